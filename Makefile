@@ -48,7 +48,7 @@ serve: install ## run the service until interrupted
 check: install ## format, lint, types, import layers
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
-	@$(BIN)/mypy lensmodel app
+	@$(BIN)/mypy lensmodel app lab
 	@$(BIN)/lint-imports
 
 security: install ## known holes in what we use (asks the network), and suspicious code of ours

@@ -90,13 +90,13 @@ class Commands(OnDemand):
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
         ),
         "reproduce": CommandEntry(
-            "lensmodel.lab.commands.reproduce:reproduce",
+            "lab.commands.reproduce:reproduce",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
         ),
         "keys": CommandEntry(
             "app.commands.keys:keys", "Make, list, renew and end the keys of a service that others can reach."
         ),
-        "bench": CommandEntry("lensmodel.lab.commands.benchmarks:bench", "Measure quality and speed."),
+        "bench": CommandEntry("lab.commands.benchmarks:bench", "Measure quality and speed."),
     }
 
 

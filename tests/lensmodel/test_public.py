@@ -59,8 +59,8 @@ SIGNATURES = Path(__file__).with_name("public_signatures.txt")
 interface changes this file too, and says so in the changelog."""
 
 METHODS = (FunctionType, classmethod, staticmethod)
-HEAVY = {"numpy", "scipy", "rawpy", "fastapi", "sqlalchemy", "pydantic", "app", "lensmodel.lab"}
-SERVICE = {"fastapi", "sqlalchemy", "pydantic", "dbos", "structlog", "app", "lensmodel.lab"}
+HEAVY = {"numpy", "scipy", "rawpy", "fastapi", "sqlalchemy", "pydantic", "app", "lab"}
+SERVICE = {"fastapi", "sqlalchemy", "pydantic", "dbos", "structlog", "app", "lab"}
 
 
 def public(name: str) -> Any:

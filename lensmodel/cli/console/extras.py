@@ -35,9 +35,9 @@ _WHAT: Final = {
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Say what to install for a missing module; None where no extra brings it."""
     name = missing.name or ""
-    if name == "app" or name.startswith("lensmodel.lab"):
+    if name.partition(".")[0] in {"app", "lab"}:
         return "this command is no part of the package: it runs in the source tree" + (
-            " or in the container image" if name == "app" else ""
+            " or in the container image" if name.partition(".")[0] == "app" else ""
         )
     top = name.partition(".")[0]
     for extra, modules in EXTRAS.items():

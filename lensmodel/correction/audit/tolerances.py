@@ -11,7 +11,7 @@ from lensmodel.core.files import fitted
 LIMITS: Final[Mapping[str, float]] = MappingProxyType(fitted("correction")["limits"])
 """Limit of each check, in the unit of its own equation.
 
-`python -m lensmodel.lab.correction.audit_table --limits` prints the limits at which less than a tenth of
+`python -m lab.correction.audit_table --limits` prints the limits at which less than a tenth of
 every sound block is held back. The first 347, of half the photographs, needed 0.29 by dark, 0.645, 1.01,
 1.39, 1.49, 3.3, 4.8, 13.0, 0.82 and 3.1 in this order. The limits lie a quarter above, since a dozen
 photographs are not all. Re-blur is newer: all but one of 152 sound blocks that got their texture back needed

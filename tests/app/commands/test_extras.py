@@ -55,7 +55,7 @@ def test_commands_on_files_do_without_the_service(ended: dict[str, tuple[int, st
     assert (status, "no photo called gone.dng" in errors) == (2, True)
 
 
-@pytest.mark.parametrize(("module", "where"), [("app", "container image"), ("lensmodel.lab", "source tree")])
+@pytest.mark.parametrize(("module", "where"), [("app", "container image"), ("lab", "source tree")])
 def test_a_command_that_is_no_part_of_the_wheel_says_where_it_runs(module: str, where: str) -> None:
     assert where in str(extras.remedy(ModuleNotFoundError("no", name=module)))
 

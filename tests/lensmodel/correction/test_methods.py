@@ -7,6 +7,9 @@ import pytest
 from scipy import ndimage
 from skimage import restoration
 
+from lab.correction.filter_flow import EfficientFilterFlow
+from lab.correction.methods import compared
+from lab.correction.quality import Constant
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta, gaussian
@@ -26,9 +29,6 @@ from lensmodel.correction.engine import Engine
 from lensmodel.correction.lights.saturation import Lights
 from lensmodel.correction.methods.richardson_lucy import ACCELERATIONS, Acceleration, first_guess
 from lensmodel.correction.methods.shrinkage import Shrinkage
-from lensmodel.lab.correction.filter_flow import EfficientFilterFlow
-from lensmodel.lab.correction.methods import compared
-from lensmodel.lab.correction.quality import Constant
 
 CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
 METHODS = list(compared)  # those of the laboratory keep the same contract

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from lab.images import psnr
+from lab.scenes import dead_leaves
 from lensmodel import photo
 from lensmodel.core.psf import as_kernel, delta, gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
 from lensmodel.correction import correct_planes
-from lensmodel.lab.images import psnr
-from lensmodel.lab.scenes import dead_leaves
 from lensmodel.photo.dng import write_bayer_dng
 
 SIDES = (160, 224)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from lab.correction.filter_flow import EfficientFilterFlow
 from lensmodel.core.belief import Belief
 from lensmodel.core.errors import CancelledError, InvalidInputError
 from lensmodel.core.geometry import Frame
@@ -19,7 +20,6 @@ from lensmodel.correction.engine import compiled
 from lensmodel.correction.expected_gain import plan
 from lensmodel.correction.limits.bounds import allowance, limited
 from lensmodel.correction.tiles.lattice import cells
-from lensmodel.lab.correction.filter_flow import EfficientFilterFlow
 
 FRAME = Frame(152, 208)  # two cells by two
 LARGE = Frame(200, 260)  # two by three

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from lab.blind.methods import compared
+from lab.scenes import dead_leaves
 from lensmodel import estimation
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
@@ -19,8 +21,6 @@ from lensmodel.core.psf import (
 from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.estimation.methods.patch_recurrence import normal_equations
 from lensmodel.estimation.steps.recurrence import blend, recur
-from lensmodel.lab.blind.methods import compared
-from lensmodel.lab.scenes import dead_leaves
 from lensmodel.simulate import demo_scene, edge_area
 
 SIGMA = 0.01

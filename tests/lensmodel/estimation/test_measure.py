@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import signal
 
+from lab.measured import scenes
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
@@ -27,7 +28,6 @@ from lensmodel.estimation.measure.points import Points
 from lensmodel.estimation.measure.solve import solve
 from lensmodel.estimation.measure.target import Target
 from lensmodel.estimation.measure.warp import homography_of, match
-from lensmodel.lab.measured import scenes
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata

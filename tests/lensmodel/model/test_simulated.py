@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.model.model_benchmark import like_estimated, run_model_benchmark
 from lensmodel.core.psf import distance
 from lensmodel.core.types import FieldPosition
-from lensmodel.lab.model.model_benchmark import like_estimated, run_model_benchmark
 from lensmodel.simulate import draw_lens
 
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.model.exact import PaperModel, all_pairs, factorised
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, distance, gaussian
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.lab.model.exact import PaperModel, all_pairs, factorised
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 
 SIZE = 21

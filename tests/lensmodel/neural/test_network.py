@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from lab.population.sets import judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
-from lensmodel.lab.population.sets import judge, load_sets
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
 from lensmodel.neural.statistics import LENGTH, WINDOW
 from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place

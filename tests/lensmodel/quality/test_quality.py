@@ -12,12 +12,12 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage, optimize, special
 
+from lab.images import psnr
+from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import CORNER_ZONE_R, Frame
 from lensmodel.core.psf import delta, gaussian
 from lensmodel.core.types import LensSettings
-from lensmodel.lab.images import psnr
-from lensmodel.lab.scenes import dead_leaves
 from lensmodel.quality import (
     best_shift,
     by_zone,

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import special
 
+from lab.local_frame import pixel_to_local
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import centroid, distance, rms_width, second_moments
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.lab.local_frame import pixel_to_local
 from lensmodel.simulate import LENS_KINDS, Aberrations, SimulatedLens, draw_lens
 from lensmodel.simulate.aberrations import WaveError
 from lensmodel.simulate.pupil import PixelOtf, disc, pixel_otf

@@ -15,11 +15,11 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import Image
 
+from lab.scenes import dead_leaves, disc_kernel, out_of_focus
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import Kernel, LensSettings, Planes
-from lensmodel.lab.scenes import dead_leaves, disc_kernel, out_of_focus
 from lensmodel.simulate import (
     DEMO_SCENES,
     Aberrations,

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.images import psnr
+from lab.traced import GridLens, read_grid
 from lensmodel import photo, simulate
 from lensmodel.core.types import LensSettings, Planes
-from lensmodel.lab.images import psnr
-from lensmodel.lab.traced import GridLens, read_grid
 from lensmodel.model import LensModel
 from lensmodel.workflow import pipeline
 

@@ -1,0 +1,377 @@
+"""Pieces that the methods by predicted edges share: prediction, selection, kernel step, borders.
+
+Cho and Lee, Xu and Jia, and the L0 methods all guess the gradients of the sharp image at strong
+edges and solve for the kernel that takes them to the observed ones. Derivatives are forward
+differences. All steps are shift-invariant; borders are continued smoothly to a periodic canvas for
+image steps, and no edge within half a kernel of the border counts in kernel steps.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lab.blind.steps.cleaning import cleaned
+from lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import as_kernel, centred, centroid, distance, otf
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
+from lensmodel.estimation.estimator import PsfEstimate, usable
+from lensmodel.estimation.steps.finish import finished
+
+_ORIENTATIONS = 4  # as in Cho and Lee
+_TINY = 1e-12  # keeps divisions finite: far below any gradient
+
+Mask = NDArray[np.bool_]
+KernelSolver = Callable[["KernelEquations"], NDArray[np.float64]]
+
+
+def down(image: Image) -> Image:
+    """Difference to the next row; zero in the last."""
+    return np.diff(image, axis=0, append=image[-1:])
+
+
+def across(image: Image) -> Image:
+    """Difference to the next column; zero in the last."""
+    return np.diff(image, axis=1, append=image[:, -1:])
+
+
+def shock_filtered(image: Image, dt: float, steps: int = 1) -> Image:
+    """Sharpen edges to steps, I <- I - sign(laplacian I) |grad I| dt.
+
+    The gradient is the smaller of both one-sided differences, zero where they disagree in sign, so
+    that no pixel passes its neighbours for dt <= 1 / sqrt 2.
+
+    References
+    ----------
+    .. [1] S. Osher and L. I. Rudin, "Feature-oriented image enhancement using shock filters", SIAM
+       J. Numer. Anal. 27, 1990, eq. (2.19).
+    """
+    sharp = image
+    for _ in range(steps):
+        wide = np.pad(sharp, 1, mode="edge")
+        before_row, after_row = sharp - wide[:-2, 1:-1], wide[2:, 1:-1] - sharp
+        before_col, after_col = sharp - wide[1:-1, :-2], wide[1:-1, 2:] - sharp
+        laplacian = after_row - before_row + after_col - before_col
+        slope = np.hypot(_minmod(before_row, after_row), _minmod(before_col, after_col))
+        sharp = sharp - np.sign(laplacian) * slope * dt
+    return sharp
+
+
+def _minmod(a: Image, b: Image) -> Image:
+    return np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0)
+
+
+def bilateral(image: Image, *, reach: int, sigma_space: float, sigma_range: float) -> Image:
+    """Average neighbours that are near in place and in value.
+
+    References
+    ----------
+    .. [1] C. Tomasi and R. Manduchi, "Bilateral filtering for gray and color images", ICCV 1998.
+    """
+    wide = np.pad(image, reach, mode="symmetric")
+    total, weights = np.zeros(image.shape), np.zeros(image.shape)
+    for row in range(-reach, reach + 1):
+        for col in range(-reach, reach + 1):
+            near = math.exp(-0.5 * (row * row + col * col) / sigma_space**2)
+            other = wide[
+                reach + row : reach + row + image.shape[0], reach + col : reach + col + image.shape[1]
+            ]
+            weight = near * np.exp(-0.5 * np.square((other - image) / sigma_range))
+            total += weight * other
+            weights += weight
+    return total / weights
+
+
+def oriented_threshold(
+    rows: Image, cols: Image, least: int, allowed: Mask, *, ranked: Image | None = None
+) -> float:
+    """Largest threshold at which each of four orientations keeps `least` of the allowed pixels.
+
+    Pixels are ranked by magnitude, or by another image. An orientation that is too poor to have so
+    many is given all that it has.
+    """
+    magnitude = np.hypot(rows, cols)
+    rank = magnitude if ranked is None else ranked
+    angle = np.mod(np.arctan2(rows, cols), np.pi)
+    sector = np.minimum((angle * (_ORIENTATIONS / np.pi)).astype(np.intp), _ORIENTATIONS - 1)
+    present = allowed & (magnitude > _TINY)
+    found = []
+    for i in range(_ORIENTATIONS):
+        own = rank[present & (sector == i)]
+        if own.size:
+            found.append(float(np.partition(own, max(own.size - least, 0))[max(own.size - least, 0)]))
+    return min(found, default=0.0)
+
+
+def inside(shape: tuple[int, ...], margin: int) -> Mask:
+    """Pixels at least `margin` from the border."""
+    mask = np.zeros(shape, dtype=np.bool_)
+    mask[margin : shape[0] - margin, margin : shape[1] - margin] = True
+    return mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeriodicPlane:
+    """A periodic plane that shows an image in its middle, for image steps by FFT.
+
+    Parameters
+    ----------
+    frame : tuple of int
+        Shape of the image.
+    pad : tuple of int
+        Pixels added on either side of the rows and columns.
+    """
+
+    frame: tuple[int, int]
+    pad: tuple[int, int]
+
+    @classmethod
+    def around(cls, image: Image, side: int) -> PeriodicPlane:
+        """Room for a kernel of `side` between opposite borders, of a size that suits the FFT."""
+        rows, cols = image.shape
+        return cls((rows, cols), (_fast_pad(rows, side), _fast_pad(cols, side)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the plane."""
+        return self.frame[0] + 2 * self.pad[0], self.frame[1] + 2 * self.pad[1]
+
+    def filled(self, image: Image) -> Image:
+        """Continue an image so that it closes on itself: mirrored ends, faded into each other."""
+        rows, cols = _closing(self.frame[0], self.pad[0]), _closing(self.frame[1], self.pad[1])
+        return np.asarray(rows @ image @ cols.T)
+
+    def cut(self, plane: Image) -> Image:
+        """Return the image in the middle."""
+        (row, col), (rows, cols) = self.pad, self.frame
+        return plane[row : row + rows, col : col + cols]
+
+    def spectrum(self, image: Image) -> NDArray[np.complex128]:
+        """Transform of an image, continued."""
+        return fft.rfft2(self.filled(image))
+
+    def gradient_power(self) -> tuple[Image, Image]:
+        """Powers of both forward differences."""
+        row = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.fftfreq(self.shape[0]))
+        col = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.rfftfreq(self.shape[1]))
+        width = (self.shape[0], col.size)
+        return np.broadcast_to(row[:, None], width), np.broadcast_to(col[None, :], width)
+
+    def divergence(self, rows: Image, cols: Image) -> Image:
+        """Adjoint of the forward differences of a plane, of fields given on the image only."""
+        fields = np.zeros((2, *self.shape))
+        (row, col), (high, wide) = self.pad, self.frame
+        fields[:, row : row + high, col : col + wide] = rows, cols
+        down_field, across_field = fields
+        return np.roll(down_field, 1, 0) - down_field + np.roll(across_field, 1, 1) - across_field
+
+    def otf(self, kernel: Kernel) -> NDArray[np.complex128]:
+        """Transfer function of a kernel on the plane."""
+        return otf(kernel, self.shape)
+
+
+def _fast_pad(length: int, least: int) -> int:
+    pad = least
+    while int(fft.next_fast_len(length + 2 * pad, real=True)) != length + 2 * pad:
+        pad += 1
+    return pad
+
+
+@lru_cache(maxsize=64)
+def _closing(length: int, pad: int) -> Image:
+    """Matrix `(length + 2 pad, length)` of `PeriodicPlane.filled` along one axis."""
+    total = length + 2 * pad
+    matrix = np.zeros((total, length))
+    for i in range(total):
+        place = i - pad
+        if 0 <= place < length:
+            matrix[i, place] = 1.0
+            continue
+        beyond = place - length if place >= length else place + total - length  # 0 .. 2 pad - 1
+        fade = (beyond + 0.5) / (2 * pad)
+        fade = 0.5 - 0.5 * math.cos(math.pi * fade)
+        matrix[i, _mirrored(length + beyond, length)] += 1.0 - fade
+        matrix[i, _mirrored(beyond - 2 * pad, length)] += fade
+    matrix.setflags(write=False)
+    return matrix
+
+
+def _mirrored(place: int, length: int) -> int:
+    folded = place % (2 * length)
+    return folded if folded < length else 2 * length - 1 - folded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DerivativePair:
+    """A predicted derivative of the sharp image, and the same derivative as observed.
+
+    Parameters
+    ----------
+    sharp, observed : ndarray, shape (H, W)
+    weight : float
+    way : int
+        0 down the rows, 1 across the columns, 2 both: what a verdict tells apart.
+    """
+
+    sharp: Image
+    observed: Image
+    weight: float
+    way: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KernelEquations:
+    """Normal equations of sum w |s * k - b|², pooled over derivatives and patches.
+
+    Parameters
+    ----------
+    side : int
+        Odd side of the kernel.
+    power : ndarray of float64
+        sum w |S|² on a common grid, which no patch wraps on.
+    cross : ndarray of complex128
+        sum w conj(S) B.
+    grid : tuple of int
+        Shape of the common grid.
+    """
+
+    side: int
+    power: Image
+    cross: NDArray[np.complex128]
+    grid: tuple[int, int]
+
+    @classmethod
+    def of(cls, pairs: Sequence[DerivativePair], side: int) -> KernelEquations:
+        """Sum over pairs; predictions near the border, whose blur reaches outside, are left out.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If nothing was predicted.
+        """
+        reach = [max(pair.sharp.shape[axis] for pair in pairs) + side for axis in (0, 1)]
+        grid = (int(fft.next_fast_len(reach[0], real=True)), int(fft.next_fast_len(reach[1], real=True)))
+        power = np.zeros((grid[0], grid[1] // 2 + 1))
+        cross = np.zeros(power.shape, dtype=np.complex128)
+        for pair in pairs:
+            kept = np.where(inside(pair.sharp.shape, side // 2 + 1), pair.sharp, 0.0)
+            sharp, observed = fft.rfft2(kept, grid), fft.rfft2(pair.observed, grid)
+            power += pair.weight * np.square(np.abs(sharp))
+            cross += pair.weight * np.conj(sharp) * observed
+        if not power.max() > _TINY:
+            raise NotEnoughEvidenceError("no edge stands out of the patches; choose parts with clear edges")
+        return cls(side, power, cross, grid)
+
+    def divided(self, gamma: float) -> NDArray[np.float64]:
+        """Kernel by division of spectra, cross / (power + gamma), cut to its side."""
+        plane = fft.irfft2(self.cross / (self.power + gamma), self.grid)
+        return self._middle(plane)
+
+    def conjugate_gradients(
+        self,
+        gamma: float | NDArray[np.float64],
+        start: NDArray[np.float64],
+        *,
+        steps: int,
+        tolerance: float = 1e-5,
+    ) -> NDArray[np.float64]:
+        """Minimise sum w |s * k - b|² + gamma |k|² over kernels of this side, without constraints.
+
+        gamma may differ from pixel to pixel. The autocorrelation of s is all that the product needs, so
+        that steps run on a grid of two kernel sides.
+        """
+        n = int(fft.next_fast_len(2 * self.side, real=True))
+        lags = np.arange(-(self.side - 1), self.side)
+        plane = fft.irfft2(self.power, self.grid)
+        small = np.zeros((n, n))
+        small[np.ix_(lags % n, lags % n)] = plane[np.ix_(lags % self.grid[0], lags % self.grid[1])]
+        toeplitz = fft.rfft2(small)
+
+        def applied(k: NDArray[np.float64]) -> NDArray[np.float64]:
+            blurred = fft.irfft2(toeplitz * fft.rfft2(k, (n, n)), (n, n))[: self.side, : self.side]
+            return np.asarray(blurred + gamma * k)
+
+        target = self._middle(fft.irfft2(self.cross, self.grid))
+        k = np.array(start)
+        residual = target - applied(k)
+        direction, energy = residual, float(np.vdot(residual, residual))
+        enough = tolerance**2 * float(np.vdot(target, target))
+        for _ in range(steps):
+            if energy <= enough:
+                break
+            product = applied(direction)
+            length = energy / max(float(np.vdot(direction, product)), _TINY * energy)
+            k = k + length * direction
+            residual = residual - length * product
+            before, energy = energy, float(np.vdot(residual, residual))
+            direction = residual + energy / before * direction
+        return k
+
+    def _middle(self, plane: Image) -> NDArray[np.float64]:
+        lags = np.arange(self.side) - self.side // 2
+        return plane[np.ix_(lags % self.grid[0], lags % self.grid[1])]
+
+
+def pruned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
+    """Clean a kernel and roll it by whole pixels until its centre of mass is the middle."""
+    kept = np.array(cleaned(kernel, threshold, least_mass))
+    row, col = (round(x) for x in centroid(kept))
+    if (row, col) != (0, 0):
+        kept = ndimage.shift(kept, (-row, -col), order=0, mode="constant")
+    return as_kernel(kept)
+
+
+def disagreement(halves: Sequence[KernelEquations], solve: KernelSolver) -> float:
+    """Relative L2 distance of the kernels that two parts of the evidence give alone; 1 if one fails."""
+    first, second = (np.maximum(solve(half), 0.0) for half in halves)
+    if not min(first.max(), second.max()) > 0:
+        return 1.0
+    found = distance(centred(first), centred(second)).rel_l2
+    return min(found, 1.0) if math.isfinite(found) else 1.0
+
+
+class EdgeSolver(LevelSolver, Protocol):
+    """A method's alternation on one level that can tell how far its evidence agrees."""
+
+    def disagreement(self) -> float:
+        """Relative L2 distance of kernels from parts of the evidence, after the last level."""
+
+
+def estimate_by_edges(
+    solver: EdgeSolver,
+    patches: Sequence[Plane],
+    noise: Sequence[NoiseModel],
+    *,
+    size: int,
+    iterations: int,
+    start: Kernel | None,
+    error: tuple[float, float],
+    on_step: StepHook,
+) -> PsfEstimate:
+    """Run a method coarse to fine, or from a first kernel on the finest level alone.
+
+    `error` is offset and slope of the expected relative L2 error by the disagreement.
+    """
+    began = time.process_time()
+    kept = usable(patches, noise, size)
+    views = [View.of(patch, model) for patch, model in kept]
+    schedule = Schedule(size, iterations, coarsest=size if start is not None or size < 5 else 5)
+    found = coarse_to_fine(views, solver, schedule, start=start, on_step=on_step)
+    apart = solver.disagreement()
+    return finished(
+        found.kernel,
+        kept,
+        size=size,
+        error=error[0] + error[1] * apart,
+        diagnostics={"support": float(size), "disagreement": apart},
+        began=began,
+    )

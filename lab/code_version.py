@@ -1,0 +1,80 @@
+"""Which code a figure depends on: the modules that a module imports, and those that they import."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import lensmodel
+
+ROOT: Final = Path(lensmodel.__file__).parents[1]
+_DATA: Final = (".npz", ".json")
+
+
+def version_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> str:
+    """Hash of the code and data behind some modules.
+
+    Parameters
+    ----------
+    modules : str
+        Dotted names, such as "lab.rivals".
+    without : sequence of str
+        Names of modules or packages that are left out with all that only they import.
+    root : Path
+        Folder that holds the packages.
+
+    Returns
+    -------
+    str
+        Sixteen hexadecimal digits; the same wherever the tree lies.
+    """
+    total = hashlib.sha256()
+    for path in code_of(*modules, without=without, root=root):
+        total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return total.hexdigest()[:16]
+
+
+def code_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> list[Path]:
+    """Files behind some modules, sorted: what they import anywhere, functions included, and their data.
+
+    Only packages below `root` count. Imports are read, not run, and relative ones are not used here.
+    """
+    left, seen = list(modules), dict[str, Path]()
+    while left:
+        name = left.pop()
+        path = _file_of(name, root)
+        if name in seen or path is None or any(f"{name}.".startswith(f"{out}.") for out in without):
+            continue
+        seen[name] = path
+        left += _imports(path, root)
+    folders = {path.parent for path in seen.values()} | {path.parent / "data" for path in seen.values()}
+    data = {
+        path for folder in folders if folder.is_dir() for path in folder.iterdir() if path.suffix in _DATA
+    }
+    return sorted({*seen.values(), *data})
+
+
+def _file_of(name: str, root: Path) -> Path | None:
+    base = root.joinpath(*name.split("."))
+    return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
+
+
+@cache
+def _imports(path: Path, root: Path) -> tuple[str, ...]:
+    return tuple(_imported(ast.parse(path.read_text(encoding="utf-8")), root))
+
+
+def _imported(tree: ast.Module, root: Path) -> Iterator[str]:
+    """Names that may be modules; of a package only what is taken from it, where that is all modules."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from names
+            if not all(_file_of(name, root) for name in names):
+                yield node.module

@@ -1,0 +1,359 @@
+"""`lensmodel bench`: accuracy and speed, on the library's material or one's own.
+
+The benchmarks are imported where they are run: they need half of SciPy, which no other command should
+wait for.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from lab.commands.gallery import gallery
+from lensmodel.cli.console import display
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.files import as_usage, refuse_existing
+from lensmodel.cli.console.options import Force, Quiet, Verbose
+from lensmodel.core.codec import to_json
+from lensmodel.core.files import write_atomically
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lab.blind.results import BlindBenchmark, BlindReport
+
+NOISE: Final = "0.01,0.003"
+ESTIMATORS: Final = "default,michaeli-irani"
+BLIND_OUTPUT: Final = Path("bench-output")
+STANDARD_OUTPUT: Final = Path("-")
+FINISHED: Final = ("blind.json", "blind.csv", "blind.md")
+"""What a finished report of `bench blind` consists of, beside its curves."""
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Also write the figures to this file; - prints them instead of the table.",
+    ),
+]
+
+bench = typer.Typer(
+    help="""Measure quality and speed.
+
+    Without a name, three quick runs, whose tables go to standard output:
+
+    - bench blind --cases 12
+
+    - bench model --seeds 1000:1002
+
+    - bench correct --methods fast,standard
+
+    They take a few minutes, and write nothing but finished cases, to bench-output/cache.
+
+    Examples:
+
+        lensmodel bench
+
+        lensmodel bench blind --help
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    """,
+    invoke_without_command=True,
+)
+
+bench.command()(gallery)
+
+
+@bench.callback()
+def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) -> None:
+    """Run the three quick ones unless one is named."""
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    context.obj = shown
+    if context.invoked_subcommand is None:
+        from lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+        from lab.blind.tables import markdown_table  # noqa: PLC0415 - same
+        from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - same
+        from lab.model.model_benchmark import table  # noqa: PLC0415 - same
+
+        settings = BlindBenchmark(noise=_levels(NOISE), methods=_names(ESTIMATORS), cases=12)
+        shown.result("Blind estimators\n\n" + markdown_table(_blind(settings, 2, BLIND_OUTPUT, shown)))
+        shown.result("Lens model\n\n" + table(_model(shown, seeds=range(1000, 1002), photos=[1, 5])))
+        shown.result("Correction\n\n" + correct_table(_correct(None, "fast,standard", 1, shown)))
+
+
+@bench.command()
+def blind(
+    context: typer.Context,
+    photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
+    psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
+    noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
+    methods: Annotated[
+        str, typer.Option(help="Estimators, comma separated; also cho-lee, edges, sun, xu-jia and zhang.")
+    ] = ESTIMATORS,
+    patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
+    cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
+    scenes: Annotated[
+        int | None,
+        typer.Option(min=1, help="So many windows of the photographs in turn. Default: one of each."),
+    ] = None,
+    pool: Annotated[int, typer.Option(help="Patches that share one kernel.")] = 1,
+    half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
+    variant: Annotated[str, typer.Option(help="gaussian, bayer or jpeg.")] = "gaussian",
+    judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
+    selection: Annotated[
+        str, typer.Option(help="Who chooses the patches: random, r-map or good-regions.")
+    ] = "r-map",
+    seed: int = 0,
+    workers: Annotated[int, typer.Option(min=1)] = 2,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and curves.")
+    ] = BLIND_OUTPUT,
+    json_output: JsonFile = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Blind PSF estimators on blurred patches with known truth (paper, section 5.1).
+
+    Finished cases are kept; a run that was stopped goes on. A finished report is replaced only
+    with --force.
+
+    Examples:
+
+        lensmodel bench blind --cases 12
+
+        lensmodel bench blind --photos sharp --psfs mine.npz --noise 0.01 --methods default -o mine
+
+        lensmodel bench blind --photos sharp --scenes 80 --half all --cases 200
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    """
+    from lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+    from lab.blind.tables import markdown_table, write_report  # noqa: PLC0415 - same
+
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
+    with as_usage():
+        settings = BlindBenchmark(
+            photos=photos,
+            psfs=psfs,
+            noise=_levels(noise),
+            methods=_names(methods),
+            half=half,  # type: ignore[arg-type]  # checked by the benchmark
+            cases=cases,
+            patch=patch,
+            pool=pool,
+            variant=variant,  # type: ignore[arg-type]  # checked by the benchmark
+            judge=judge,
+            seed=seed,
+            selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
+            scenes=scenes,
+        )
+    report = _blind(settings, workers, output, shown)
+    written = write_report(report, output)
+    _tell(shown, json_output, report.to_json(), markdown_table(report))
+    shown.note("written: " + ", ".join(str(path) for path in written))
+
+
+def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
+    from lab.blind.blind_benchmark import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
+
+    with as_usage(), shown.progress() as bars:
+        task = bars.add_task("cases", total=None)
+        return run_blind_benchmark(
+            settings,
+            workers=workers,
+            cache=output / "cache",
+            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+        )
+
+
+@bench.command()
+def model(
+    context: typer.Context,
+    seeds: Annotated[
+        str, typer.Option(metavar="FIRST:LAST", help="Simulated lenses, the last excluded.")
+    ] = "1000:1004",
+    photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
+    methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
+    psf_field: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs.")
+    ] = None,
+    photographs: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Sharp photographs: estimate patches of those blindly."),
+    ] = None,
+    json_output: JsonFile = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Predictions of the lens model where no sample was, against other regressions.
+
+    Examples:
+
+        lensmodel bench model --seeds 1000:1001 --photos 1 --methods eff-linear
+
+        lensmodel bench model --psf-field stars.npz --json model.json
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), force=force)
+    try:
+        first, last = (int(part) for part in seeds.split(":"))
+        counts = [int(part) for part in photos.split(",")]
+    except ValueError as error:
+        raise UsageError(
+            f"give --seeds like 1000:1004 and --photos like 1,5, got {seeds} and {photos}"
+        ) from error
+    from lab.model.model_benchmark import table  # noqa: PLC0415 - see the top of the module
+
+    result = _model(
+        shown,
+        seeds=range(first, last),
+        photos=counts,
+        methods=None if methods is None else _names(methods),
+        psf_field=psf_field,
+        photographs=photographs,
+    )
+    _tell(shown, json_output, result, table(result))
+
+
+def _model(
+    shown: Display,
+    *,
+    seeds: Sequence[int],
+    photos: Sequence[int],
+    methods: Sequence[str] | None = None,
+    psf_field: Path | None = None,
+    photographs: Path | None = None,
+) -> dict[str, Any]:
+    from lab.model.model_benchmark import run_model_benchmark  # noqa: PLC0415 - see the top of the module
+
+    with as_usage(), shown.progress() as bars:
+        task = bars.add_task("fits", total=None)
+        return run_model_benchmark(
+            seeds=seeds,
+            photos=photos,
+            methods=methods,
+            psf_field=psf_field,
+            photographs=photographs,
+            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+        )
+
+
+@bench.command()
+def correct(
+    context: typer.Context,
+    photo: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A photo of yours; default: one of the library's.")
+    ] = None,
+    methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
+    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Runs; the median counts.")] = 1,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="Time G'MIC, RawTherapee and darktable too, where installed.")
+    ] = False,
+    roi: Annotated[
+        str | None, typer.Option(metavar="T,L,H,W", help="Only this part, in the cells of the whole photo.")
+    ] = None,
+    beside: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Compare CPU time with that of N threads.")
+    ] = None,
+    json_output: JsonFile = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Time and memory of correcting a photo, and of the Richardson-Lucy step against its peers.
+
+    Examples:
+
+        lensmodel bench correct --methods fast
+
+        lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    """
+    from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - see the top of the module
+
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), force=force)
+    if photo is not None and not photo.is_file():
+        raise UsageError(f"no photo called {photo}; check the name and the folder")
+    window = _window(roi)
+    result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers, roi=window, beside=beside)
+    _tell(shown, json_output, result, correct_table(result))
+
+
+def _correct(
+    photo: Path | None,
+    methods: str,
+    workers: int,
+    shown: Display,
+    *,
+    repeats: int = 1,
+    peers: bool = False,
+    roi: tuple[int, int, int, int] | None = None,
+    beside: int | None = None,
+) -> dict[str, Any]:
+    from lab.correction.correction_benchmark import run_correct_benchmark  # noqa: PLC0415 - see the top of the module
+    from lab.peers import PEERS  # noqa: PLC0415 - same
+    from lensmodel.photo import develop  # noqa: PLC0415 - same
+    from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
+
+    planes = develop(photo or demo_data_path("lake.jpg")).planes
+    with as_usage(), shown.progress() as bars:
+        task = bars.add_task("methods", total=None)
+        return run_correct_benchmark(
+            planes,
+            methods=_names(methods),
+            workers=workers,
+            repeats=repeats,
+            peers=PEERS if peers else (),
+            roi=roi,
+            beside=beside,
+            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+        )
+
+
+def _window(text: str | None) -> tuple[int, int, int, int] | None:
+    if text is None:
+        return None
+    try:
+        top, left, height, width = (int(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--roi must be four whole numbers T,L,H,W, got {text!r}") from error
+    return top, left, height, width
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
+def _levels(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--noise must be numbers such as 0.01,0.003, got {text!r}") from error
+
+
+def _file(json_output: Path | None) -> Path | None:
+    return None if json_output == STANDARD_OUTPUT else json_output
+
+
+def _tell(shown: Display, json_output: Path | None, result: object, words: str) -> None:
+    """Print the table, or the figures where they were asked for; write them where a file was named."""
+    if json_output == STANDARD_OUTPUT:
+        shown.document(result)
+        return
+    shown.result(words)
+    if json_output is not None:
+        json_output.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(json_output, json.dumps(to_json(result), indent=1).encode())

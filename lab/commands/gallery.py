@@ -1,0 +1,79 @@
+"""`lensmodel bench gallery`: pictures to look at."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from lensmodel.cli.console import display
+from lensmodel.cli.console.files import as_usage
+from lensmodel.cli.console.options import Quiet, Verbose
+
+DATA_VARIABLE: Final = "LENSMODEL_TEST_DATA"
+
+
+def gallery(
+    context: typer.Context,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help=f"Test data with real photos. Default: ${DATA_VARIABLE}; without it only simulated frames.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for page, crops and stored results.")
+    ] = Path("gallery-output"),
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Only pictures whose name holds this; may be repeated."),
+    ] = None,
+    mode: Annotated[
+        str | None, typer.Option(metavar="MODE", help="Mode of the lens model instead of the default one.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes and threads.")] = 2,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Make stored results of these pictures anew.")
+    ] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """A page to look at: each picture calibrated from itself, corrected by default, beside its original.
+
+    Real photos of the test data and simulated frames, with crops at 3:1, what RawTherapee makes of them
+    where it is installed, and figures. Results are kept by the content of the photo and the version of the
+    code: the same command again goes on where it was, and writes the page of the pictures it was asked for.
+
+    Examples:
+
+        lensmodel bench gallery --only simulated/text
+
+        lensmodel bench gallery --only simulated/snow --only simulated/sky -o two-pictures
+
+    Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
+    """
+    from lab import gallery as hall  # noqa: PLC0415 - it needs half of SciPy
+
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    named = os.environ.get(DATA_VARIABLE)
+    folder = data or (Path(named) if named else None)
+    began = time.monotonic()
+    with as_usage():
+        wishes = hall.Wishes(mode=mode, workers=workers, fresh=fresh)
+        _ = wishes.model
+        known = [] if folder is None else hall.real_pictures(folder)
+        pictures = hall.chosen([*known, *hall.simulated_pictures(output / hall.CACHE)], only or [])
+
+    def progress(words: str, done: int, total: int) -> None:
+        shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
+
+    entries = []
+    for entry in hall.hang(pictures, output, wishes, on_picture=progress):
+        entries.append(entry)
+        page = hall.write_page(entries, output)  # after each: a run that is stopped leaves a page
+    shown.result(hall.text(entries))
+    shown.note(f"written: {page}")

@@ -1,0 +1,174 @@
+"""`lensmodel reproduce`."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
+
+import typer
+
+from lensmodel.cli.console import display
+from lensmodel.cli.console.files import refuse_existing
+from lensmodel.cli.console.options import Force, Quiet, Verbose, choice
+
+if TYPE_CHECKING:
+    from lab.reproduce import Case, DirectRoute
+
+DATA_VARIABLE = "LENSMODEL_TEST_DATA"
+Size = Literal["quick", "small", "default", "full"]
+PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")
+"""What is in the folder of a finished reproduction, beside pictures and stored results."""
+
+BENCHMARK = Path("bench-output")
+"""Where `lensmodel bench blind` leaves what Fig. 1 is drawn from."""
+
+
+def reproduce(
+    context: typer.Context,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
+    ] = Path("reproduction"),
+    size: Annotated[
+        str,
+        choice(
+            "--size",
+            get_args(Size),
+            "quick: four lenses on small photos, minutes. small: all lenses on a megapixel, hours. "
+            "default: large frames, other files and the rivals too. full: two apertures a lens, up to twenty "
+            "photos and scenes that hurt, all night.",
+        ),
+    ] = "default",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
+    ] = None,
+    grids: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="PSFs of a ray-traced lens, made by `python -m lab.traced make`; again for more. "
+            "Default: the two of the repository.",
+        ),
+    ] = None,
+    scenes: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of sharp photographs; its test half is used. Default: the folder sharp of "
+            f"${DATA_VARIABLE} where that is set, else the library's five."
+        ),
+    ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where figures of each lens and number of photos are kept and taken from, so that several "
+            "runs on several machines make one page. Default: cache in the output folder.",
+        ),
+    ] = None,
+    default_only: Annotated[
+        bool,
+        typer.Option(
+            "--default-only",
+            help="Only the default correction, beside the true PSF: what the bars ask for, in less time.",
+        ),
+    ] = False,
+    assert_bars: Annotated[
+        bool,
+        typer.Option(
+            "--assert-bars",
+            help="Fail where a bar is missed, and name each: the lens and zone of a fall too.",
+        ),
+    ] = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
+
+    Each lens learns from Bayer DNG files as a user's does; what it answers and corrects is measured
+    against the truth. Finished results are kept: a run that was stopped goes on, and a change of code
+    or settings computes anew. A finished page is replaced only with --force.
+
+    Examples:
+
+        lensmodel reproduce --size quick -o reproduction
+
+        lensmodel reproduce --only 1003 --results figures-so-far -o sitting
+
+    Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
+    """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(*(output / name for name in PAGE), force=force)
+    from lab.reproduce import (  # noqa: PLC0415 - the simulation is slow to import
+        DirectRoute,
+        collected,
+        missed,
+        planned,
+        run_reproduction,
+        write_json,
+        write_page,
+    )
+
+    @contextmanager
+    def library(case: Case, folder: Path) -> Iterator[DirectRoute]:
+        del case
+        yield DirectRoute(folder / "models")
+
+    plan = planned(
+        cast("Size", size),
+        scenes=scenes or _external(),
+        grids=grids,
+        only=only or (),
+        default_only=default_only,
+    )
+    work = WorkLines(quiet=shown.quiet)
+    result = run_reproduction(plan, library, output, route="in the library", results=results, on_work=work)
+    result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
+    written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
+    shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
+    if assert_bars and (lines := missed(result)):
+        shown.error("\n".join(["these bars are missed:", *lines]))
+        raise typer.Exit(1)
+
+
+class WorkLines:
+    """One line on standard error after each piece of work, with the time left."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._began = time.monotonic()
+        self._stored = 0.0
+        self._last = 0.0
+
+    def __call__(self, words: str, done: float, total: float, *, fresh: bool) -> None:
+        """Say what was done; see `OnWork`."""
+        if not fresh:
+            self._stored += done - self._last
+        self._last = done
+        if self._quiet:
+            return
+        spent, computed = time.monotonic() - self._began, done - self._stored
+        left = ""
+        if computed > 0 and done < total:
+            seconds = spent / computed * (total - done)
+            left = f", about {_duration(seconds)} left"
+        typer.echo(f"[{100 * done / total:3.0f} %] {words}{left}", err=True)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _external() -> Path | None:
+    named = os.environ.get(DATA_VARIABLE)
+    if not named:
+        return None
+    folder = Path(named) / "sharp"
+    return folder if folder.is_dir() else None

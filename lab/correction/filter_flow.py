@@ -1,0 +1,142 @@
+"""A field of kernels: the efficient filter flow, by which tests blur pictures.
+
+A correction solves in cells of one kernel instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.correction.windows import partition
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import Channel, Kernel, Plane
+from lensmodel.correction.blur import UniformBlur
+
+
+class _Window(NamedTuple):
+    """One window of the latent plane, with the kernel of its centre."""
+
+    rows: slice
+    cols: slice
+    weight: NDArray[np.float32]
+    blur: UniformBlur
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EfficientFilterFlow:
+    """Blur that changes over the field [1]_.
+
+    Windows first, then one convolution for each::
+
+        y = sum_r  place_r( a_r * (w_r . crop_r(x)) ),        sum_r w_r = 1
+
+    The windows act on the sharp plane, so each point of the scene keeps one kernel and all of
+    its light. Between window centres the kernels are interpolated linearly.
+
+    Parameters
+    ----------
+    height, width : int
+        Size of the frame in pixels.
+    kernels : tuple of tuple of Kernel
+        Grid of kernels, row by row, all of one side; `kernels[i][j]` belongs to the centre of
+        window (i, j) of an even partition of the frame.
+
+    References
+    ----------
+    .. [1] M. Hirsch, S. Sra, B. Schölkopf, S. Harmeling, "Efficient filter flow for
+       space-variant multiframe blind deconvolution", CVPR 2010.
+    """
+
+    height: int
+    width: int
+    kernels: tuple[tuple[Kernel, ...], ...]
+
+    def __post_init__(self) -> None:
+        shapes = {kernel.shape for line in self.kernels for kernel in line}
+        if len(shapes) != 1 or len({len(line) for line in self.kernels}) != 1:
+            raise InvalidInputError("the kernels of a filter flow must form a full grid of one size")
+
+    @classmethod
+    def of_field(
+        cls, field: PsfField, frame: Frame, channel: Channel, *, pitch: int = 128, size: int = 55
+    ) -> EfficientFilterFlow:
+        """Sample a PSF field at window centres about `pitch` pixels apart."""
+        rows, cols = max(1, round(frame.height / pitch)), max(1, round(frame.width / pitch))
+        centre_rows = (np.arange(rows) + 0.5) * frame.height / rows - 0.5
+        centre_cols = (np.arange(cols) + 0.5) * frame.width / cols - 0.5
+        kernels = tuple(
+            tuple(field.kernel_at(frame.position(float(i), float(j)), channel, size) for j in centre_cols)
+            for i in centre_rows
+        )
+        return cls(frame.height, frame.width, kernels)
+
+    @property
+    def reach(self) -> int:
+        """By how many pixels the latent plane is wider than the frame on each side."""
+        return int(self.kernels[0][0].shape[0] // 2)
+
+    @property
+    def latent_shape(self) -> tuple[int, int]:
+        """Size of the latent plane in pixels."""
+        return self.height + 2 * self.reach, self.width + 2 * self.reach
+
+    def forward(self, latent: Plane) -> Plane:
+        """Return F x, `(height, width)`."""
+        if latent.shape != self.latent_shape:
+            raise InvalidInputError(f"latent plane must be {self.latent_shape}, got {latent.shape}")
+        reach = self.reach
+        # Each window lands with a margin of the kernel's half side; the frame is cut out at the end.
+        full = np.zeros((latent.shape[0] + 2 * reach, latent.shape[1] + 2 * reach))
+        for rows, cols, weight, blur in self._windows():
+            piece = np.pad(latent[rows, cols] * weight, 2 * reach)
+            full[rows.start : rows.stop + 2 * reach, cols.start : cols.stop + 2 * reach] += blur.forward(
+                piece
+            )
+        cut = 2 * reach
+        return np.asarray(full[cut : cut + self.height, cut : cut + self.width], dtype=np.float32)
+
+    def adjoint(self, blurred: Plane) -> Plane:
+        """Return F^T y on the latent plane."""
+        if blurred.shape != (self.height, self.width):
+            raise InvalidInputError(f"blurred plane must be {self.height, self.width}, got {blurred.shape}")
+        reach = self.reach
+        full = np.pad(blurred, 2 * reach)
+        latent = np.zeros(self.latent_shape)
+        for rows, cols, weight, blur in self._windows():
+            piece = full[rows.start : rows.stop + 2 * reach, cols.start : cols.stop + 2 * reach]
+            latent[rows, cols] += weight * blur.frame(blur.frame(blur.adjoint(piece)))
+        return latent.astype(np.float32)
+
+    def frame(self, latent: Plane) -> Plane:
+        """Return the part of the latent plane that the photo shows."""
+        cut = self.reach
+        return latent[cut : cut + self.height, cut : cut + self.width]
+
+    def _windows(self) -> Iterator[_Window]:
+        reach = self.reach
+        down, across = len(self.kernels), len(self.kernels[0])
+        for i, (top, rise) in enumerate(_widened(partition(self.height, down), reach)):
+            for j, (left, run) in enumerate(_widened(partition(self.width, across), reach)):
+                yield _Window(
+                    slice(top, top + len(rise)),
+                    slice(left, left + len(run)),
+                    np.outer(rise, run).astype(np.float32),
+                    UniformBlur(self.kernels[i][j]),
+                )
+
+
+def _widened(
+    pieces: tuple[tuple[int, NDArray[np.float64]], ...], margin: int
+) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Move windows of the frame onto the latent plane, the outer ones flat over the margin."""
+    for i, (start, window) in enumerate(pieces):
+        before = margin if i == 0 else 0
+        after = margin if i == len(pieces) - 1 else 0
+        yield start + margin - before, np.pad(window, (before, after), mode="edge")

@@ -1,0 +1,124 @@
+"""Which places of a picture are looked at, and their crops side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.gallery.rendering import Rendered
+from lensmodel.quality.images import Picture as Shown
+from lensmodel.quality.images import crop_boxes
+
+SIDE: Final = 96
+ZOOM: Final = 3
+"""Pixels of a crop, and how many times each is shown."""
+
+WORST: Final = 3  # crops of the worst places (chosen)
+_BLOCK: Final = 48  # pixels of a square that is scored: half a crop, so that one shows all of it
+_EVEN: Final = 0.02
+"""Added to the local contrast: a change of an even place counts against it, not against nothing."""
+_GAP: Final = 6  # pixels between crops (chosen)
+
+Place = tuple[str, int, int]
+"""Name, first row and first column."""
+
+
+def places(
+    before: Rendered,
+    after: Rendered,
+    keep: NDArray[np.float32] | None,
+    named: Sequence[tuple[str, Sequence[int] | None]] = (),
+) -> list[Place]:
+    """Center, corners, and the worst three: by the audit, or else where most was changed.
+
+    Parameters
+    ----------
+    before, after : ndarray of uint16, shape (row, col, 3)
+    keep : ndarray, shape (row, col), or None
+        Share of the correction that the audit would keep; its worst places are where it takes most away.
+    named : sequence of (str, (row, col) or None)
+        Further places by the pixel in their middle; left out where another crop shows most of them.
+    """
+    height, width = before.shape[:2]
+    side = side_of(before)
+    found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]
+    score = _change(before, after)
+    if keep is not None:
+        score = score * _held_back(keep)  # where nothing was changed there is nothing to hold back
+    word = "most changed" if keep is None else "audit"
+    for number, (row, col) in enumerate(_peaks(score, side), start=1):
+        found.append((f"{word} {number}", *_inside(row, col, side, height, width)))
+    for name, pixel in named:
+        if pixel is None:
+            continue
+        row, col = _inside(pixel[0], pixel[1], side, height, width)
+        if all(max(abs(row - r), abs(col - c)) > side // 2 for _, r, c in found):
+            found.append((name, row, col))
+    return found
+
+
+def side_of(picture: Rendered) -> int:
+    """Side of the crops of a picture: less where it is small."""
+    return min(SIDE, picture.shape[0] // 2, picture.shape[1] // 2)
+
+
+def sheet(pictures: Sequence[Rendered], row: int, col: int, side: int) -> Shown:
+    """One place of several pictures side by side, each pixel as a square of three."""
+    tall = side * ZOOM
+    out = np.full((tall, len(pictures) * (tall + _GAP) - _GAP, 3), 255, dtype=np.uint8)
+    for number, picture in enumerate(pictures):
+        crop = (picture[row : row + side, col : col + side] // 257).astype(np.uint8)
+        left = number * (tall + _GAP)
+        out[:, left : left + tall] = crop.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
+    return out
+
+
+def drawn(keep: NDArray[np.float32], longest: int = 640) -> Shown:
+    """Map of what the audit would hold back: black where it keeps everything; the least of each square."""
+    step = max(-(-max(keep.shape) // longest), 1)
+    height, width = (n // step * step for n in keep.shape)
+    least = keep[:height, :width].reshape(height // step, step, width // step, step).min(axis=(1, 3))
+    shade = np.rint(255.0 * (1.0 - np.clip(least, 0.0, 1.0))).astype(np.uint8)
+    return np.repeat(shade[..., None], 3, axis=-1)
+
+
+def _change(before: Rendered, after: Rendered) -> NDArray[np.float64]:
+    """Mean change of each block over the original's contrast there."""
+    across = before.shape[1] // _BLOCK
+    rows = []
+    for row in range(0, before.shape[0] - _BLOCK + 1, _BLOCK):
+        strips = []
+        for picture in (before, after):
+            strip = np.asarray(picture[row : row + _BLOCK, : across * _BLOCK], dtype=np.float64) / 65535.0
+            strips.append(strip.reshape(_BLOCK, across, _BLOCK, 3))
+        old, new = strips
+        contrast = old.std(axis=(0, 2)).mean(axis=-1)
+        rows.append(np.abs(new - old).mean(axis=(0, 2, 3)) / (contrast + _EVEN))
+    return np.array(rows)
+
+
+def _held_back(keep: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Mean share of the correction that each block loses by the audit."""
+    down, across = (n // _BLOCK for n in keep.shape)
+    blocks = keep[: down * _BLOCK, : across * _BLOCK].reshape(down, _BLOCK, across, _BLOCK)
+    return 1.0 - blocks.mean(axis=(1, 3), dtype=np.float64)
+
+
+def _peaks(score: NDArray[np.float64], side: int) -> list[tuple[int, int]]:
+    """Middles of the highest blocks whose crops do not overlap; none where nothing was changed."""
+    apart = -(-side // _BLOCK)
+    left = score.copy()
+    found: list[tuple[int, int]] = []
+    while len(found) < WORST and left.size and left.max() > 0.0:
+        row, col = (int(k) for k in np.unravel_index(int(left.argmax()), left.shape))
+        found.append((row * _BLOCK + _BLOCK // 2, col * _BLOCK + _BLOCK // 2))
+        left[max(row - apart, 0) : row + apart + 1, max(col - apart, 0) : col + apart + 1] = 0.0
+    return found
+
+
+def _inside(row: int, col: int, side: int, height: int, width: int) -> tuple[int, int]:
+    """First pixel of a crop around a pixel."""
+    return min(max(row - side // 2, 0), height - side), min(max(col - side // 2, 0), width - side)

@@ -1,0 +1,385 @@
+"""How well regressions predict the PSF where no sample was: simulated lenses, or measured fields.
+
+Three kinds of input:
+
+* lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
+  n photos and asked at places in between and beyond;
+* the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
+  ways to answer can be compared;
+* a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
+  aperture and group): groups are held out in turn.
+
+Compared with two ways of the trade: linear interpolation between PSFs of the image plane, which is
+what efficient filter flow does, and a polynomial of the place for each pixel, as PSFEx fits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
+
+from lab.cases import list_photos, photo_half
+from lab.model.estimated import estimated_samples
+from lab.model.exact import PaperModel
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.psf import PsfSample, as_kernel, centred, distance, gaussian
+from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
+from lensmodel.model import LensModel, ModelSettings, smoothers
+from lensmodel.model.answer import MODES
+from lensmodel.simulate import draw_lens
+
+FRAME = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)
+PATCHES = (4, 6)  # rows and columns: 24 patches, as a calibration has in one photo
+SIZE = 31  # pixels: that of an estimate
+MARGIN_PX = 96  # half a window of a calibration: patches lie within the frame
+_SOFT_PX, _GRAIN = 1.1, 0.4  # at level 1: by them `level` is about the relative L2, see below
+
+Predictor = Callable[[FieldPosition], Kernel]
+Fit = Callable[[Sequence[PsfSample]], Predictor]
+
+
+def patch_places(rng: np.random.Generator) -> list[FieldPosition]:
+    """Draw one place in each cell of a 4 x 6 tiling: the 24 patches of a photo."""
+    rows, cols = PATCHES
+    found = []
+    for i in range(rows):
+        for j in range(cols):
+            row = (i + rng.uniform(0.1, 0.9)) / rows * FRAME.height
+            col = (j + rng.uniform(0.1, 0.9)) / cols * FRAME.width
+            row = min(max(row, MARGIN_PX), FRAME.height - 1 - MARGIN_PX)
+            col = min(max(col, MARGIN_PX), FRAME.width - 1 - MARGIN_PX)
+            found.append(FRAME.position(float(row), float(col)))
+    return found
+
+
+def like_estimated(kernel: Kernel, rng: np.random.Generator, level: float) -> Kernel:
+    """Spoil a kernel as blind estimation does: what the scene was soft by, and noise.
+
+    The softness is a Gaussian of random axes, different in every patch. The noise is smooth over two
+    pixels and grows with the root of the light. At `level` 0.35 the relative L2 is about 0.35 in the
+    mean of the lenses of `draw_lens`.
+    """
+    side = kernel.shape[0]
+    axes = np.linalg.qr(rng.normal(size=(2, 2)))[0] * (level * _SOFT_PX * rng.gamma(2.0, 0.5, 2))
+    soft = fftconvolve(kernel, gaussian(side, axes @ axes.T + 1e-3 * np.eye(2)), mode="same")
+    soft = np.maximum(soft, 0.0)
+    grain = gaussian_filter(rng.normal(size=kernel.shape), 0.7)
+    noisy = soft + level * _GRAIN * grain / grain.std() * np.sqrt(soft * soft.max())
+    return centred(np.maximum(noisy, 0.0))
+
+
+def asked_places() -> list[FieldPosition]:
+    """Places of the questions, all inside the frame: 12 at the center, 8 mid, 12 in the corners."""
+    rings: list[tuple[tuple[float, ...], tuple[float, ...]]] = [
+        ((0.05, 0.15, 0.27), (-2.2, -0.6, 1.1, 2.6)),
+        ((0.4, 0.6), (-2.7, -0.5, 0.4, 2.5)),
+        ((0.8, 0.9), (-2.58, -0.52, 0.55, 2.62)),
+        ((0.98,), (-2.55, -0.6, 0.58, 2.56)),
+    ]
+    return [FieldPosition(r, phi) for radii, angles in rings for r in radii for phi in angles]
+
+
+@dataclass(frozen=True, slots=True)
+class MethodErrors:
+    """Errors of one method: mean relative L2 by zone after sub-pixel alignment.
+
+    `worst` are the means of the lens that is worst in each zone, where there were several. `net` is what of
+    the root of the mean square is left without the noise of the held-out PSFs, where those say how noisy they
+    are.
+    """
+
+    method: str
+    photos: int
+    errors: Mapping[Zone, float]
+    seconds: float
+    net: Mapping[Zone, float] | None = None
+    worst: Mapping[Zone, float] | None = None
+
+
+def run_model_benchmark(
+    *,
+    seeds: Sequence[int] = (1000, 1001, 1002, 1003),
+    photos: Sequence[int] = (1, 5),
+    methods: Sequence[str] | None = None,
+    psf_field: Path | None = None,
+    spoiled: float = 0.0,
+    photographs: Path | None = None,
+    on_step: StepHook = ignore_step,
+) -> dict[str, Any]:
+    """Compare methods of regression by the error of their predictions.
+
+    Parameters
+    ----------
+    seeds : sequence of int
+        Lenses to draw. Nothing was tuned on seeds from 1000 on.
+    photos : sequence of int
+        How many photos of 24 patches a model sees.
+    methods : sequence of str, optional
+        Names in `smoothers`, "eff-linear", "polynomial", "paper", or the modes "mode-default" and
+        "mode-paper"; by default all, but modes only of `photographs`.
+    psf_field : Path, optional
+        Measured PSFs; then `seeds` and `photos` play no part.
+    spoiled : float
+        Relative L2 of the kernels that models are fed with, see `like_estimated`; they are asked for
+        the true ones in any case.
+    photographs : Path, optional
+        Folder of sharp photographs; models are fed with blind estimates of patches of them, those of the
+        test half, in an order drawn for each lens.
+    on_step : StepHook
+        Told after each fit of a method with its questions.
+
+    Returns
+    -------
+    dict
+        `rows` of method, photos, errors by zone, seconds; and what was asked.
+    """
+    fits = _fits(methods, modes=photographs is not None)
+    if psf_field is not None:
+        samples = load_field(psf_field)
+        rows: list[MethodErrors] = []
+        for name, fit in fits.items():
+            on_step(len(rows), len(fits))
+            rows.append(_held_out(name, fit, samples))
+        on_step(len(fits), len(fits))
+        return {"psf_field": psf_field.name, "samples": len(samples), "rows": [_plain(r) for r in rows]}
+    collected: dict[tuple[str, int], list[list[tuple[Zone, float]]]] = {}
+    seconds: dict[tuple[str, int], float] = {}
+    done, total = 0, len(seeds) * len(photos) * len(fits)
+    on_step(done, total)
+    for seed in seeds:
+        lens = draw_lens(seed)
+        rng = np.random.default_rng(seed)
+        samples = (
+            [
+                PsfSample(lens.kernel(place, None, SIZE), place, photo=f"photo{i}")
+                for i in range(max(photos))
+                for place in patch_places(rng)
+            ]
+            if photographs is None
+            else estimated_samples(lens, _drawn(photographs, seed, max(photos)), seed)
+        )
+        if spoiled > 0:
+            spoil = np.random.default_rng([seed, 1])
+            samples = [replace(s, kernel=like_estimated(s.kernel, spoil, spoiled)) for s in samples]
+        truth = [(place, lens.kernel(place, None, SIZE)) for place in asked_places()]
+        for count in photos:
+            names = {f"photo{i}" for i in range(count)}
+            seen = [s for s in samples if s.photo in names]
+            for name, fit in fits.items():
+                start = time.process_time()
+                predict = fit(seen)
+                found = [(zone_of(p.r), distance(predict(p), k).rel_l2) for p, k in truth]
+                seconds[name, count] = seconds.get((name, count), 0.0) + time.process_time() - start
+                collected.setdefault((name, count), []).append(found)
+                done += 1
+                on_step(done, total)
+    rows = [_over_lenses(*key, lenses, seconds[key]) for key, lenses in collected.items()]
+    conditions = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
+    return {**conditions, "rows": [_plain(row) for row in rows]}
+
+
+def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
+    """Fit one of the methods of `run_model_benchmark` to samples; all of the same settings.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no method of that name.
+    """
+    return _fits([method])[method](samples)
+
+
+def load_field(path: Path) -> list[PsfSample]:
+    """Read measured PSFs from an npz; negative pixels are noise and become zero.
+
+    Raises
+    ------
+    InvalidInputError
+        If a key is missing or shapes differ.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            psf, r, phi = stored["psf"], stored["r"], stored["phi"]
+            aperture = stored["aperture"] if "aperture" in stored else np.full(len(psf), np.nan)
+            group = stored["group"] if "group" in stored else np.arange(len(psf)) % 5
+    except (OSError, ValueError, KeyError) as error:
+        raise InvalidInputError(
+            f"{path.name} must be an npz with psf (n, k, k), r and phi (n,), optionally aperture and group"
+        ) from error
+    if psf.ndim != 3 or not len(psf) == len(r) == len(phi) == len(aperture) == len(group):
+        raise InvalidInputError(f"{path.name}: psf must be (n, k, k) and the others (n,), got {psf.shape}")
+    return [
+        PsfSample(
+            centred(np.maximum(psf[i], 0.0)),
+            FieldPosition(float(r[i]), float(phi[i])),
+            LensSettings(aperture=None if math.isnan(aperture[i]) else float(aperture[i])),
+            photo=str(group[i]),
+        )
+        for i in range(len(psf))
+    ]
+
+
+def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
+    """Photographs of the test half that a lens is used for."""
+    files = [p for p in list_photos(folder) if photo_half(p.stem) == "test"]
+    if len(files) < count:
+        raise InvalidInputError(
+            f"{folder} holds {len(files)} photographs of the test half; {count} are needed"
+        )
+    return [files[i] for i in np.random.default_rng(seed).permutation(len(files))[:count]]
+
+
+def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fit]:
+    known: dict[str, Fit] = {
+        "eff-linear": _linear,
+        "polynomial": _polynomial,
+        "paper": _paper,
+        **{name: _regression(ModelSettings(method=name)) for name in smoothers},
+        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
+    }
+    unknown = [name for name in methods or () if name not in known]
+    if unknown:
+        raise InvalidInputError(f"no method {unknown[0]!r}; known: {', '.join(sorted(known))}")
+    usual = [name for name in known if modes or not name.startswith("mode-")]
+    return {name: known[name] for name in methods or usual}
+
+
+def _regression(chosen: ModelSettings) -> Fit:
+    def fit(samples: Sequence[PsfSample]) -> Predictor:
+        model = LensModel.fit(samples, chosen)
+        settings, size = samples[0].settings, samples[0].kernel.shape[0]
+        return lambda place: model.query(place, settings, size).kernel
+
+    return fit
+
+
+def _paper(samples: Sequence[PsfSample]) -> Predictor:
+    model = PaperModel.fit(samples)
+    settings, size = samples[0].settings, samples[0].kernel.shape[0]
+    return lambda place: model.kernel_at_settings(place, settings, size)
+
+
+def _xy(places: Sequence[FieldPosition]) -> NDArray[np.float64]:
+    return np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in places])
+
+
+def _linear(samples: Sequence[PsfSample]) -> Predictor:
+    """Linear interpolation of pixels between the PSFs of the image plane; the nearest outside."""
+    where, values = _xy([s.position for s in samples]), np.stack([s.kernel for s in samples])
+    inside, outside = LinearNDInterpolator(where, values), NearestNDInterpolator(where, values)
+
+    def predict(place: FieldPosition) -> Kernel:
+        found = inside(_xy([place]))[0]
+        return as_kernel(np.maximum(found if np.isfinite(found).all() else outside(_xy([place]))[0], 0.0))
+
+    return predict
+
+
+def _polynomial(samples: Sequence[PsfSample]) -> Predictor:
+    """Polynomial of degree 3 in the place for each pixel, least squares with a small ridge."""
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+
+    def features(where: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([where[:, 0] ** i * where[:, 1] ** j for i, j in powers], axis=1)
+
+    design = features(_xy([s.position for s in samples]))
+    values = np.stack([s.kernel.ravel() for s in samples])
+    size = samples[0].kernel.shape[0]
+    solved = np.linalg.solve(design.T @ design + 1e-3 * np.eye(len(powers)), design.T @ values)
+    return lambda place: as_kernel(np.maximum(features(_xy([place])) @ solved, 0.0).reshape(size, size))
+
+
+def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> MethodErrors:
+    groups = sorted({s.photo for s in samples})
+    start, errors, noise = time.process_time(), [], list[float]()
+    for group in groups:
+        predict = fit([s for s in samples if s.photo != group])
+        held = [s for s in samples if s.photo == group]
+        errors += [(zone_of(s.position.r), distance(predict(s.position), s.kernel).rel_l2) for s in held]
+        noise += [0.0 if s.error is None else s.error for s in held]
+    row = _row(name, len(groups) - 1, errors, time.process_time() - start)
+    if not any(noise):
+        return row
+    beyond = _row("", 0, [(z, e**2 - n**2) for (z, e), n in zip(errors, noise, strict=True)], 0.0)
+    return replace(row, net={z: math.sqrt(max(e, 0.0)) for z, e in beyond.errors.items()})
+
+
+def _over_lenses(
+    name: str, photos: int, lenses: Sequence[Sequence[tuple[Zone, float]]], seconds: float
+) -> MethodErrors:
+    mean = _row(name, photos, [error for errors in lenses for error in errors], seconds)
+    alone = [_row(name, photos, errors, 0.0).errors for errors in lenses]
+    return replace(mean, worst={zone: max(one.get(zone, 0.0) for one in alone) for zone in mean.errors})
+
+
+def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> MethodErrors:
+    by_zone = {zone: [e for z, e in errors if z == zone] for zone in ZONES}
+    return MethodErrors(name, photos, {z: float(np.mean(e)) for z, e in by_zone.items() if e}, seconds)
+
+
+def _plain(row: MethodErrors) -> dict[str, Any]:
+    return {
+        "method": row.method,
+        "photos": row.photos,
+        "errors": dict(row.errors),
+        "rel_l2": dict(row.errors),  # the same by the name of the measure
+        "seconds": round(row.seconds, 2),
+        **({} if row.net is None else {"net": dict(row.net)}),
+        **({} if row.worst is None else {"worst": dict(row.worst)}),
+    }
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """Write the rows of a result as a Markdown table."""
+    net = any("net" in row for row in result["rows"])
+    more = [f"{zone}, net of noise" for zone in ZONES] if net else []
+    titles = ["method", "photos", *ZONES, *more, "CPU s"]
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    for row in sorted(result["rows"], key=lambda r: (r["photos"], r["errors"].get("corner", 0.0))):
+        kinds = [row["errors"], row["net"]] if net else [row["errors"]]
+        cells = [f"{kind[zone]:.3f}" if zone in kind else "-" for kind in kinds for zone in ZONES]
+        lines.append(f"| {row['method']} | {row['photos']} | {' | '.join(cells)} | {row['seconds']:.1f} |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run from the command line: `python -m lab.model.model_benchmark --seeds 1000:1008`."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seeds", default="1000:1004", help="first:last, the last excluded")
+    parser.add_argument("--photos", default="1,5", help="numbers of photos, with commas")
+    parser.add_argument("--methods", default=None, help="names with commas; all by default")
+    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs")
+    parser.add_argument("--spoiled", type=float, default=0.0, help="relative L2 of the kernels fed")
+    parser.add_argument("--photographs", type=Path, default=None, help="folder; estimate patches of those")
+    parser.add_argument("--json", type=Path, default=None, help="also write the result there")
+    given = parser.parse_args(arguments)
+    first, last = (int(part) for part in given.seeds.split(":"))
+    result = run_model_benchmark(
+        seeds=range(first, last),
+        photos=[int(part) for part in given.photos.split(",")],
+        methods=None if given.methods is None else given.methods.split(","),
+        psf_field=given.psf_field,
+        spoiled=given.spoiled,
+        photographs=given.photographs,
+    )
+    sys.stdout.write(table(result) + "\n")
+    if given.json is not None:
+        given.json.write_text(json.dumps(result, indent=2), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

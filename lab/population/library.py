@@ -1,0 +1,189 @@
+"""A library of lenses with photos through them, in shards on disk; seeded, resumable, on any number of cores.
+
+A lens is drawn from its number alone, so that a library is the same however often it was interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.population import traced
+from lab.population.kernels import PopulationLens, behind_sensor, coarse_of, fine_of, kernels_of
+from lab.population.photos import KINDS, Camera, Kind, Scenes
+from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
+from lab.population.wavefronts import RandomLens
+from lensmodel.core.files import atomic
+from lensmodel.neural.statistics import to_octant
+
+Family = Literal["wavefront", "third-order", "traced"]
+FAMILIES: Final[tuple[Family, ...]] = ("wavefront", "third-order", "traced")
+SHARD: Final = 25
+"""Lenses in a shard: a minute's work at most is lost when a run is ended."""
+
+_KIND_SHARES: Final = (0.64, 0.12, 0.24)
+_PHOTO_COUNTS: Final = ((1, 2, 3, 5), (0.3, 0.2, 0.2, 0.3))
+_PLAIN_PATCHES: Final = 72  # of each photo
+_OFF_CENTRE: Final = 0.08  # share of lenses whose pictures are cut out of a larger one
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Settings of a lens at which kernels are known."""
+
+    f_number: float
+    focal_mm: float
+    zoom: float  # 0..1 between the two fields of a zoom
+
+
+def places(rng: np.random.Generator, cells: int = 4) -> NDArray[np.float64]:
+    """8 + cells^2 places of a frame: the centre, three about it, a jittered grid, near the four corners."""
+    aspect = rng.choice([1.5, 1.5, 4 / 3, 16 / 9])
+    hx, hy = aspect / np.hypot(aspect, 1), 1 / np.hypot(aspect, 1)
+    at = [(0.001, 0.0005)]
+    at += [tuple(rng.normal(0, 0.15, 2)) for _ in range(3)]
+    side = 2 / cells
+    for i in range(cells):
+        at += [
+            (((i + rng.random()) * side - 1) * hx, ((j + rng.random()) * side - 1) * hy) for j in range(cells)
+        ]
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            t = rng.uniform(0.82, 0.98)
+            at.append((sx * hx * t, sy * hy * t))
+    return np.array(at)
+
+
+def draw_lens(
+    family: Family, rng: np.random.Generator, *, held_out: bool
+) -> tuple[PopulationLens, list[State]]:
+    """Draw a lens and the states it is photographed at."""
+    if family == "traced":
+        names = sorted(name for name in PRESCRIPTIONS if (name in HELD_OUT) == held_out)
+        lens: PopulationLens = traced.draw(rng, names)
+        zooms = [0.0]
+    else:
+        zoom = family == "wavefront" and rng.random() < 0.12
+        lens = RandomLens(rng, family, zoom=zoom)
+        zooms = [0.0, float(rng.uniform(0.3, 1.0))] if zoom else [0.0]
+    stops = [0.0, *rng.uniform(0.4, 3.0, int(rng.choice([0, 1, 2], p=[0.6, 0.28, 0.12])))]
+    ratio = float(np.exp(rng.uniform(np.log(1.2), np.log(4.0))))
+    return lens, [
+        State(lens.f_number * 2 ** (stop / 2), lens.focal_mm * ratio**zoom, zoom)
+        for zoom in zooms
+        for stop in stops
+    ]
+
+
+def draw_sensor(rng: np.random.Generator) -> tuple[float, float]:
+    """Separation of the optical low-pass filter's spots and r.m.s. diffusion, both in pixels.
+
+    Of some sensors neither; a few lenses wear a softening filter, whose blur is that of a strong diffusion.
+    """
+    separation = rng.uniform(0.35, 1.0) if rng.random() < 0.35 else 0.0
+    diffusion = rng.uniform(0.1, 0.4) if rng.random() < 0.5 else 0.0
+    if rng.random() < 0.04:
+        diffusion = rng.uniform(0.4, 2.5)
+    return float(separation), float(diffusion)
+
+
+def make_lens(
+    family: Family, number: int, scenes: Scenes, *, held_out: bool, plain: bool = False
+) -> dict[str, Any] | None:
+    """Make one lens with the statistics of its photos; None where they hardly show anything.
+
+    Plain lenses have five RAW photos that nothing spoils.
+    """
+    rng = np.random.default_rng([number, FAMILIES.index(family), int(held_out)])
+    lens, states = draw_lens(family, rng, held_out=held_out)
+    if plain:
+        states = states[:1]
+    xy = places(rng, 4 if held_out else 3)
+    on_lens = xy
+    if rng.random() < _OFF_CENTRE and not plain:
+        size = rng.uniform(0.45, 0.95)
+        on_lens = size * xy + rng.uniform(-1, 1, 2) * (1 - size) * np.array([0.8, 0.5])
+    kernels = []
+    for state in states:
+        at = lens.at_state(state.zoom, 1.0) if isinstance(lens, RandomLens) and state.zoom else lens
+        kernels.append(kernels_of(at, on_lens, state.f_number))
+    stacked = np.array(kernels)
+    if not plain:
+        stacked = behind_sensor(stacked, *draw_sensor(rng))
+    kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    camera = Camera(rng, scenes, kind, xy, stacked, plain)
+    photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
+    count = int(rng.choice([32, 56, 110], p=[0.35, 0.4, 0.25]))
+    patches = camera.take(5, 5 * _PLAIN_PATCHES) if plain else camera.take(photos, count)
+    if len(patches.place) < 8:
+        return None
+    if camera.processing is not None:
+        stacked = camera.processing.applied(stacked)
+    turned = to_octant(patches.statistics, xy[patches.place])
+    return {
+        "statistics": turned.astype(np.float16),
+        "place": patches.place.astype(np.int16),
+        "photo": patches.photo.astype(np.int16),
+        "state": patches.state.astype(np.int16),
+        "xy": xy.astype(np.float32),
+        "fine": fine_of(stacked).astype(np.float16),
+        "coarse": coarse_of(stacked).astype(np.float16),
+        "states": np.array([(s.f_number, s.focal_mm) for s in states], np.float32),
+        "facts": np.array([lens.pitch_um, KINDS.index(kind)], np.float32),
+    }
+
+
+def _make_shard(
+    folder: Path, scenes: Path, family: Family, shard: int, *, held_out: bool, plain: bool
+) -> int:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{family}-{shard:05d}.npz"
+    if path.exists():
+        return 0
+    crops = Scenes(scenes, held_out=held_out)
+    made: dict[str, Any] = {}
+    count = 0
+    for number in range(shard * SHARD, (shard + 1) * SHARD):
+        lens = make_lens(family, number, crops, held_out=held_out, plain=plain)
+        if lens is not None:
+            made.update({f"{count}/{name}": value for name, value in lens.items()})
+            count += 1
+    with atomic(path) as file:
+        np.savez(file, **made)
+    return count
+
+
+def generate(
+    folder: Path,
+    scenes: Path,
+    family: Family,
+    shards: Sequence[int],
+    *,
+    held_out: bool,
+    plain: bool,
+    processes: int,
+) -> Iterator[int]:
+    """Make the shards that are not there yet; yield how many lenses each has got."""
+    with ProcessPoolExecutor(processes) as pool:
+        jobs = [
+            pool.submit(_make_shard, folder, scenes, family, shard, held_out=held_out, plain=plain)
+            for shard in shards
+        ]
+        for job in jobs:
+            yield job.result()
+
+
+def load_shard(path: Path) -> list[dict[str, NDArray[Any]]]:
+    """Read the lenses of a shard."""
+    lenses: dict[str, dict[str, NDArray[Any]]] = {}
+    with np.load(path) as shard:
+        for key in shard.files:
+            number, name = key.split("/")
+            lenses.setdefault(number, {})[name] = shard[key]
+    return list(lenses.values())

@@ -1,0 +1,248 @@
+"""Lenses of a library as sets of samples and queries, for training and judging."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.population.library import FAMILIES, Family, load_shard
+from lensmodel.core.files import atomic
+from lensmodel.neural import Conditions, FieldNetwork
+from lensmodel.neural.features import KINDS
+from lensmodel.neural.network import assembled, outer_cells
+from lensmodel.neural.statistics import group
+from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image
+
+_UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
+
+
+@dataclass(slots=True)
+class Lens:
+    """One lens of the library, ready for sets."""
+
+    statistics: NDArray[np.float16]
+    place: NDArray[np.int64]
+    photo: NDArray[np.int64]
+    state: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    settings: NDArray[np.float64]  # (states, SETTINGS)
+    truth: NDArray[np.float16]  # (states, places, 3, _LOGITS), in the octants' frames
+
+    @classmethod
+    def of(cls, stored: Mapping[str, NDArray[Any]]) -> Lens:
+        """Make one of what a shard holds."""
+        xy = stored["xy"].astype(np.float64)
+        pitch, kind = stored["facts"]
+        states = stored["states"].astype(np.float64)
+        settings = np.full((len(states), 5), np.nan)
+        settings[:, 0] = np.log(states[:, 0])
+        settings[:, 1] = np.log(0.54 * states[:, 0] / pitch)
+        settings[:, 2] = np.log(states[:, 1])
+        settings[:, 4] = kind
+        octants = octant_of(xy)
+        turned = []
+        for name in ("fine", "coarse"):
+            kernels = stored[name]
+            parts = np.stack([to_octant_image(int(o), kernels[:, p]) for p, o in enumerate(octants)], 1)
+            turned.append(
+                parts[..., outer_cells()] if name == "coarse" else parts.reshape(*parts.shape[:3], -1)
+            )
+        return cls(
+            np.nan_to_num(stored["statistics"]), stored["place"].astype(int), stored["photo"].astype(int),
+            stored["state"].astype(int), xy, settings, np.concatenate(turned, -1),
+        )  # fmt: skip
+
+
+def load_library(
+    folder: Path, known: set[str], families: Sequence[Family] = FAMILIES, limit: int = 10**9
+) -> list[Lens]:
+    """Lenses of the shards that are not known yet; adds their names."""
+    lenses: list[Lens] = []
+    for family in families:
+        for path in sorted(folder.glob(f"{family}-*.npz")):
+            if path.name in known or len(lenses) >= limit:
+                continue
+            known.add(path.name)
+            lenses += [Lens.of(stored) for stored in load_shard(path)]
+    return lenses
+
+
+@dataclass(slots=True)
+class Set:
+    """Some samples of one lens, and queries with their truth."""
+
+    statistics: NDArray[np.float32]
+    xy: NDArray[np.float64]
+    settings: NDArray[np.float64]
+    photo: NDArray[np.int64]
+    query_xy: NDArray[np.float64]
+    query_settings: NDArray[np.float64]
+    truth: NDArray[np.float16]
+
+
+def _swapped(
+    statistics: NDArray[np.float32], truth: NDArray[np.float16]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Exchange red and blue: no network should know which is which."""
+    out = statistics.copy()
+    red, blue, level = group("red"), group("blue"), group("level").start
+    out[:, red], out[:, blue] = statistics[:, blue], statistics[:, red]
+    out[:, level : level + 2], out[:, level + 4 : level + 6] = (
+        statistics[:, level + 4 : level + 6],
+        statistics[:, level : level + 2],
+    )
+    return out, truth[:, ::-1]
+
+
+def draw_set(lens: Lens, samples: int, queries: int, rng: np.random.Generator, *, varied: bool = True) -> Set:
+    """Draw samples of one to all photos, and queries; half the time with no sample at their places."""
+    index = np.arange(len(lens.place))
+    if samples <= 24 and rng.random() < 0.5:
+        index = index[lens.photo == rng.choice(lens.photo)]
+    asked = rng.choice(len(lens.xy), queries, replace=False)
+    state = (
+        int(rng.integers(len(lens.settings))) if rng.random() < 0.5 else int(rng.choice(lens.state[index]))
+    )
+    if samples <= 2:
+        asked[0] = lens.place[rng.choice(index)]
+        index = np.concatenate([index[lens.place[index] == asked[0]], index]) if samples == 1 else index
+        chosen = index[:1] if samples == 1 else rng.permutation(index)[:samples]
+        if rng.random() < 0.7:
+            state = int(lens.state[chosen[0]])
+    else:
+        if rng.random() < 0.5 and len(apart := index[~np.isin(lens.place[index], asked[: queries // 2])]) > 2:
+            index = apart
+        chosen = rng.permutation(index)[:samples]
+    settings = lens.settings.copy()
+    if varied and rng.random() < _UNKNOWN:
+        settings[:, :2] = np.nan
+    elif varied and rng.random() < _UNKNOWN:
+        settings[:, 1] = np.nan
+    if len(np.unique(settings[:, 2])) == 1 or rng.random() < 0.2:
+        settings[:, 2] = np.nan
+    statistics, truth = lens.statistics[chosen].astype(np.float32), lens.truth[state][asked]
+    if varied and rng.random() < 0.5:
+        statistics, truth = _swapped(statistics, truth)
+    return Set(
+        statistics, lens.xy[lens.place[chosen]], settings[lens.state[chosen]], lens.photo[chosen],
+        lens.xy[asked], np.repeat(settings[state][None], queries, 0), truth,
+    )  # fmt: skip
+
+
+def conditions_of(settings: NDArray[np.float64]) -> Conditions:
+    """Turn a row of settings back into what it was made of."""
+    f_number, width, focal, focus = (None if math.isnan(v) else math.exp(v) for v in settings[:4])
+    pitch = None if None in (f_number, width) else 0.54 * f_number / width  # type: ignore[operator]
+    return Conditions(f_number, pitch, focal, focus, KINDS[int(settings[4])])
+
+
+def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Relative L2 errors of the network's kernels on a set, and those it expects; both (queries, 3)."""
+    tokens = np.empty((len(drawn.xy), 0), np.float32)
+    for photo in np.unique(drawn.photo):
+        part = drawn.photo == photo
+        known = conditions_of(drawn.settings[part][0])
+        encoded = network.encode(drawn.statistics[part], drawn.xy[part], known)
+        if not tokens.size:
+            tokens = np.empty((len(drawn.xy), encoded.shape[1]), np.float32)
+        tokens[part] = encoded
+    memory = network.memory(tokens, drawn.xy, [conditions_of(row) for row in drawn.settings])
+    made, told = [], []
+    for xy, row, shares in zip(drawn.query_xy, drawn.query_settings, drawn.truth, strict=True):
+        answer = network.query(memory, xy, conditions_of(row))
+        truth = from_octant_image(int(octant_of(xy)), assembled(shares))
+        power = np.square(truth).sum((1, 2))
+        made.append(np.sqrt(np.square(answer.kernels - truth).sum((1, 2)) / power))
+        told.append(answer.error)
+    return np.array(made), np.array(told)
+
+
+def of_photos(lens: Lens, photos: int) -> Set:
+    """All samples of the first photos, and all places at the first state as queries."""
+    chosen = np.nonzero((lens.photo < photos) & (lens.state == 0))[0]
+    places = np.arange(len(lens.xy))
+    return Set(
+        lens.statistics[chosen].astype(np.float32), lens.xy[lens.place[chosen]],
+        lens.settings[lens.state[chosen]], lens.photo[chosen],
+        lens.xy, np.repeat(lens.settings[:1], len(places), 0), lens.truth[0],
+    )  # fmt: skip
+
+
+def understated(network: FieldNetwork, sets: Iterable[Set]) -> float:
+    """How much the errors of kernels are understated: median of the logarithm of made over told errors."""
+    pairs = [answered(network, drawn) for drawn in sets]
+    made, told = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
+    return float(np.median(np.log(made / told)))
+
+
+def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
+    """Errors of kernels, of each colour, of green by zone, and how true the told errors are.
+
+    Parameters
+    ----------
+    network : FieldNetwork
+    sets : iterable of Set
+        Of lenses that were not trained on.
+
+    Returns
+    -------
+    dict of str to float
+        Relative L2 distance: mean of "r", "g", "b", and of green in "center" (r < 0.3), "mid" and "corner"
+        (r > 0.75); of the means that each lens has there, the medians; and "told_right", the share of places
+        whose told error is within a factor of 1.5.
+    """
+    made, told = [], []
+    of_lens: dict[str, list[float]] = {"center": [], "mid": [], "corner": []}
+    of_place: dict[str, list[float]] = {zone: [] for zone in of_lens}
+    for drawn in sets:
+        errors, expected = answered(network, drawn)
+        made.append(errors)
+        told.append(expected)
+        r = np.hypot(*drawn.query_xy.T)
+        for zone, inside in (("center", r < 0.3), ("mid", (r >= 0.3) & (r <= 0.75)), ("corner", r > 0.75)):
+            if inside.any():
+                of_lens[zone].append(float(errors[inside, 1].mean()))
+                of_place[zone] += errors[inside, 1].tolist()
+    e, t = np.concatenate(made), np.concatenate(told)
+    figures = {colour: float(e[:, i].mean()) for i, colour in enumerate("rgb")}
+    figures |= {zone: float(np.mean(values)) for zone, values in of_place.items()}
+    figures |= {f"{zone}_median": float(np.median(values)) for zone, values in of_lens.items()}
+    right = np.abs(np.log(t[:, 1] / e[:, 1])) < math.log(1.5)
+    return {**figures, "told_right": float(right.mean())}
+
+
+def save_sets(sets: Sequence[Set], path: Path) -> None:
+    """Write sets to one file."""
+    arrays = {f"{i}/{f.name}": getattr(one, f.name) for i, one in enumerate(sets) for f in fields(Set)}
+    arrays = {name: a.astype(np.float16) if name.endswith("statistics") else a for name, a in arrays.items()}
+    with atomic(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+def load_sets(path: Path) -> list[Set]:
+    """Read what `save_sets` wrote."""
+    sets: dict[str, dict[str, NDArray[Any]]] = {}
+    with np.load(path) as stored:
+        for key in stored.files:
+            number, name = key.split("/")
+            sets.setdefault(number, {})[name] = stored[key]
+    return [Set(**{**one, "statistics": one["statistics"].astype(np.float32)}) for one in sets.values()]
+
+
+def fixed_set(lenses: Sequence[Lens], *, samples: int = 48, queries: int = 7, count: int = 8) -> list[Set]:
+    """A small set to hold weights by: the first photos of some lenses, every few of their places."""
+    chosen = []
+    for lens in lenses[:: max(len(lenses) // count, 1)][:count]:
+        whole = of_photos(lens, 1)
+        asked = slice(None, None, len(whole.query_xy) // queries)
+        kept = {f.name: getattr(whole, f.name) for f in fields(Set)}
+        chosen.append(
+            Set(**{n: v[asked] if n.startswith(("query", "truth")) else v[:samples] for n, v in kept.items()})
+        )
+    return chosen

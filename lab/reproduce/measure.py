@@ -1,0 +1,151 @@
+"""What is measured of a route, all against a truth that it never saw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+import numpy as np
+
+from lab.model.model_benchmark import asked_places
+from lab.reproduce.cases import Case
+from lab.reproduce.fidelity import fidelity, linear_psnr
+from lab.reproduce.routes import Answer, Place
+from lab.reproduce.shots import Shots, guard_of
+from lensmodel import quality
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import PsfField, distance
+from lensmodel.core.types import CHANNELS, ZONES, Planes
+from lensmodel.simulate import edge_chart
+
+PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
+NEAR: Final = 1.5
+"""A predicted error within this factor of the true one counts as right."""
+
+FAIR_OVERSHOOT: Final = 5.0
+"""Percent of the step: corrections are compared at no more than that."""
+
+_MIXES = 10  # steps of a strength slider (chosen): tenths
+
+
+def places() -> list[Place]:
+    """Where PSFs are asked for, in every channel: not where patches lie."""
+    return [(place, channel) for channel in CHANNELS for place in asked_places()]
+
+
+def psf_errors(answers: Sequence[Answer], truth: PsfField) -> dict[str, Any]:
+    """Compare the answers at `places()` with the truth, after sub-pixel alignment.
+
+    Returns
+    -------
+    dict
+        `rel_l2`: median by channel and zone; `mtf_rmse` alike; `predicted_right`: share of places
+        where the model's own prediction of the relative L2 lies within a factor of 1.5.
+    """
+    rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
+    mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
+    right = []
+    for (place, channel), answer in zip(places(), answers, strict=True):
+        found = distance(answer.kernel, truth.kernel_at(place, channel, PSF_SIZE))
+        rel_l2[channel][zone_of(place.r)].append(found.rel_l2)
+        mtf[channel][zone_of(place.r)].append(found.mtf_rmse)
+        ratio = answer.predicted_error / max(found.rel_l2, 1e-9)
+        right.append(1.0 / NEAR <= ratio <= NEAR)
+    return {
+        "rel_l2": _medians(rel_l2),
+        "mtf_rmse": _medians(mtf),
+        "predicted_right": float(np.mean(right)),
+    }
+
+
+def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
+    return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
+
+
+def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
+    """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
+
+    The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
+    pixel, not a constant 1, whose MTF50 would lie at infinity.
+    """
+    boxes = [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges]
+    found = quality.by_zone(quality.measure_edges(chart[channel], boxes))
+    return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
+
+
+def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
+    del row["zone"]
+    for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
+        row[name] = None if math.isnan(row[name]) else row[name] * height
+    return row
+
+
+def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[str, float]]:
+    """PSNR and SSIM of the held-out photo against the sharp scene; see `fidelity`.
+
+    Photos of the raw path are white-balanced for it; others are already.
+    """
+    gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
+    seen = photo * gains if case.conditions.container == "dng" else photo
+    return fidelity(seen, shots.truth() * gains, case.camera.frame)
+
+
+def forecast(
+    before: Mapping[str, float], after: Planes, expected: Mapping[str, float | None], shots: Shots, case: Case
+) -> dict[str, dict[str, float | None]]:
+    """Gain in PSNR of linear light that a correction expected of itself in each zone, beside the true one.
+
+    Parameters
+    ----------
+    before : mapping
+        `light` of the photo as it was.
+    after : Planes
+        Corrected, of the raw path.
+    expected : mapping
+        Decibels by zone; None where the correction does not tell.
+    """
+    found = light(after, shots, case)
+    return {
+        zone: {"expected": expected[zone], "true": found[zone] - before[zone]}
+        for zone in found
+        if zone in expected
+    }
+
+
+def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
+    """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
+    return dict(linear_psnr(photo, shots.truth(), case.camera.frame).items())
+
+
+def state(
+    chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, before: Planes | None = None
+) -> dict[str, Any]:
+    """Everything about one version of the chart, if there is one, and of the held-out photo.
+
+    With the chart as it was (`before`) each zone also has `mtf50_fair`, see `fair_mtf50`.
+    """
+    found = {} if chart is None else edges(chart, case)
+    if chart is not None and before is not None:
+        for zone, value in fair_mtf50(chart, before, case).items():
+            found[zone]["mtf50_fair"] = value
+    return {"edges": found, **pictures(photo, shots, case)}
+
+
+def fair_mtf50(chart: Planes, before: Planes, case: Case) -> dict[str, float | None]:
+    """MTF50 in LP/PH at equal overshoot, by zone.
+
+    Overshoot buys MTF50. A correction that overshoots more than 5 percent is mixed with the photo as it
+    was, in steps of a tenth, until it no longer does: that is what its strength slider would do.
+    """
+    found: dict[str, float | None] = {}
+    for step in range(_MIXES, -1, -1):
+        share = np.float32(step / _MIXES)
+        mixed = edges(before[1:2] + share * (chart[1:2] - before[1:2]), case, channel=0)
+        for zone, row in mixed.items():
+            if zone not in found and (row["overshoot"] <= FAIR_OVERSHOOT or step == 0):
+                found[zone] = row["mtf50"]
+        if len(found) == len(mixed):
+            break
+    return found

@@ -1,0 +1,351 @@
+"""The tables of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lab.reproduce.cases import HARD_METHODS
+from lab.reproduce.measure import FAIR_OVERSHOOT
+from lab.reproduce.pages.bars import Bar, held
+from lab.reproduce.pages.sheet import Page
+from lab.reproduce.pages.tables import (
+    DENOISED,
+    PAPER_WAY,
+    deconvolution,
+    hard_rows,
+    number,
+    others,
+    shown,
+    states,
+)
+from lab.reproduce.pages.verdicts import NOTHING_DB, TOLERATED_DB, TOLERATED_L2
+from lensmodel.core.types import ZONES
+
+_PAPER = [
+    ("without correction", "613", "383"),
+    ("n = 1", "923", "545"),
+    ("n = 2", "1013", "608"),
+    ("n = 5", "1076", "654"),
+    ("true (measured) PSF", "1120", "696"),
+]
+
+_COUNTED = ("zones", "worse", "clearly_worse", "ssim_worse", "unimproved")
+
+
+def table1(page: Page, found: Mapping[str, Any], label: str) -> None:
+    """MTF50 by zone, with what makes it honest."""
+    page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
+    page.text(
+        f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges. MTF50 "
+        "alone proves nothing, because a PSF that is too wide scores above the truth: read it with the "
+        "highest MTF (1.00 is right) and the overshoot of the edge in percent of the step, "
+        "both the largest of the zone. Fair is MTF50 at equal overshoot: a correction that overshoots more "
+        f"than {FAIR_OVERSHOOT:g} percent is mixed with the photo as it was until it does not. "
+        f"{PAPER_WAY.capitalize()} is learned and corrected as the paper says from end to end; its rows are "
+        "the same under each deconvolution. Other PSFs are corrected with the deconvolution of the title."
+    )
+    for method, rows in found["mtf"].items():
+        page.title(f"Deconvolution: {deconvolution(method)}", 3)
+        head = [
+            "",
+            *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over", "fair")),
+        ]
+        page.table(head, [[shown(row["state"]), *_edge_cells(row)] for row in rows])
+        page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
+        page.table(
+            ["", *ZONES, *(f"{z} tan / sag" for z in ZONES), *(f"{z} overshoot beyond" for z in ZONES)],
+            _share_rows(found, method),
+        )
+    page.text("The paper, Canon EF 24mm f/1.4 (center, corner), for comparison of shares, not of values:")
+    page.table(["", "center", "corner"], _PAPER)
+
+
+def _share_rows(found: Mapping[str, Any], method: str) -> list[list[str]]:
+    rows = []
+    for n, share in found["share"][method].items():
+        along, across = (found[f"share_{way}"][method][n] for way in ("tangential", "sagittal"))
+        beyond = found["halo"][method][n]
+        rows.append(
+            [
+                f"n = {n}",
+                *(number(share[z], 2) for z in ZONES),
+                *(f"{number(along[z], 2)} / {number(across[z], 2)}" for z in ZONES),
+                *(number(beyond[z], 1) for z in ZONES),
+            ]
+        )
+    return rows
+
+
+def _edge_cells(row: Mapping[str, Any]) -> list[str]:
+    cells = []
+    for zone in ZONES:
+        edge = row[zone]
+        cells += [
+            number(edge["mtf50"]),
+            f"{number(edge['tangential_mtf50'])} / {number(edge['sagittal_mtf50'])}",
+            number(edge["mtf_max"], 2),
+            number(edge["overshoot"], 1),
+            number(edge["mtf50_fair"]),
+        ]
+    return cells
+
+
+def psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
+    """Error of the PSF, ours and the rivals'."""
+    page.title(f"Error of the PSF, {label}")
+    page.text(
+        "Relative L2 against the truth after sub-pixel alignment, green; median of the zone, mean over "
+        "lenses."
+    )
+    beside = [[name, *(number(row[z], 3) for z in ZONES)] for name, row in found["psf_others"].items()]
+    page.table(["", *ZONES], [*beside, *_count_rows(found["psf"], 3)])
+    page.text("Red and blue:")
+    by_channel = [
+        [f"{word}, {row[0]}", *row[1:]]
+        for channel, word in (("r", "red"), ("b", "blue"))
+        for row in _count_rows(found["psf_by_channel"][channel], 3)
+    ]
+    page.table(["", *ZONES], by_channel)
+    right = ", ".join(f"n = {n}: {number(v, 2)}" for n, v in found["predicted_right"].items())
+    page.text(
+        "Share of places where the model's own prediction of this error is right within a factor of 1.5: "
+        f"{right}."
+    )
+
+
+def photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
+    """PSNR and SSIM of the photo never learned from."""
+    page.title(f"A photo never used for calibration, {label}")
+    page.text(
+        "PSNR in dB and SSIM of the sRGB-encoded picture against the sharp scene, each block of 128 "
+        "pixels at its best shift, before and after alike; of large frames every second block, as on a "
+        f"chessboard. {DENOISED.capitalize()} is the control: the correction with a PSF that is a point."
+    )
+    for method, psnr in found["psnr"].items():
+        page.title(f"Deconvolution: {deconvolution(method)}", 3)
+        rows = [
+            [shown(row["state"]), *(number(row[z], 2) for z in ZONES), *(number(other[z], 4) for z in ZONES)]
+            for row, other in zip(psnr, found["ssim"][method], strict=True)
+        ]
+        page.table(["", *(f"PSNR {z}" for z in ZONES), *(f"SSIM {z}" for z in ZONES)], rows)
+        page.text("Share of the gain of the true PSF, where that is measurable:")
+        kept, likeness = found["psnr_kept"][method], found["ssim_kept"][method]
+        page.table(
+            ["", *(f"PSNR {z}" for z in ZONES), *(f"SSIM {z}" for z in ZONES)],
+            [
+                [
+                    f"n = {n}",
+                    *(number(kept[n][z], 2) for z in ZONES),
+                    *(number(likeness[n][z], 2) for z in ZONES),
+                ]
+                for n in kept
+            ],
+        )
+        page.text("Zones of lenses where PSNR or SSIM fell:")
+        page.table(
+            ["", "zones", "PSNR worse", "by more than 0.05 dB", "SSIM worse", "not better despite blur"],
+            [
+                [f"n = {n}", *(str(row[name]) for name in _COUNTED)]
+                for n, row in found["worse"][method].items()
+            ],
+        )
+        off = ", ".join(f"n = {n}: {number(v, 2)}" for n, v in found["forecast_off"][method].items())
+        page.text(
+            "What the gain that a correction expects of itself in a zone is off by, dB of linear light, mean "
+            f"over zones of lenses: {off}."
+        )
+        said = "; ".join(
+            f"n = {n}: {row['said']} of {row['lenses']}, {row['wrongly']} of them wrongly, "
+            f"and left out of {row['unsaid']}"
+            for n, row in found["nothing_said"][method].items()
+        )
+        page.text(
+            '"Nothing to correct" was said of so many lenses (right where the true PSF gains less than '
+            f"{NOTHING_DB:g} dB in every zone): {said}."
+        )
+        _more_table(page, found["more_photos"].get(method))
+
+
+def _more_table(page: Page, more: Mapping[str, Any] | None) -> None:
+    """Name the zones of lenses where more photos did harm."""
+    if more is None:
+        return
+    page.text(
+        f"Five photos beside two: of {more['zones']} zones of lenses the PSF error is larger by more than "
+        f"{TOLERATED_L2:g} in {more['psf_worse']} (the worst channel), PSNR of the corrected picture lower "
+        f"by more than {TOLERATED_DB:g} dB in {more['psnr_worse']}."
+    )
+    if more["rows"]:
+        page.table(
+            ["", "zone", "PSF error", "PSNR"],
+            [
+                [row["lens"], row["zone"], _from_to(row["psf"], 3), _from_to(row["psnr"], 2)]
+                for row in more["rows"]
+            ],
+        )
+
+
+def _from_to(pair: Sequence[float] | None, digits: int) -> str:
+    return "-" if pair is None else " to ".join(number(value, digits) for value in pair)
+
+
+def bars_table(page: Page, every: Sequence[Bar]) -> None:
+    """Every bar, its value, and whether it holds: for each family a table, a column for each n."""
+    if not every:
+        return
+    page.title("What is asked, and what holds")
+    count = held(every)
+    page.text(
+        f"{count['held']} bars hold, {count['missed']} do not, {count['unknown']} are not told by this run. "
+        "They are of lenses wide open, raw, at base ISO, learned and corrected by default, means over the "
+        "lenses of a family. Bands are two-sided where a value that is too good is wrong as well: a PSF that "
+        "is too wide scores above the truth in MTF50."
+    )
+    for family in dict.fromkeys(bar.family for bar in every):
+        page.title(family.capitalize() or "Other scenes and paths", 3)
+        rows: dict[tuple[str, str], dict[str, Bar]] = {}
+        for bar in every:
+            if bar.family == family:
+                rows.setdefault((bar.name, bar.place), {})[bar.n] = bar
+        counts = sorted({bar.n for bar in every if bar.family == family})
+        head = ["", "where", *(f"n = {n}" for n in counts)]
+        page.table(head, [[*key, *(_cell(row.get(n)) for n in counts)] for key, row in rows.items()])
+
+
+def _cell(bar: Bar | None) -> str:
+    if bar is None:
+        return ""
+    value = number(bar.value, 0 if isinstance(bar.value, int) else 2)
+    return f"{value} ({_band(bar.low, bar.high)}) {_verdict(bar)}"
+
+
+def _band(low: float | None, high: float | None) -> str:
+    if low is None:
+        return f"at most {high:g}"
+    return f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
+
+
+def _verdict(bar: Bar) -> str:
+    if bar.met is None:
+        return "not told"
+    return "held" if bar.met else "MISSED"
+
+
+def hard_table(page: Page, result: Mapping[str, Any]) -> None:
+    """What became of scenes and paths that hurt."""
+    rows = hard_rows(result)
+    if not rows:
+        return
+    page.title("Scenes and paths that hurt")
+    page.text(
+        "Each lens learns from one photo of this kind, and another photo of this kind is corrected, "
+        f"deconvolution {' '.join(HARD_METHODS)}. Gains in dB of PSNR over the photo as it was, "
+        "center / mid / corner."
+    )
+    page.table(
+        [
+            "",
+            "family",
+            "lenses",
+            "not learned from",
+            "gain",
+            "denoised only",
+            "true PSF",
+            "gain in SSIM",
+            "MTF50 share",
+            "PSF error",
+            "worse zones",
+            "by more than 0.05 dB",
+            "nothing to correct: said, wrongly, left out",
+        ],
+        [
+            [
+                row["title"],
+                row["family"],
+                str(row["lenses"]),
+                str(row["refused"]),
+                _slashed(row["gain"], 2),
+                _slashed(row["control"], 2),
+                _slashed(row["true"], 2),
+                _slashed(row["ssim"], 3),
+                _slashed(row["share"], 2),
+                _slashed(row["psf"], 2),
+                f"{row['counts']['worse']} of {row['counts']['zones']}",
+                str(row["counts"]["clearly_worse"]),
+                ", ".join(str(row["nothing"][name]) for name in ("said", "wrongly", "unsaid")),
+            ]
+            for row in rows
+        ],
+    )
+
+
+def _slashed(row: Mapping[str, float | None], digits: int) -> str:
+    return " / ".join(number(row[zone], digits) for zone in ZONES)
+
+
+def which_lenses(page: Page, result: Mapping[str, Any]) -> None:
+    """Name every lens, where it comes from, and whether anything was developed on it."""
+    page.title("The lenses")
+    page.text(
+        "Nothing was developed or chosen on photos of an unseen lens; what all designs have of each "
+        "aberration is known, and expected of lenses. Parameters are chosen on other lenses; three choices "
+        "followed from a look at lenses of this page. Third-order lenses are of the theory that the "
+        "wavefront fit assumes, ray-traced ones of published designs, traced to all orders."
+    )
+    rows = [
+        [
+            case["family"],
+            case["title"],
+            case["source"],
+            "unseen" if case["unseen"] else "looked at during development",
+            case.get("general_profile", ""),
+        ]
+        for case in result["cases"]
+    ]
+    page.table(["family", "lens", "source", "", "general profile"], rows)
+
+
+def lenses(page: Page, result: Mapping[str, Any]) -> None:
+    """Every lens in every state."""
+    page.title("Every lens")
+    for method in result["plan"]["methods"]:
+        page.title(f"Every lens, deconvolution: {deconvolution(method)}", 3)
+        rows = []
+        for case in result["cases"]:
+            beside = others(case)
+            for name, state in states(case, method).items():
+                unit = case["learned"].get(name.removeprefix("n = ")) or beside.get(name)
+                psf = None if unit is None or unit["psf"] is None else unit["psf"]["rel_l2"]["g"]
+                rows.append([case["title"], shown(name), *_lens_cells(state, psf)])
+        head = ["lens", "", *(f"{z} {what}" for z in ZONES for what in ("MTF50", "max", "PSNR", "PSF error"))]
+        page.table(head, rows)
+    refused = [
+        f"{case['title']}: {reason}"
+        for case in result["cases"]
+        for reason in dict.fromkeys(
+            r
+            for part in ("learned", "paper")
+            for unit in case.get(part, {}).values()
+            for r in unit["refused"]
+        )
+    ]
+    if refused:
+        page.text("Photos that gave no usable patch and did not count: " + "; ".join(refused) + ".")
+
+
+def _lens_cells(state: Mapping[str, Any], psf: Mapping[str, float] | None) -> list[str]:
+    cells = []
+    for zone in ZONES:
+        edge = state["edges"].get(zone, {})
+        cells += [
+            number(edge.get("mtf50")),
+            number(edge.get("mtf_max"), 2),
+            number(state["psnr"].get(zone), 2),
+            number(None if psf is None else psf.get(zone), 2),
+        ]
+    return cells
+
+
+def _count_rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
+    return [[f"default, n = {n}", *(number(row[zone], digits) for zone in ZONES)] for n, row in rows.items()]

@@ -1,0 +1,390 @@
+"""Tables from results: means over lenses, in the paper's order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+from lab.reproduce.pages.verdicts import (
+    FEWER,
+    MEASURABLE,
+    MORE,
+    Result,
+    counted,
+    gain,
+    get,
+    more_photos,
+    said_nothing,
+)
+from lensmodel.core.types import CHANNELS, ZONES
+
+SMALL_GAIN: Final = 0.05
+"""Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
+
+EDGE_FIGURES: Final = (
+    "mtf50",
+    "tangential_mtf50",
+    "sagittal_mtf50",
+    "mtf_max",
+    "overshoot",
+    "mtf50_fair",
+)
+
+BEFORE: Final = "without correction"
+DENOISED: Final = "denoised only"
+GENERAL: Final = "general profile of the lens model"
+PAPER_WAY: Final = "the paper's own way"
+MEASURED: Final = "measured with a target"
+TRUE: Final = "true PSF"
+
+DECONVOLUTIONS: Final = {"paper": "Richardson-Lucy", "standard": "standard"}
+"""How pages call non-blind methods: `paper` is one of them, and the paper's own way another thing."""
+
+
+def deconvolution(method: str) -> str:
+    """Name of a non-blind method on pages."""
+    return DECONVOLUTIONS.get(method, method)
+
+
+def shown(state: str) -> str:
+    """Name of a state on pages: what was learned by default says so."""
+    return f"default, {state}" if state.startswith("n = ") else state
+
+
+def groups(result: Result) -> dict[str, Result]:
+    """Split the lenses by family, aperture and frame: means over different ones would compare nothing."""
+    found: dict[str, list[Result]] = {}
+    for case in result["cases"]:
+        settings = case["settings"]
+        stops = "wide open" if case["stops"] < 0.1 else f"{case['stops']:.0f} stops down"
+        label = f"{case['family']}, {stops}, frames of {settings['width']} x {settings['height']}"
+        found.setdefault(label, []).append(case)
+    return {label: {**result, "cases": cases} for label, cases in found.items()}
+
+
+def counts(result: Result) -> list[int]:
+    """Numbers of photos that occur, ascending."""
+    return sorted({int(n) for case in result["cases"] for n in case["learned"]})
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Mean of those that are known; None where none is."""
+    known = [v for v in values if v is not None and math.isfinite(v)]
+    return sum(known) / len(known) if known else None
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return everything that the tables show, as plain values.
+
+    Returns
+    -------
+    dict
+        `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
+        `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
+        `highest_mtf`: the highest corrected MTF of any lens;
+        `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
+        `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
+        the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
+        that a correction expects of itself in a zone, dB; `nothing_said`, see the function; `more_photos` of
+        `verdicts.more_photos`.
+    """
+    methods = result["plan"]["methods"]
+    return {
+        "lenses": len(result["cases"]),
+        "mtf": {method: _mtf(result, method) for method in methods},
+        "share": {method: _by_count(result, partial(shares, method=method)) for method in methods},
+        "share_tangential": {
+            method: _by_count(result, partial(shares, method=method, edge="tangential_mtf50"))
+            for method in methods
+        },
+        "share_sagittal": {
+            method: _by_count(result, partial(shares, method=method, edge="sagittal_mtf50"))
+            for method in methods
+        },
+        "halo": {method: _by_count(result, partial(halo, method=method)) for method in methods},
+        "highest_mtf": {method: _highest_mtf(result, method) for method in methods},
+        "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
+        "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
+        "psnr_control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in result["cases"])),
+        "psnr_kept": {method: _by_count(result, partial(kept, method=method)) for method in methods},
+        "ssim_kept": {
+            method: _by_count(result, partial(kept, method=method, of="ssim")) for method in methods
+        },
+        "worse": {method: worse(result, method) for method in methods},
+        "psf_others": _psf_of_others(result),
+        "psf": _by_count(result, partial(_psf, channel="g")),
+        "psf_by_channel": {c: _by_count(result, partial(_psf, channel=c)) for c in CHANNELS},
+        "predicted_right": {
+            str(n): mean(get(c["learned"][str(n)]["psf"], "predicted_right") for c in _having(result, n))
+            for n in counts(result)
+        },
+        "forecast_off": {method: _forecast_off(result, method) for method in methods},
+        "nothing_said": {method: nothing_said(result, method) for method in methods},
+        "more_photos": {
+            method: more_photos(_having(result, int(FEWER)), method)
+            for method in methods
+            if int(MORE) in counts(result)
+        },
+    }
+
+
+def nothing_said(result: Result, method: str) -> dict[str, dict[str, int]]:
+    """Count lenses said to have nothing to correct, by number of photos; see `said_nothing`."""
+    return {
+        str(n): said_nothing(
+            (case, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
+            for case in _having(result, n)
+        )
+        for n in counts(result)
+    }
+
+
+def _forecast_off(result: Result, method: str) -> dict[str, float | None]:
+    """Mean over zones of lenses of what the expected gain is off by, for each number of photos."""
+    found: dict[str, float | None] = {}
+    for n in counts(result):
+        zones = [
+            zone
+            for case in _having(result, n)
+            for zone in case["learned"][str(n)]["methods"][method].get("forecast", {}).values()
+        ]
+        found[str(n)] = mean(abs(z["expected"] - z["true"]) for z in zones if z["expected"] is not None)
+    return found
+
+
+def _psf_of_others(result: Result) -> dict[str, dict[str, float | None]]:
+    """Error of green PSFs that are not the default's, by the names of their states."""
+    found: dict[str, list[Result]] = {}
+    for case in result["cases"]:
+        for name, unit in others(case).items():
+            if unit["psf"] is not None:
+                found.setdefault(name, []).append(_rel_l2(unit["psf"], "g"))
+    return {name: _zones(partial(_column_mean, found[name])) for name in _names([found])}
+
+
+def others(case: Result) -> dict[str, Result]:
+    """Units of a lens whose PSFs are not the default's, by the names of their states."""
+    found = {f"{name}, n = 1": unit for name, unit in case["rivals"].items()}
+    if case.get("general"):
+        found[GENERAL] = case["general"]
+    for n, unit in sorted(case.get("paper", {}).items(), key=lambda item: int(item[0])):
+        found[f"{PAPER_WAY}, n = {n}"] = unit
+    if case.get("measured"):
+        found[MEASURED] = case["measured"]
+    return found
+
+
+def shares(case: Result, n: int, method: str, edge: str = "mtf50") -> dict[str, float | None]:
+    """Share of the gain of the true PSF in MTF50 that one lens reaches; None where that gain is small."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        before = _edge(case["truth"]["before"], zone, edge)
+        true = _edge(case["truth"]["true"][method], zone, edge)
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, edge)
+        if before is None or true is None or after is None or true - before < SMALL_GAIN * before:
+            found[zone] = None
+        else:
+            found[zone] = (after - before) / (true - before)
+    return found
+
+
+def halo(case: Result, n: int, method: str) -> dict[str, float | None]:
+    """Overshoot of edges beyond that of the correction with the true PSF, percent of the step."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        true = _edge(case["truth"]["true"][method], zone, "overshoot")
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, "overshoot")
+        found[zone] = None if true is None or after is None else after - true
+    return found
+
+
+def kept(case: Result, n: int, method: str, of: str = "psnr") -> dict[str, float | None]:
+    """Share of the gain of the true PSF in PSNR or SSIM; None where that gain is small."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        true = gain(case, case["truth"]["true"][method], zone, of)
+        after = gain(case, case["learned"][str(n)]["methods"][method], zone, of)
+        found[zone] = None if true is None or after is None or true < MEASURABLE[of] else after / true
+    return found
+
+
+def _highest_mtf(result: Result, method: str) -> dict[str, dict[str, float | None]]:
+    """The highest corrected MTF of any lens, by number of photos and zone: a mean would hide it."""
+
+    def highest(n: int, zone: str) -> float | None:
+        states = [case["learned"][str(n)]["methods"][method] for case in _having(result, n)]
+        found = [get((state.get("edges") or {}).get(zone), "mtf_max") for state in states]
+        return max((value for value in found if value is not None), default=None)
+
+    return {str(n): _zones(partial(highest, n)) for n in counts(result)}
+
+
+def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
+    """Count zones of lenses whose PSNR or SSIM fell.
+
+    Returns
+    -------
+    dict
+        By number of photos: `zones`; `worse` and `clearly_worse`, PSNR at all and by more than is
+        tolerated; `ssim_worse`; `unimproved`, PSNR or SSIM did not rise although the true PSF raises
+        PSNR measurably.
+    """
+    return {
+        str(n): counted(
+            [
+                (case, zone, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
+                for case in _having(result, n)
+                for zone in ZONES
+            ]
+        )
+        for n in counts(result)
+    }
+
+
+def hard_rows(result: Result) -> list[dict[str, Any]]:
+    """One row a scene or path that hurts and family: gains in PSNR by zone, and zones that fell.
+
+    Returns
+    -------
+    list of dict
+        `condition`, `title`, `family`, `lenses`, `refused` (photos that were not learned from); `gain`,
+        `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
+        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
+        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`; `nothing` of
+        `verdicts.said_nothing`.
+    """
+    every: dict[tuple[str, str], list[Result]] = {}
+    for case in result.get("hard", ()):
+        every.setdefault((case["condition"], case["family"]), []).append(case)
+    return [_hard_row(cases) for cases in every.values()]
+
+
+def _hard_row(cases: Sequence[Result]) -> dict[str, Any]:
+    after = [(case, *case["learned"].values()) for case in cases]
+    method = next(iter(after[0][1]["methods"]))
+    done = [(case, unit["methods"][method]) for case, unit in after]
+    rows = [(c, z, state, c["truth"]["true"][method]) for c, state in done for z in ZONES]
+    return {
+        "condition": cases[0]["condition"],
+        "title": cases[0]["condition_title"],
+        "family": cases[0]["family"],
+        "lenses": len(cases),
+        "refused": sum(len(unit["refused"]) for _, unit in after),
+        "gain": _zones(lambda z: mean(gain(c, state, z) for c, state in done)),
+        "ssim": _zones(lambda z: mean(gain(c, state, z, "ssim") for c, state in done)),
+        "control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in cases)),
+        "true": _zones(lambda z: mean(gain(c, c["truth"]["true"][method], z) for c in cases)),
+        "kept": _zones(partial(_column_mean, [kept(c, 1, method) for c in cases])),
+        "share": _zones(partial(_column_mean, [shares(c, 1, method) for c in cases])),
+        "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
+        "counts": counted(rows),
+        "nothing": said_nothing((case, state, case["truth"]["true"][method]) for case, state in done),
+    }
+
+
+def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
+    """Versions of a lens's photos by name, from untouched to the true PSF."""
+    learned = {
+        f"n = {n}": unit["methods"][method]
+        for n, unit in sorted(case["learned"].items(), key=lambda item: int(item[0]))
+    }
+    return {
+        BEFORE: case["truth"]["before"],
+        DENOISED: case["truth"]["control"],
+        **{name: unit["state"] for name, unit in case.get("programs", {}).items()},
+        **learned,
+        **{name: found for name, unit in others(case).items() if (found := _of(unit, name, method))},
+        TRUE: case["truth"]["true"][method],
+    }
+
+
+def _of(unit: Result, name: str, method: str) -> Mapping[str, Any] | None:
+    """Corrected with a method; what is done the paper's own way has none but its own."""
+    methods: Mapping[str, Mapping[str, Any]] = unit["methods"]
+    return next(iter(methods.values())) if name.startswith(PAPER_WAY) else methods.get(method)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """Format a number; a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _names(every: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Names of all states: untouched, denoised, others, the paper's way, photos ascending, the true PSF."""
+    found = dict.fromkeys(name for one in every for name in one)
+
+    def place(name: str) -> tuple[int, int]:
+        fixed = {BEFORE: 0, DENOISED: 1, GENERAL: 3, MEASURED: 6, TRUE: 7}
+        if name in fixed:
+            return fixed[name], 0
+        if name.startswith(PAPER_WAY):
+            return 4, int(name.rpartition(" = ")[2])
+        return (5, int(name[4:])) if name.startswith("n = ") else (2, 0)
+
+    return sorted(found, key=place)
+
+
+def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
+    every = [states(case, method) for case in result["cases"]]
+    rows = []
+    for name in _names(every):
+        row: dict[str, Any] = {"state": name}
+        for zone in ZONES:
+            here = [one[name]["edges"].get(zone, {}) for one in every if name in one]
+            row[zone] = {field: mean(get(edge, field) for edge in here) for field in EDGE_FIGURES}
+        rows.append(row)
+    return rows
+
+
+def _fidelity(result: Result, method: str, of: str) -> list[dict[str, Any]]:
+    every = [states(case, method) for case in result["cases"]]
+    return [
+        {
+            "state": name,
+            **{zone: mean(get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
+        }
+        for name in _names(every)
+    ]
+
+
+def _by_count(
+    result: Result, of: Callable[[Result, int], Mapping[str, float | None]]
+) -> dict[str, dict[str, float | None]]:
+    table: dict[str, dict[str, float | None]] = {}
+    for n in counts(result):
+        rows = [of(case, n) for case in _having(result, n)]
+        table[str(n)] = _zones(partial(_column_mean, rows))
+    return table
+
+
+def _column_mean(rows: Sequence[Mapping[str, float | None]], zone: str) -> float | None:
+    return mean(row.get(zone) for row in rows)
+
+
+def _zones(of: Callable[[str], float | None]) -> dict[str, float | None]:
+    return {zone: of(zone) for zone in ZONES}
+
+
+def _having(result: Result, n: int) -> list[Result]:
+    return [case for case in result["cases"] if str(n) in case["learned"]]
+
+
+def _psf(case: Result, n: int, channel: str) -> dict[str, float | None]:
+    return _rel_l2(case["learned"][str(n)]["psf"], channel)
+
+
+def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
+    return {zone: None if found is None else found["rel_l2"][channel].get(zone) for zone in ZONES}
+
+
+def _edge(state: Result, zone: str, name: str) -> float | None:
+    value: float | None = get(state["edges"].get(zone, {}), name)
+    return value

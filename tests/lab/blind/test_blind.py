@@ -1,0 +1,473 @@
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy import ndimage, signal
+
+from lab import cases as making
+from lab.blind import judges
+from lab.blind.blind_benchmark import run_blind_benchmark
+from lab.blind.results import UNTOUCHED, BlindBenchmark, BlindReport, CaseResult, summarised
+from lab.blind.tables import (
+    csv_table,
+    cumulative,
+    curve_figure,
+    markdown_table,
+    write_report,
+)
+from lab.cases import (
+    _apart,
+    list_photos,
+    load_psfs,
+    make_cases,
+    observe,
+    photo_half,
+    psf_half,
+    scene_of,
+)
+from lensmodel.core import psf
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import FieldPosition, Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.estimation import PsfEstimate
+from lensmodel.estimation.patches import Patch
+
+SMALL = {"patch": 128, "cases": 3, "half": "all"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_photos(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Show parts of the library's own photographs: to read whole ones takes longer than the rest of a run."""
+    folder = tmp_path_factory.mktemp("photos")
+    for path in list_photos():
+        with Image.open(path) as whole:
+            whole.crop((300, 200, 860, 660)).save(folder / f"{path.stem}.png", compress_level=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(making, "demo_data_path", lambda name: folder / Path(name).with_suffix(".png"))
+        yield
+
+
+def answer(kernel: Kernel, seconds: float = 0.0) -> PsfEstimate:
+    return PsfEstimate(
+        kernel=kernel,
+        confidence=0.5,
+        reliability=np.ones(4),
+        predicted_error=0.3,
+        diagnostics={},
+        seconds=seconds,
+        no_blur=False,
+    )
+
+
+@dataclass(frozen=True)
+class Fake:
+    """Answers with a Gaussian, and counts how often it was asked."""
+
+    sigma: float = 1.2
+    name: str = "fake"
+    version: int = 1
+    asked: list[int] = field(default_factory=list, compare=False, repr=False)
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        self.asked.append(len(patches))
+        return answer(psf.gaussian(size, np.eye(2) * self.sigma**2))
+
+
+@dataclass(frozen=True)
+class Declining(Fake):
+    def estimate(self, patches: Sequence[Plane], noise: Sequence[NoiseModel], **_: object) -> PsfEstimate:
+        raise NotEnoughEvidenceError("nothing to see")
+
+
+def registry(**methods: Fake) -> Registry[Fake]:
+    return Registry("method", {name: (lambda m=m: m) for name, m in methods.items()})
+
+
+@pytest.fixture(scope="module")
+def report() -> BlindReport:
+    methods = registry(narrow=Fake(0.3), wide=Fake(9.0))
+    return run_blind_benchmark(BlindBenchmark(methods=("narrow", "wide"), **SMALL), methods=methods)
+
+
+# ---- the judge
+
+
+@pytest.fixture(scope="module")
+def scene() -> Plane:
+    return scene_of(list_photos()[3])[1][:192, :192]
+
+
+@pytest.mark.parametrize("name", sorted(judges.judges))
+def test_judge_brings_a_blurred_scene_nearer_to_the_truth(name: str, scene: Plane) -> None:
+    kernel = psf.gaussian(15, [[2.0, 0.5], [0.5, 1.0]])
+    blurred = signal.fftconvolve(np.pad(scene, 7, mode="reflect"), kernel, mode="valid")
+    noisy = (blurred + np.random.default_rng(0).normal(0, 0.003, scene.shape)).astype(np.float32)
+    restored = judges.judges.create(name).deconvolve(noisy, kernel, 0.003, (0.0, 0.0))
+
+    assert restored.shape == scene.shape
+    assert judges.squared_error(restored, scene) < 0.7 * judges.squared_error(noisy, scene)
+
+
+@pytest.mark.parametrize("name", sorted(judges.judges))
+def test_judge_returns_a_flat_patch_unchanged(name: str) -> None:
+    flat = np.full((128, 128), 0.4, dtype=np.float32)
+    restored = judges.judges.create(name).deconvolve(flat, psf.gaussian(11, np.eye(2)), 0.01, (0.0, 0.0))
+
+    np.testing.assert_allclose(restored, 0.4, atol=1e-3)
+
+
+def test_kernel_shifted_by_the_judge_is_the_kernel_shifted_on_the_grid() -> None:
+    kernel = np.zeros((9, 9))
+    kernel[2, 5], kernel[4, 4] = 0.25, 0.75
+    moved = np.roll(kernel, (1, -2), axis=(0, 1))
+
+    np.testing.assert_allclose(
+        judges.shifted_otf(kernel, (32, 32), (1.0, -2.0)),
+        judges.shifted_otf(moved, (32, 32), (0.0, 0.0)),
+        atol=1e-12,
+    )
+
+
+def test_judge_undoes_the_shift_of_a_kernel(scene: Plane) -> None:
+    kernel = psf.gaussian(15, np.eye(2) * 2.0)
+    off = psf.as_kernel(ndimage.shift(np.pad(kernel, 3), (1.0, -2.0), order=1))
+    blurred = ndimage.convolve(scene.astype(np.float64), kernel).astype(np.float32)
+    judge = judges.HyperLaplacian()
+    straight = judge.deconvolve(blurred, kernel, 0.003, (0.0, 0.0))
+    aligned = judge.deconvolve(blurred, off, 0.003, psf.distance(off, kernel).shift)
+
+    np.testing.assert_allclose(aligned, straight, atol=1e-3)
+
+
+@settings(max_examples=40)
+@given(v=st.floats(-3.0, 3.0), beta=st.sampled_from([1.0, 2.8, 22.0, 256.0]))
+@example(v=0.681640625, beta=2.8)  # within a hundredth of the jump
+def test_shrinkage_finds_the_least_of_its_cost(v: float, beta: float) -> None:
+    found = float(judges._tabled_shrinkage(np.array([v]), beta, 2.0 / 3.0)[0])
+    w = np.linspace(-3.1, 3.1, 62001)
+
+    def cost(w: np.ndarray | float) -> np.ndarray:
+        return np.abs(w) ** (2.0 / 3.0) + 0.5 * beta * (w - v) ** 2
+
+    assert cost(found) <= cost(w).min() + 1e-3
+
+
+def test_padding_joins_without_a_jump() -> None:
+    ramp = np.add.outer(np.arange(64.0), np.arange(64.0)).astype(np.float32)
+    padded = judges.tapered(ramp, 28)
+    largest_step = max(np.abs(np.diff(padded, axis=axis)).max() for axis in (0, 1))
+
+    assert np.abs(padded[0] - padded[-1]).max() <= largest_step
+    assert np.abs(padded[:, 0] - padded[:, -1]).max() <= largest_step
+    np.testing.assert_array_equal(padded[28:-28, 28:-28], ramp)
+
+
+# ---- error ratio
+
+
+@dataclass(frozen=True)
+class Oracle(Fake):
+    """Knows the true kernel of a case and returns it off centre."""
+
+    kernel: tuple[tuple[float, ...], ...] = ()
+
+    def estimate(self, patches: Sequence[Plane], noise: Sequence[NoiseModel], **_: object) -> PsfEstimate:
+        return answer(psf.as_kernel(np.roll(np.pad(np.array(self.kernel), 2), (1, 2), axis=(0, 1))))
+
+
+def test_error_ratio_of_the_true_kernel_is_one_even_when_it_is_off_centre(tmp_path: Path) -> None:
+    kernel = load_psfs()[3]
+    np.savez(tmp_path / "one.npz", psf=kernel[None])
+    oracle = Oracle(kernel=tuple(map(tuple, kernel)))
+    report = run_blind_benchmark(
+        BlindBenchmark(psfs=tmp_path / "one.npz", methods=("oracle",), **SMALL),
+        methods=registry(oracle=oracle),
+    )
+    rows = [r for r in report.results if r.method == "oracle"]
+
+    assert len(rows) == 3
+    for row in rows:
+        assert row.error_ratio == pytest.approx(1.0, rel=1e-3)
+        assert row.ncc == pytest.approx(1.0, abs=1e-6)
+        assert row.untouched_ratio > 1.2
+        assert row.improved
+
+
+def test_untouched_patch_is_in_every_report_and_never_counts_as_improved(report: BlindReport) -> None:
+    rows = [r for r in report.results if r.method == UNTOUCHED]
+
+    assert len(rows) == 3
+    assert all(row.error_ratio == row.untouched_ratio and not row.improved for row in rows)
+
+
+def test_a_kernel_far_too_wide_does_harm(report: BlindReport) -> None:
+    wide = next(row for row in report.summary if row.method == "wide")
+
+    assert wide.improved == 0.0
+    assert wide.width_ratio > 1.5
+
+
+def test_a_method_that_declines_leaves_the_patch_as_it_is() -> None:
+    report = run_blind_benchmark(BlindBenchmark(methods=("shy",), **SMALL), methods=registry(shy=Declining()))
+    shy = next(row for row in report.summary if row.method == "shy")
+
+    assert shy.declined == shy.cases == 3
+    assert all(r.error_ratio == r.untouched_ratio for r in report.results)
+
+
+# ---- cases
+
+
+def test_halves_share_no_photo_and_no_psf() -> None:
+    photos = tuple(
+        Path(f"{stem}.png") for stem in ("s01_city_sunset", "s03_lake_mountains", "s05_colosseum", "mine")
+    )
+    options = {"noise": 0.01, "patch": 256, "variant": "gaussian", "pool": 1, "seed": 0, "limit": None}
+    halves = {half: make_cases(photos, 12, half=half, **options) for half in ("dev", "test", "all")}
+    pairs = {half: {(c.photos[0], c.psf_number) for c in cases} for half, cases in halves.items()}
+
+    assert not {p for p, _ in pairs["dev"]} & {p for p, _ in pairs["test"]}
+    assert not {n for _, n in pairs["dev"]} & {n for _, n in pairs["test"]}
+    assert len(pairs["all"]) == 48
+    assert pairs["dev"] | pairs["test"] <= pairs["all"]
+
+
+def test_demo_photos_are_in_the_half_of_the_photos_they_were_made_from() -> None:
+    assert photo_half("city") == photo_half("s01_city_sunset") == "test"
+    assert photo_half("lake") == photo_half("s03_lake_mountains") == "dev"
+    assert {psf_half(n) for n in range(12)} == {"dev", "test"}
+
+
+def test_a_limit_spreads_over_photos_and_psfs() -> None:
+    cases = make_cases(
+        list_photos(), 12, half="all", noise=0.01, patch=256, variant="gaussian", pool=1, seed=0, limit=10
+    )
+
+    assert len({c.photos[0] for c in cases}) == 5
+    assert len({c.psf_number for c in cases}) == 10
+
+
+@pytest.mark.slow
+def test_more_scenes_than_photos_are_further_windows_of_the_same_photos() -> None:
+    options = {"half": "all", "noise": 1e-3, "patch": 128, "variant": "gaussian", "pool": 1, "seed": 3}
+    cases = make_cases(list_photos(), 2, limit=None, choice="r-map", scenes=12, **options)
+
+    assert len(cases) == len({case.name for case in cases}) == 24
+    assert [len({c.photos[0] for c in cases if c.window == k}) for k in range(3)] == [5, 5, 2]
+    first = {c.window: c for c in cases if c.photos[0] == cases[0].photos[0] and c.psf_number == 0}
+    kernel = load_psfs()[4]
+    sharp = [observe(first[k], kernel).sharp for k in range(3)]
+    assert not any(np.array_equal(a, b) for a, b in pairwise(sharp))
+    with pytest.raises(InvalidInputError, match="at least one scene, not 0"):
+        make_cases(list_photos(), 2, limit=None, scenes=0, **options)
+
+
+def test_windows_overlap_none_before_them_as_long_as_there_are_such() -> None:
+    there = FieldPosition(0.5, 0.0)
+    best, beside, far = (Patch(0, col, 64, there, 1.0, 0) for col in (0, 32, 64))
+
+    assert [_apart([best, beside, far], k).col for k in range(4)] == [0, 64, 32, 0]
+
+
+def test_pooled_windows_come_from_different_photos() -> None:
+    fake = Fake()
+    run_blind_benchmark(BlindBenchmark(methods=("fake",), pool=4, **SMALL), methods=registry(fake=fake))
+
+    assert fake.asked == [4, 4, 4]
+
+
+def test_observation_is_the_scene_through_the_psf() -> None:
+    kernel = load_psfs()[4]
+    (case,) = make_cases(
+        list_photos(), 12, half="all", noise=1e-4, patch=128, variant="gaussian", pool=1, seed=3, limit=1
+    )
+    seen = observe(case, kernel)
+    inner = (slice(27, -27), slice(27, -27))
+    again = ndimage.convolve(seen.sharp.astype(np.float64), kernel)
+
+    assert seen.sharp.shape == seen.patches[0].shape == (128, 128)
+    assert np.abs(again - seen.patches[0])[inner].max() < 1e-3
+
+
+def test_a_window_that_a_selector_chose_is_the_scene_through_the_psf() -> None:
+    kernel = load_psfs()[4]
+    options = {"half": "all", "noise": 1e-3, "patch": 128, "variant": "gaussian", "pool": 1, "seed": 3}
+    (case,) = make_cases(list_photos(), 12, limit=1, choice="r-map", **options)
+    seen = observe(case, kernel)
+    inner = (slice(27, -27), slice(27, -27))
+    again = ndimage.convolve(seen.sharp.astype(np.float64), kernel)
+
+    assert seen.sharp.shape == seen.patches[0].shape == (128, 128)
+    assert np.abs(again - seen.patches[0])[inner].std() < 1.1e-3
+
+
+@pytest.mark.parametrize("variant", ["bayer", "jpeg"])
+def test_camera_variants_stay_near_the_plain_one(variant: str) -> None:
+    kernel = load_psfs()[7]
+    options = {"half": "all", "noise": 0.003, "patch": 128, "pool": 1, "seed": 3, "limit": 1}
+    plain, other = (
+        observe(make_cases(list_photos(), 12, variant=v, **options)[0], kernel).patches[0]
+        for v in ("gaussian", variant)
+    )
+
+    difference = np.abs(ndimage.uniform_filter(other - plain, 8))
+    assert 0.0 < np.median(difference) < 0.01
+
+
+def test_own_psfs_span_the_widths_of_lens_blur_and_fit_their_frame() -> None:
+    kernels = load_psfs()
+    widths = [psf.rms_width(k) for k in kernels]
+
+    assert kernels.shape == (12, 55, 55)
+    assert min(widths) < 0.9
+    assert max(widths) > 4.5
+    assert all(k[3:-3, 3:-3].sum() > 0.99 for k in kernels)
+
+
+def test_bad_settings_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="half"):
+        BlindBenchmark(half="both")
+    with pytest.raises(InvalidInputError, match="patch"):
+        BlindBenchmark(patch=100)
+    with pytest.raises(InvalidInputError, match="kernel size"):
+        BlindBenchmark(kernel_size=30)
+    with pytest.raises(InvalidInputError, match="noise"):
+        BlindBenchmark(noise=(0.0,))
+    with pytest.raises(InvalidInputError, match="selection"):
+        BlindBenchmark(selection="best")
+    with pytest.raises(UnknownMethodError, match="fake"):
+        run_blind_benchmark(BlindBenchmark(methods=("best",)), methods=registry(fake=Fake()))
+    with pytest.raises(InvalidInputError, match="no PNG"):
+        list_photos(tmp_path)
+    (tmp_path / "x.npz").write_bytes(b"no archive")
+    with pytest.raises(InvalidInputError, match="psf"):
+        load_psfs(tmp_path / "x.npz")
+
+
+# ---- cache
+
+
+def test_a_second_run_computes_nothing_and_says_the_same(tmp_path: Path) -> None:
+    wanted = BlindBenchmark(methods=("fake",), **SMALL)
+    first, second = Fake(), Fake()
+    one = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=first))
+    two = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=second))
+
+    assert len(first.asked) == 3
+    assert second.asked == []
+    assert two.to_json() == one.to_json()
+
+
+def test_cases_of_other_photographs_can_be_left_out(tmp_path: Path) -> None:
+    wanted = BlindBenchmark(methods=("fake",), **SMALL)
+    every = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=Fake()))
+    one = every.results[0].case.split("/")[0]
+    some = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=Fake()), only={one})
+
+    assert some.results == tuple(r for r in every.results if r.case.startswith(f"{one}/"))
+    assert run_blind_benchmark(wanted, methods=registry(fake=Fake()), only=()).results == ()
+
+
+def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    run_blind_benchmark(
+        BlindBenchmark(methods=("fake",), **{**SMALL, "cases": 2}),
+        cache=tmp_path,
+        methods=registry(fake=Fake()),
+    )
+    with (tmp_path / "blind.jsonl").open("a") as out:
+        out.write('{"key": "cut off in the mid')
+    more = Fake()
+    run_blind_benchmark(
+        BlindBenchmark(methods=("fake",), **SMALL), cache=tmp_path, methods=registry(fake=more)
+    )
+
+    assert len(more.asked) == 1
+
+
+def test_a_changed_method_is_computed_again(tmp_path: Path) -> None:
+    wanted = BlindBenchmark(methods=("fake",), **SMALL)
+    for method in (Fake(), Fake(sigma=1.3), Fake(version=2)):
+        run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=method))
+
+        assert len(method.asked) == 3
+
+
+@pytest.mark.slow
+def test_numbers_do_not_depend_on_the_number_of_processes() -> None:
+    wanted = BlindBenchmark(methods=(), **SMALL)
+    one, two = (run_blind_benchmark(wanted, workers=n) for n in (1, 2))
+
+    assert [r.error_ratio for r in one.results] == [r.error_ratio for r in two.results]
+
+
+# ---- report
+
+
+def result(ratio: float, method: str = "m", untouched: float = 3.0) -> CaseResult:
+    return CaseResult(
+        case="c", method=method, noise=0.01, error_ratio=ratio, untouched_ratio=untouched, ncc=0.9,
+        rel_l2=0.4, mtf_rmse=0.1, width_px=1.0, true_width_px=2.0, confidence=math.nan,
+        predicted_error=math.nan, declined=False, seconds=1.0,
+    )  # fmt: skip
+
+
+def test_summary_counts_what_it_says() -> None:
+    (row,) = summarised([result(1.0), result(2.5), result(2.9), result(8.0)])
+
+    assert (row.cases, row.improved, row.er_lt_3, row.er_lt_2) == (4, 0.75, 0.75, 0.25)
+    assert row.er_median == pytest.approx(2.7)
+    assert row.width_ratio == 0.5
+    assert row.moment_bias == -3.0
+
+
+def test_cumulative_curve_rises_from_nothing_to_all() -> None:
+    percents = cumulative(np.array([1.5, 2.5, 20.0]), np.array([1.0, 2.0, 3.0, 100.0]))
+
+    np.testing.assert_allclose(percents, [0.0, 100 / 3, 200 / 3, 100.0])
+
+
+def test_json_has_the_promised_keys_and_no_nan(report: BlindReport, tmp_path: Path) -> None:
+    files = {path.name for path in write_report(report, tmp_path)}
+    stored = json.loads((tmp_path / "blind.json").read_text(), parse_constant=pytest.fail)
+
+    assert files == {"blind.json", "blind.csv", "blind.md", "blind-er-1percent.svg", "blind-er-1percent.png"}
+    assert {"settings", "summary", "cases"} <= set(stored)
+    promised = {
+        "method", "noise", "cases", "improved", "er_lt_3", "er_lt_2", "er_median", "ncc", "rel_l2",
+        "mtf_rmse", "moment_bias", "seconds",
+    }  # fmt: skip
+    assert all(promised <= set(row) for row in stored["summary"])
+    assert [row["method"] for row in stored["summary"]] == [UNTOUCHED, "narrow", "wide"]
+    assert len(stored["cases"]) == 9
+
+
+def test_tables_have_a_row_for_each_method_and_case(report: BlindReport) -> None:
+    assert markdown_table(report).count("\n") == 2 + 3
+    assert len(csv_table(report.results).splitlines()) == 1 + 9
+
+
+def test_curve_draws_every_method_and_dashes_no_correction(report: BlindReport) -> None:
+    (axes,) = curve_figure(report, 0.01).axes
+
+    names = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert set(names) >= {"narrow", "wide", "no correction"}
+    dashed = [line.get_label() for line in axes.get_lines() if line.get_linestyle() == "--"]
+    assert dashed == ["no correction"]

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from lab.blind.steps.pyramid import (
+    RATIO,
+    Image,
+    Level,
+    LevelResult,
+    Schedule,
+    Tick,
+    View,
+    coarse_to_fine,
+    noise_gain,
+    odd,
+    resample,
+    rescaled,
+)
+from lensmodel.core.errors import CancelledError, InvalidInputError
+from lensmodel.core.psf import centroid, gaussian, second_moments
+from lensmodel.core.types import Kernel, NoiseModel
+
+
+def picture(height: int = 60, width: int = 48) -> Image:
+    rng = np.random.default_rng(0)
+    return signal.convolve(rng.normal(size=(height + 8, width + 8)), gaussian(9, 2.0 * np.eye(2)), "valid")
+
+
+def keep(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    for _ in range(level.iterations):
+        tick()
+    return LevelResult(kernel, latents)
+
+
+def test_a_constant_and_a_ramp_survive_resampling() -> None:
+    ramp = np.broadcast_to(np.arange(60.0) + 0.5, (40, 60))
+
+    small = resample(ramp, (20, 30))
+
+    inner = small[4:-4, 4:-4]
+    assert np.allclose(inner, 2.0 * np.arange(30)[4:-4] + 1.0)
+    assert np.allclose(resample(np.full((40, 60), 3.0), (29, 43)), 3.0)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_resampling_commutes_with_turns(turns: int) -> None:
+    y = picture()
+    shape = (43, 34)
+    turned = resample(np.rot90(y, turns), shape if turns % 2 == 0 else shape[::-1])
+
+    assert np.allclose(turned, np.rot90(resample(y, shape), turns))
+
+
+def test_stripes_finer_than_the_coarse_grid_do_not_alias() -> None:
+    stripes = np.broadcast_to(np.cos(2 * np.pi * 0.45 * np.arange(120)), (120, 120))
+
+    # Mirroring breaks the stripes at the border.
+    assert np.abs(resample(stripes, (60, 60))[:, 3:-3]).max() < 0.02
+
+
+def test_noise_gain_is_what_white_noise_keeps() -> None:
+    white = np.random.default_rng(1).normal(size=(300, 300))
+
+    assert resample(white, (212, 212)).std() == pytest.approx(noise_gain((300, 300), (212, 212)), rel=0.02)
+
+
+def test_affine_change_of_values_changes_no_view() -> None:
+    y = (0.3 + 0.05 * picture()).astype(np.float32)
+    first = View.of(y, NoiseModel.white(0.01))
+    second = View.of((0.5 * y + 0.1).astype(np.float32), NoiseModel.white(0.005))
+
+    assert np.allclose(first.y, second.y, atol=1e-5)
+    assert first.noise == pytest.approx(second.noise, rel=1e-4)
+
+
+def test_rescaled_kernels_keep_their_centre_and_scale_their_moments() -> None:
+    kernel = gaussian(31, [[9.0, 2.0], [2.0, 4.0]])
+
+    half = rescaled(kernel, RATIO, 23)
+    double = rescaled(kernel, 1.0 / RATIO, 45)
+
+    assert np.allclose(centroid(half), 0.0, atol=1e-9)
+    assert np.allclose(second_moments(half, 0.0) * 2.0, second_moments(kernel, 0.0), atol=0.6)
+    assert np.allclose(second_moments(double, 0.0) / 2.0, second_moments(kernel, 0.0), atol=0.3)
+
+
+def test_levels_go_down_to_the_coarsest_side_or_the_smallest_image() -> None:
+    sides = Schedule(side=31, iterations=1).sides(256)
+
+    assert sides[0] == 31
+    assert sides == tuple(odd(31 * RATIO**i) for i in range(len(sides)))
+    assert sides[-1] >= 5 > odd(31 * RATIO ** len(sides))
+    assert len(Schedule(side=31, iterations=1).sides(64)) < len(sides)
+
+
+def test_progress_reaches_its_total_even_where_a_level_stops_early() -> None:
+    seen: list[tuple[int, int]] = []
+
+    def lazy(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+        tick()
+        return LevelResult(kernel, latents)
+
+    view = View(picture(), 0.01)
+    coarse_to_fine([view], lazy, Schedule(15, 4), on_step=lambda done, total: seen.append((done, total)))
+
+    assert seen[-1][0] == seen[-1][1]
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_cancelling_in_the_hook_stops_the_driver() -> None:
+    def stop(done: int, total: int) -> None:
+        raise CancelledError(f"stopped at {done} of {total}")
+
+    with pytest.raises(CancelledError):
+        coarse_to_fine([View(picture(), 0.01)], keep, Schedule(9, 2), on_step=stop)
+
+
+def test_every_level_gets_shapes_that_fit_together() -> None:
+    levels: list[Level] = []
+
+    def look(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+        assert kernel.shape == (level.side, level.side)
+        assert [x.shape for x in latents] == [v.y.shape for v in level.views]
+        levels.append(level)
+        return keep(level, kernel, latents, tick)
+
+    views = [View(picture(96, 80), 0.01), View(picture(64, 64), 0.02)]
+    found = coarse_to_fine(views, look, Schedule(15, 2), start=gaussian(15, np.eye(2)))
+
+    assert [level.number for level in levels] == list(reversed(range(len(levels))))
+    assert found.kernel.shape == (15, 15)
+    assert all(level.views[0].noise <= 0.01 for level in levels)
+
+
+@pytest.mark.parametrize("wrong", [{"side": 4}, {"iterations": 0}, {"ratio": 1.0}, {"coarsest": 1}])
+def test_impossible_schedules_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError):
+        Schedule(**{"side": 15, "iterations": 2, **wrong})  # type: ignore[arg-type]  # on purpose

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import signal
+
+from lab.blind.methods.sun import Sun, edge_terms, image_step
+from lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
+from lab.blind.steps.kernel_step import least_squares_kernel
+from lab.blind.steps.pyramid import View
+from lab.scenes import dead_leaves
+from lab.training import make_edge_patches
+from lensmodel.core.psf import as_kernel, delta, distance, gaussian
+from lensmodel.core.types import Kernel, NoiseModel, Plane
+from lensmodel.simulate import edge_area
+
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
+SIGMA = 0.01
+OVAL = gaussian(13, [[2.0, 0.8], [0.8, 1.2]])
+
+
+def scene(side: int, seed: int = 0) -> NDArray[np.float64]:
+    return dead_leaves(side, side, np.random.default_rng(seed), largest=40.0)[1].astype(np.float64)
+
+
+def shot(kernel: Kernel, *, side: int = 96, seed: int = 0) -> Plane:
+    y = signal.convolve(scene(side + kernel.shape[0] - 1, seed), kernel, mode="valid", method="direct")
+    return (y + np.random.default_rng(seed).normal(0, SIGMA, y.shape)).astype(np.float32)
+
+
+def stroke() -> Kernel:
+    kernel = np.zeros((13, 13))
+    kernel[np.arange(3, 10), np.arange(3, 10)] = np.linspace(1.0, 0.5, 7)
+    kernel[9, 4:9] = 0.4
+    return as_kernel(signal.convolve(kernel, gaussian(3, 0.3 * np.eye(2)), mode="same", method="direct"))
+
+
+def explained(y: Plane, sharp: NDArray[np.float64], kernel: Kernel) -> float:
+    """Cost of the kernel step for one kernel when the sharp scene is known."""
+    view = View(y.astype(np.float64), SIGMA)
+    terms = edge_terms(sharp, view, kernel.shape[0], 0.0)
+    return sum(float(np.square(t.y - t.grid.blurred(kernel, t.x)).sum()) for t in terms)
+
+
+def test_the_generating_kernel_costs_least_where_the_scene_is_known() -> None:
+    truth, side = stroke(), 120
+    sharp = scene(side + 12)
+    y, inner = shot(truth, side=side), sharp[6:-6, 6:-6]
+    wrong = (delta(13), OVAL, as_kernel(np.rot90(truth)), as_kernel(truth[::-1, ::-1]), as_kernel(truth**1.5))
+
+    assert all(explained(y, inner, kernel) > explained(y, inner, truth) for kernel in wrong)
+
+
+def test_the_kernel_step_recovers_the_kernel_of_a_known_scene() -> None:
+    truth, side = stroke(), 160
+    y = View(shot(truth, side=side).astype(np.float64), SIGMA)
+    terms = edge_terms(scene(side + 12)[6:-6, 6:-6], y, 13, 0.0)
+
+    found = least_squares_kernel(terms, gaussian(13, np.eye(2)), turns=4)
+
+    assert distance(as_kernel(found), truth).ncc > 0.95
+
+
+def test_the_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> None:
+    sharp = scene(100)
+    y = signal.convolve(np.pad(sharp, 6, mode="symmetric"), OVAL, mode="valid", method="direct")
+
+    x = image_step(y, OVAL, sharp, np.full(sharp.shape, 25.0), 0.2, 0.0, steps=25)
+
+    assert np.abs(x - sharp)[12:-12, 12:-12].max() < 2e-3
+
+
+def test_stored_patterns_are_those_that_the_command_makes() -> None:
+    made = make_edge_patches.spread(make_edge_patches.primitives(), make_edge_patches.COUNT)
+
+    assert np.allclose(default_prior().patches, made, atol=1e-6)
+
+
+def test_patterns_have_no_mean_unit_norm_and_all_their_turns() -> None:
+    patches = default_prior().patches
+    turned = np.rot90(patches.reshape(-1, SIDE, SIDE), axes=(1, 2)).reshape(len(patches), -1)
+
+    assert np.allclose(patches.sum(axis=1), 0.0, atol=1e-5)
+    assert np.allclose(np.linalg.norm(patches, axis=1), 1.0, atol=1e-5)
+    assert (turned @ patches.T).max(axis=1).min() > 1.0 - 1e-5
+    assert (-patches @ patches.T).max(axis=1).min() > 1.0 - 1e-5
+
+
+def test_the_mask_lies_on_the_edge_and_nowhere_else() -> None:
+    rows, cols = np.arange(-24, 24)[:, None], np.arange(-24, 24)[None, :]
+    mask = edge_mask(edge_area(rows, cols, 0.4))
+    away = np.abs(math.cos(0.4) * cols - math.sin(0.4) * rows)
+
+    assert mask.sum() > 20
+    assert away[mask].max() < 1.5
+
+
+def test_a_sharp_step_stays_and_a_soft_one_becomes_steeper() -> None:
+    rows, cols = np.arange(-28, 28)[:, None], np.arange(-28, 28)[None, :]
+    step = edge_area(rows, cols, 0.4)
+    soft = signal.convolve(np.pad(step, 6, mode="edge"), gaussian(13, 1.5 * np.eye(2)), "valid", "direct")
+    inner = (slice(8, -8), slice(8, -8))
+
+    kept, _ = target(step, edge_mask(step), default_prior())
+    steeper, count = target(soft, edge_mask(soft), default_prior())
+
+    assert np.sqrt(np.mean((kept - step)[inner] ** 2)) < 0.03
+    assert np.abs(np.diff(steeper, axis=1)[inner]).max() > 1.3 * np.abs(np.diff(soft, axis=1)[inner]).max()
+    assert np.array_equal(steeper[count == 0], soft[count == 0])
+
+
+def test_a_stroke_is_recovered_from_one_patch() -> None:
+    found = Sun().estimate([shot(stroke(), side=128)], [NoiseModel.white(SIGMA)], size=15)
+
+    assert distance(found.kernel, stroke()).ncc > 0.85
+    assert distance(delta(15), stroke()).ncc < 0.5
+
+
+def test_sharp_patches_give_a_kernel_like_a_point() -> None:
+    found = Sun(iterations=3).estimate([shot(delta(3))], [NoiseModel.white(SIGMA)], size=11)
+
+    assert found.no_blur
+
+
+def test_the_kernel_turns_with_the_patch() -> None:
+    y, method, noise = shot(OVAL, side=97), Sun(iterations=2), [NoiseModel.white(SIGMA)]
+
+    straight = method.estimate([y], noise, size=13).kernel
+    turned = method.estimate([np.ascontiguousarray(np.rot90(y))], noise, size=13).kernel
+
+    assert distance(turned, np.rot90(straight)).ncc > 0.999
+
+
+def test_patches_of_one_position_share_one_kernel() -> None:
+    method, noise = Sun(iterations=2), NoiseModel.white(SIGMA)
+    patches = [shot(stroke(), side=80, seed=seed) for seed in (0, 1, 2)]
+
+    single = [distance(method.estimate([y], [noise], size=13).kernel, stroke()).rel_l2 for y in patches]
+    pooled = distance(method.estimate(patches, [noise] * 3, size=13).kernel, stroke()).rel_l2
+
+    assert pooled < np.mean(single)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_the_mask_holds_at_most_its_share(share: float) -> None:
+    x = scene(96)
+
+    assert 0 < edge_mask(x, share).sum() <= share * x.size + 1

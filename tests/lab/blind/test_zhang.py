@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import signal
+
+from lab.blind.methods.zhang import Zhang
+from lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
+from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
+from lab.scenes import dead_leaves
+from lensmodel.core.psf import as_kernel, delta, distance, gaussian, rms_width
+from lensmodel.core.types import Kernel, NoiseModel, Plane
+
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
+SIGMA = 0.01
+FLOOR = 1e-4 + 2 * SIGMA**2
+
+
+def scene(side: int, seed: int = 0) -> NDArray[np.float64]:
+    return dead_leaves(side, side, np.random.default_rng(seed), largest=40.0)[1].astype(np.float64)
+
+
+def shot(kernel: Kernel, *, side: int = 128, seed: int = 0, sigma: float = SIGMA) -> Plane:
+    y = signal.fftconvolve(scene(side + kernel.shape[0] - 1, seed), kernel, mode="valid")
+    return (y + np.random.default_rng(seed).normal(0, sigma, y.shape)).astype(np.float32)
+
+
+def bent(size: int = 13) -> Kernel:
+    """A stroke with a corner: no symmetry that could hide a flip."""
+    kernel = np.zeros((size, size))
+    kernel[3, 3:9] = 1.0
+    kernel[3:10, 9] = np.linspace(1.0, 0.3, 7)
+    return as_kernel(signal.convolve(kernel, gaussian(3, 0.3 * np.eye(2)), mode="same"))
+
+
+def explained(y: NDArray[np.floating], kernel: Kernel, sweeps: int = 10) -> float:
+    """Free energy when everything but the kernel is fitted."""
+    found = GradientBeliefs.of(y.astype(np.float64), kernel.shape[0], kernel, FLOOR)
+    for _ in range(sweeps):
+        found = found.improved(kernel, 8).with_noise(kernel)
+    return found.free_energy(kernel)
+
+
+def spread_out(kernel: Kernel, variance: float) -> Kernel:
+    return as_kernel(signal.convolve(kernel, gaussian(7, variance * np.eye(2)), "same", method="direct"))
+
+
+@pytest.mark.parametrize("truth", [bent(), gaussian(13, [[2.0, 0.8], [0.8, 1.2]])], ids=["bent", "gauss"])
+def test_the_generating_kernel_has_the_least_free_energy(truth: Kernel) -> None:
+    y = shot(truth, side=96)
+    best = explained(y, truth)
+
+    for wrong in (delta(13), as_kernel(truth**1.7), spread_out(truth, 0.6), as_kernel(np.rot90(truth))):
+        assert explained(y, wrong) > best
+
+
+def test_the_mirrored_kernel_has_more_free_energy() -> None:
+    y = shot(bent(), side=96)
+
+    assert explained(y, as_kernel(bent()[::-1, ::-1])) > explained(y, bent())
+
+
+def test_every_update_lowers_the_free_energy() -> None:
+    y, kernel = shot(bent(), side=72).astype(np.float64), gaussian(13, np.eye(2))
+    found = GradientBeliefs.of(y, 13, kernel, FLOOR)
+    energy = found.free_energy(kernel)
+    for _ in range(6):
+        found = found.improved(kernel, 8)
+        after_image = found.free_energy(kernel)
+        raw = pooled_kernel(found.weighted(), kernel)
+        kernel = as_kernel(raw)
+        found = found.scaled(float(raw.sum()))
+        after_kernel = found.free_energy(kernel)
+        found = found.with_noise(kernel)
+        after_noise = found.free_energy(kernel)
+
+        assert after_noise <= after_kernel < after_image < energy
+        energy = after_noise
+
+
+def test_scaling_scene_against_kernel_changes_no_free_energy() -> None:
+    y, kernel = shot(bent(), side=72).astype(np.float64), bent()
+    found = GradientBeliefs.of(y, 13, kernel, FLOOR).improved(kernel, 4)
+
+    assert found.scaled(2.0).free_energy(kernel / 2.0) == pytest.approx(found.free_energy(kernel), rel=1e-5)
+
+
+def test_products_with_the_convolution_are_each_others_transposes() -> None:
+    rng = np.random.default_rng(0)
+    grid = Grid((20, 27), 5)
+    x, e, k = rng.normal(size=grid.latent), rng.normal(size=grid.frame), rng.random((5, 5))
+    x, e = x.astype(np.float32), e.astype(np.float32)
+    blurred = signal.convolve(x, k, mode="valid")
+
+    assert np.allclose(grid.blurred(k, x), blurred, atol=1e-4)
+    assert np.vdot(grid.back(grid.spectrum(k), e), x) == pytest.approx(np.vdot(e, blurred), rel=1e-4)
+    assert np.vdot(grid.onto_kernel(grid.spectrum(x), e), k) == pytest.approx(np.vdot(e, blurred), rel=1e-4)
+    # sum_i c_i w_i(k) = sum_j k_j² (sum of c under j)
+    assert np.vdot(grid.reach_of(k), x**2) == pytest.approx(np.vdot(grid.sums_of(x**2), k**2), rel=1e-4)
+
+
+def test_the_kernel_step_recovers_the_kernel_of_a_known_scene() -> None:
+    truth, y = bent(), scene(140)
+    x = np.diff(y, axis=1)
+    observed = signal.fftconvolve(x, truth, mode="valid")
+    frame = (observed.shape[0], observed.shape[1])
+    term = Term(Grid(frame, 13), observed.astype(np.float32), x.astype(np.float32), 1.0)
+
+    found = least_squares_kernel([term], gaussian(13, np.eye(2)), turns=6)
+
+    assert distance(as_kernel(found), truth).rel_l2 < 0.01
+
+
+def test_a_bent_stroke_is_recovered_from_one_patch() -> None:
+    found = Zhang().estimate([shot(bent(), seed=1)], [NoiseModel.white(SIGMA)], size=15)
+
+    assert distance(found.kernel, bent()).ncc > 0.93
+    assert distance(delta(15), bent()).ncc < 0.5
+
+
+def test_sharp_patches_give_a_kernel_like_a_point() -> None:
+    found = Zhang().estimate([shot(delta(3), side=96)], [NoiseModel.white(SIGMA)], size=11)
+
+    assert found.kernel.max() > 0.75
+    assert found.no_blur
+
+
+def test_the_kernel_turns_and_stays_as_the_patch_turns_and_shifts() -> None:
+    y = shot(gaussian(13, [[2.0, 0.8], [0.8, 1.2]]), side=100)
+    method, noise = Zhang(iterations=3), [NoiseModel.white(SIGMA)]
+
+    straight = method.estimate([y[:97, :97]], noise, size=13).kernel
+    turned = method.estimate([np.ascontiguousarray(np.rot90(y[:97, :97]))], noise, size=13).kernel
+    shifted = method.estimate([y[3:, 3:]], noise, size=13).kernel
+
+    assert np.abs(turned - np.rot90(straight)).max() < 1e-3 * straight.max()
+    assert distance(shifted, straight).ncc > 0.98
+
+
+def test_patches_of_one_position_share_a_better_kernel() -> None:
+    method, noise = Zhang(iterations=6), NoiseModel.white(SIGMA)
+    patches = [shot(bent(), side=80, seed=seed) for seed in (0, 1)]
+
+    single = [distance(method.estimate([y], [noise], size=13).kernel, bent()).rel_l2 for y in patches]
+    pooled = distance(method.estimate(patches, [noise] * 2, size=13).kernel, bent()).rel_l2
+
+    assert pooled < np.mean(single)
+
+
+def test_another_channel_starts_from_the_first() -> None:
+    y, noise = shot(bent(), side=96, seed=1), [NoiseModel.white(SIGMA)]
+    method = Zhang(iterations=10)
+    green = method.estimate([y], noise, size=13)
+    red = method.estimate_channel([0.5 * y], [NoiseModel.white(0.5 * SIGMA)], green, [y], size=13)
+
+    assert distance(red.kernel, green.kernel).ncc > 0.9
+    assert red.seconds < green.seconds
+
+
+def test_a_wider_blur_gives_a_wider_kernel() -> None:
+    noise = [NoiseModel.white(SIGMA)]
+    widths = [
+        rms_width(
+            Zhang(iterations=4)
+            .estimate([shot(gaussian(15, s * s * np.eye(2)), side=80)], noise, size=15)
+            .kernel
+        )
+        for s in (0.7, 1.4, 2.2)
+    ]
+
+    assert widths == sorted(widths)

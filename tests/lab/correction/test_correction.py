@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from lab.correction.correction_benchmark import SoftCorners, correct_table, run_correct_benchmark
+from lab.peers import Peer
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import rms_width
+from lensmodel.core.types import FieldPosition
+
+
+@pytest.mark.slow  # the next one corrects the same photo, a part of it
+def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
+
+    missing = Peer("nobody's", "no-such-program", lambda *_: [], (1.0,), 1.0)
+
+    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing], beside=2)
+
+    assert report["methods"]["fast"]["cpu_s"] > 0
+    assert report["kernel"]["ours"] > 0
+    assert report["peers"] == {"nobody's": None}
+    assert "| nobody's | not installed |" in correct_table(report)
+    assert "2 threads take" in correct_table(report)
+    assert capsys.readouterr().out == ""
+
+
+def test_benchmark_of_a_window_counts_its_pixels_only() -> None:
+    photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
+
+    report = run_correct_benchmark(photo, methods=("fast",), roi=(0, 0, 100, 110))
+
+    assert report["megapixels"] == pytest.approx(0.011)
+    with pytest.raises(InvalidInputError, match="does not lie"):
+        run_correct_benchmark(photo, methods=("fast",), roi=(150, 0, 100, 110))
+
+
+def test_lens_for_timing_is_softer_in_the_corner() -> None:
+    lens = SoftCorners()
+
+    widths = [rms_width(lens.kernel_at(FieldPosition(r, 0.5), "g", 21)) for r in (0.0, 1.0)]
+
+    assert widths[0] < 1.0 < widths[1]
+
+
+def test_benchmark_refuses_a_single_plane() -> None:
+    with pytest.raises(InvalidInputError, match="photo must be"):
+        run_correct_benchmark(np.zeros((10, 10), dtype=np.float32))

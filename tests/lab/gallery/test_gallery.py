@@ -1,0 +1,559 @@
+"""The gallery: each figure finds what it is meant to and is silent on clean pictures; the page builds."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage, special
+
+import lensmodel
+from lab.gallery import Picture, Wishes, chosen, crops, hang, real_pictures, text, write_page
+from lab.gallery import audit as auditing
+from lab.gallery import work as working
+from lab.gallery.crops import ZOOM, places, sheet
+from lab.gallery.figures import (
+    chromaticity,
+    dots,
+    grain,
+    grain_ratio,
+    hue_flips,
+    overshoots,
+    percentile_of_edges,
+    texture_kept,
+    textures,
+)
+from lab.gallery.frames import FRAMES, take
+from lab.gallery.measure import TILE, bars, measured
+from lab.gallery.rendering import aligned
+from lab.gallery.truth import best_shift, gains
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile
+from lensmodel.photo import develop
+from lensmodel.workflow.lens import Lens
+
+Shown = NDArray[np.float64]
+GREY = 0.45
+
+
+def even(height: int = 64, width: int = 64, noise: float = 0.01, seed: int = 1) -> Shown:
+    """An even ground with white noise."""
+    rng = np.random.default_rng(seed)
+    return np.clip(GREY + noise * rng.normal(size=(height, width, 3)), 0.0, 1.0)
+
+
+def leaves(height: int, width: int) -> Shown:
+    """Shapes of all sizes with sharp edges, coloured as moderately as most things are."""
+    return _leaves(height, width).copy()  # a test may change them
+
+
+@cache
+def _leaves(height: int, width: int) -> Shown:
+    rng = np.random.default_rng(2)
+    picture = np.full((height, width, 3), 0.5)
+    rows, cols = np.mgrid[:height, :width]
+    for _ in range(400):
+        radius = float(rng.choice([2.0, 4.0, 8.0, 16.0]))
+        row, col = rng.uniform(0, height), rng.uniform(0, width)
+        near = (
+            slice(max(int(row - radius), 0), int(row + radius) + 2),
+            slice(max(int(col - radius), 0), int(col + radius) + 2),
+        )
+        inside = np.hypot(rows[near] - row, cols[near] - col) < radius
+        picture[near][inside] = rng.uniform(0.2, 0.7) * rng.uniform(0.75, 1.25, 3)
+    return ndimage.gaussian_filter(picture, (0.5, 0.5, 0.0))
+
+
+def blurred(picture: Shown, sigma: float) -> Shown:
+    return ndimage.gaussian_filter(picture, (sigma, sigma, 0.0), mode="nearest")
+
+
+def stepped(ringing: float, blur: float) -> tuple[Shown, Shown]:
+    """A blurred slanted edge from .3 to .7, and it sharp with a halo of a given share of the step."""
+    rows, cols = np.mgrid[:400, :96]
+    across = (cols - 48.0) + 0.15 * (rows - 200.0)
+    step = 0.5 * (1.0 + special.erf(across / (blur * 2**0.5)))
+    sharp = 0.5 * (1.0 + np.tanh(across / 0.6))
+    halo = np.exp(-0.5 * np.square((across - 3.0) / 1.2)) - np.exp(-0.5 * np.square((across + 3.0) / 1.2))
+    before, after = 0.3 + 0.4 * step, 0.3 + 0.4 * (sharp + ringing * halo)
+    return np.repeat(before[..., None], 3, axis=-1), np.repeat(after[..., None], 3, axis=-1)
+
+
+# --- dots ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_dots_are_found_where_they_were_put(value: float, channel: int) -> None:
+    before = even()
+    after = before.copy()
+    put = [(5, 7), (30, 40), (50, 12)]
+    for row, col in put:
+        after[row, col, channel] = value
+
+    assert [tuple(at) for at in np.argwhere(dots(before, after))] == put
+
+
+def test_a_pair_of_pixels_is_still_a_dot() -> None:
+    before = even()
+    after = before.copy()
+    after[20, 20:22] = 0.95
+
+    assert dots(before, after).sum() == 2
+
+
+def test_a_line_that_got_sharper_has_no_dots() -> None:
+    before = even(noise=0.0)
+    before[:, 31:34] += np.array([0.1, 0.25, 0.1])[:, None]
+    after = even(noise=0.0)
+    after[:, 32] = 1.0
+
+    assert not dots(before, after).any()
+
+
+def test_a_picture_that_was_blurred_and_comes_back_has_no_dots_and_no_flips() -> None:
+    sharp = leaves(200, 200)
+    before = blurred(sharp, 1.0)
+
+    assert not dots(before, sharp).any()
+    assert not hue_flips(before, sharp).any()
+
+
+def test_a_small_coloured_lamp_that_comes_back_has_no_dots_and_no_flips() -> None:
+    sharp = np.full((64, 64, 3), 0.1)
+    sharp[20:22, 30:32] = (0.9, 0.2, 0.15)
+    sharp[45, 12] = 0.9
+    before = blurred(sharp, 0.8)
+
+    assert not dots(before, sharp).any()
+    assert not hue_flips(before, sharp).any()
+
+
+def test_grain_that_was_doubled_is_no_dot() -> None:
+    before = even(200, 200, noise=0.01)
+
+    assert not dots(before, GREY + 2.0 * (before - GREY)).any()
+
+
+# --- hue -----------------------------------------------------------------------------------------
+
+
+def test_chromaticity_of_grey_is_the_origin_and_of_equal_distances_equal() -> None:
+    pure = chromaticity(np.eye(3)[None])[0]
+
+    assert np.allclose(chromaticity(np.full((1, 1, 3), 0.7)), 0.0, atol=1e-6)
+    assert np.allclose(np.linalg.norm(pure, axis=1), (2.0 / 3.0) ** 0.5)
+
+
+def test_cyan_pixels_beside_a_blown_sky_are_flips() -> None:
+    before = np.full((64, 64, 3), 1.0)
+    before[:, 32:] = (0.45, 0.42, 0.38)
+    after = before.copy()
+    after[10:40:5, 31] = (0.0, 1.0, 1.0)
+
+    found = hue_flips(before, after)
+
+    assert [tuple(at) for at in np.argwhere(found)] == [(row, 31) for row in range(10, 40, 5)]
+
+
+def test_a_colour_that_got_purer_or_moved_by_two_pixels_is_no_flip() -> None:
+    before = even(noise=0.0)
+    before[:, 30:34, 0] += 0.2
+    purer, moved = before.copy(), even(noise=0.0)
+    purer[:, 30:34, 0] += 0.15
+    moved[:, 32:36, 0] += 0.2
+
+    assert not hue_flips(before, purer).any()
+    assert not hue_flips(before, moved).any()
+
+
+def test_a_green_dot_in_a_red_place_is_a_flip() -> None:
+    before = np.full((40, 40, 3), (0.8, 0.15, 0.1))
+    after = before.copy()
+    after[20, 20] = (0.1, 0.8, 0.1)
+
+    assert np.argwhere(hue_flips(before, after)).tolist() == [[20, 20]]
+
+
+# --- edges ---------------------------------------------------------------------------------------
+
+
+def test_overshoot_of_a_known_halo_is_measured() -> None:
+    found = overshoots(*stepped(0.2, 1.2))
+
+    assert len(found) >= 15
+    assert np.median(found[:, 1]) == pytest.approx(20.0, abs=1.5)
+    assert np.median(found[:, 0]) < 0.5
+
+
+def test_an_edge_that_only_got_sharper_does_not_overshoot() -> None:
+    found = overshoots(*stepped(0.0, 1.2))
+
+    assert len(found) >= 15
+    assert found[:, 1].max() < 1.0
+
+
+def test_an_edge_as_sharp_as_pixels_allow_does_not_overshoot() -> None:
+    before, _ = stepped(0.0, 1.2)
+    fine = (np.arange(96 * 8) + 0.5) / 8 - 48.5 + 0.15 * ((np.arange(400 * 8) + 0.5)[:, None] / 8 - 200.5)
+    share = (fine > 0.0).reshape(400, 8, 96, 8).mean(axis=(1, 3))
+    after = np.repeat((0.3 + 0.4 * share)[..., None], 3, axis=-1)
+
+    found = overshoots(before, after)
+
+    assert len(found) >= 15
+    assert found[:, 1].max() < 0.1
+
+
+def test_a_line_beside_an_edge_is_no_halo_of_the_original() -> None:
+    before, after = stepped(0.0, 1.2)
+    rows, cols = np.mgrid[:400, :96]
+    across = (cols - 48.0) + 0.15 * (rows - 200.0)
+    before[(across > 3.0) & (across < 5.5)] += 0.25
+
+    assert len(overshoots(before, after)) < 5
+
+
+def test_a_line_that_blur_hid_beside_an_edge_is_no_halo_where_the_truth_shows_it() -> None:
+    before, after = stepped(0.2, 1.2)
+    truth = stepped(0.0, 1.2)[1]
+
+    assert len(overshoots(before, after, truth)) == len(overshoots(before, after))
+    assert len(overshoots(before, after, after)) == 0
+
+
+def test_few_edges_give_no_percentile() -> None:
+    assert percentile_of_edges(np.zeros((10, 2))) is None
+    assert percentile_of_edges(np.tile([1.0, 3.0], (60, 1))) == (1.0, 3.0)
+
+
+# --- grain ---------------------------------------------------------------------------------------
+
+
+def test_grain_ratio_is_the_square_of_a_factor_in_every_band() -> None:
+    before = even(256, 256)
+
+    ratio = grain_ratio(grain(before, GREY + 0.8 * (before - GREY)))
+
+    assert ratio is not None
+    assert [ratio[band] for band in ("coarse", "middle", "fine")] == pytest.approx([0.64] * 3, abs=0.01)
+
+
+def test_smoothed_grain_shows_in_the_fine_band_most() -> None:
+    before = even(256, 256)
+    ratio = grain_ratio(grain(before, blurred(before, 0.8)))
+
+    assert ratio is not None
+    assert ratio["fine"] < 0.1 < ratio["middle"] < ratio["coarse"]
+
+
+def test_a_scene_without_an_even_place_has_no_grain_ratio() -> None:
+    rng = np.random.default_rng(3)
+    radius = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256)[None, :])
+    spectrum = np.fft.fft2(rng.normal(size=(256, 256))) / np.maximum(radius, 0.005) ** 1.5
+    texture = np.real(np.fft.ifft2(spectrum))
+    scene = np.repeat((0.5 + 0.1 * texture / texture.std())[..., None], 3, axis=-1)
+
+    assert grain_ratio(grain(scene, scene)) is None
+
+
+def test_contrast_that_is_left_of_low_contrast_texture_is_measured() -> None:
+    before = even(256, 256, noise=0.03)
+    erased = before.copy()
+    erased[64:128, 64:128] = GREY
+
+    assert texture_kept(textures(before, GREY + 0.6 * (before - GREY))) == pytest.approx(0.6, abs=0.01)
+    assert texture_kept(textures(before, before)) == 1.0
+    found = texture_kept(textures(before, erased))
+    assert found is not None
+    assert found < 0.05
+    assert texture_kept(textures(even(noise=0.0), even(noise=0.0))) is None
+
+
+# --- truth ---------------------------------------------------------------------------------------
+
+
+def test_gains_against_the_truth_are_those_of_the_errors() -> None:
+    truth = leaves(300, 420)
+    noise = np.random.default_rng(4).normal(size=truth.shape)
+
+    found = gains(truth + 0.02 * noise, truth + 0.01 * noise, truth)
+
+    assert found is not None
+    assert list(found.zones.values()) == pytest.approx([6.02] * 3, abs=0.2)
+    assert found.loss_share == 0.0
+
+
+def test_a_ruined_block_is_found() -> None:
+    truth = leaves(300, 420)
+    noise = np.random.default_rng(4).normal(size=truth.shape)
+    before = truth + 0.02 * noise
+    after = truth + 0.01 * noise
+    after[140:260, 140:260] = before[140:260, 140:260] + 0.1
+
+    found = gains(before, after, truth)
+
+    assert found is not None
+    assert found.worst_db < -10.0
+    assert abs(found.worst_at[0] - 136) <= 28
+    assert found.worst_at[1] == 136
+    assert found.loss_share > 0.0
+
+
+def test_a_shift_is_measured_and_costs_nothing() -> None:
+    truth = leaves(160, 160)
+    moved = np.stack(
+        [ndimage.shift(truth[..., k], (0.4, -1.3), order=5, mode="nearest") for k in range(3)], -1
+    )
+
+    assert best_shift(moved, truth) == pytest.approx((0.4, -1.3), abs=0.02)
+    found = gains(blurred(truth, 0.7), moved, truth)
+    assert found is not None
+    assert found.worst_db > 5.0
+
+
+# --- all of it -----------------------------------------------------------------------------------
+
+
+def stored(picture: Shown) -> NDArray[np.uint16]:
+    return np.rint(np.clip(picture, 0.0, 1.0) * 65535).astype(np.uint16)
+
+
+def test_an_untouched_picture_keeps_every_bar() -> None:
+    picture = stored(np.concatenate([leaves(300, 300), even(300, 300)], axis=1))
+
+    found = measured(picture, picture, stored(np.concatenate([leaves(300, 300)] * 2, axis=1)))
+
+    assert found["dots"] == found["hue_flips"] == found["changed"] == 0
+    assert all(bars(found).values())
+
+
+def test_faults_across_tiles_are_counted_once_and_their_place_is_told() -> None:
+    before = stored(even(TILE + 100, 200))
+    after = before.copy()
+    for row in range(TILE - 4, TILE + 4, 2):
+        after[row, 100] = (0, 65535, 0)
+
+    found = measured(before, after, None)
+
+    assert found["dots"] == found["hue_flips"] == 4
+    assert abs(found["dots_at"][0] - TILE) <= 48
+    assert not bars(found)["dots"]
+    assert not bars(found)["hue flips"]
+
+
+def test_bars_that_were_not_measured_are_left_out() -> None:
+    picture = stored(np.full((128, 128, 3), 0.5))
+
+    assert set(bars(measured(picture, picture, None))) == {"dots", "hue flips"}
+
+
+def test_the_most_changed_places_are_those_that_were_changed() -> None:
+    before = stored(even(600, 600))
+    after = before.copy()
+    after[300:340, 440:480] //= 2
+
+    found = {name: (row, col) for name, row, col in places(before, after, None)}
+
+    row, col = found["most changed 1"]
+    assert row <= 300
+    assert row + 96 >= 340
+    assert col <= 440
+    assert col + 96 >= 480
+    assert {"center", "upper left", "lower right"} <= set(found)
+
+
+def test_crops_are_squares_of_three_pixels_side_by_side() -> None:
+    picture = stored(even(40, 40))
+
+    made = sheet([picture, picture[::-1]], 10, 10, 8)
+
+    assert made.shape == (8 * ZOOM, 2 * 8 * ZOOM + 6, 3)
+    assert (made[:3, :3] == picture[10, 10] // 257).all()
+    assert (made[:3, -3:] == picture[::-1][10, 17] // 257).all()
+
+
+def test_another_programs_picture_is_turned_and_moved_onto_ours() -> None:
+    ours = stored(leaves(180, 240))
+    upright = np.rot90(ours[4:-4, 6:-2], -1)
+
+    found = aligned(upright, ours, 6)
+
+    assert (found[4:-4, 6:-2] == ours[4:-4, 6:-2]).all()
+    assert not found[:4].any()
+
+
+# --- the page ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Test data of one photo, one stand-in, and files that hold no picture."""
+    monkeypatch.setattr(crops, "ZOOM", 1)  # to pack enlarged crops would take longer than all the rest
+    (tmp_path / "real").mkdir()
+    (tmp_path / "meta").mkdir()
+    eight = np.rint(255.0 * np.clip(blurred(leaves(224, 256), 1.0), 0.0, 1.0)).astype(np.uint8)
+    Image.fromarray(eight).save(tmp_path / "real" / "leaves.png")
+    Image.fromarray(eight[:40, :60]).save(tmp_path / "meta" / "stand-in.jpg")
+    (tmp_path / "meta" / "notes.tsv").write_text("a\tb\n", encoding="utf-8")
+    return tmp_path
+
+
+def known_lens(*args: Any, **options: Any) -> Lens:
+    return _known_lens(options["model"])
+
+
+@cache
+def _known_lens(model: Any) -> Lens:
+    samples = [
+        PsfSample(
+            gaussian(15, np.eye(2)),
+            FieldPosition(r, phi),
+            LensSettings(5.6),
+            photo="0123456789abcdef",
+            error=0.1,
+        )
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    return Lens(LensProfile(LensModel.fit(samples, model)))
+
+
+def refused(*args: Any, **options: Any) -> Lens:
+    raise NotEnoughEvidenceError("no photo could be used")
+
+
+def ignore(words: str, done: int, total: int) -> None:
+    """Hear nothing."""
+
+
+def test_the_pictures_of_a_folder_are_those_that_show_something(folder: Path) -> None:
+    assert [picture.name for picture in real_pictures(folder)] == ["real/leaves.png"]
+
+
+def test_asking_for_no_such_picture_names_those_there_are(folder: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"'rose'; there are real/leaves\.png"):
+        chosen(real_pictures(folder), ["rose"])
+
+
+def test_the_page_shows_a_corrected_picture_and_its_figures(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lensmodel, "calibrate", known_lens)
+    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    output = tmp_path / "gallery"
+
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
+    page = write_page(entries, output).read_text(encoding="utf-8")
+
+    assert entries[0].work["state"] == "corrected"
+    assert entries[0].figures["changed"] > 0.01
+    assert "rawtherapee-cli is not installed" in page
+    assert len(entries[0].places) >= 6
+    for place in entries[0].places:
+        assert (output / place.file).is_file()
+        assert f'src="{place.file}"' in page
+    assert "| real/leaves.png | corrected |" in text(entries)
+
+
+def test_the_audits_map_and_its_worst_places_are_shown_where_there_is_an_audit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def audit_photo(original: Any, corrected: Any, evidence: Any) -> SimpleNamespace:
+        assert evidence("a place", "a window").clip == (1.0, 1.0, 1.0)
+        keep = np.ones(corrected.shape[1:])
+        keep[96:144, 48:96] = 0.0
+        return SimpleNamespace(keep=keep)
+
+    fake = SimpleNamespace(audit_photo=audit_photo, Evidence=SimpleNamespace)
+    monkeypatch.setattr(auditing, "find_spec", lambda _: object())
+    monkeypatch.setattr(auditing, "import_module", lambda _: fake)
+    monkeypatch.setattr(lensmodel, "calibrate", known_lens)
+    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    output = tmp_path / "gallery"
+
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
+
+    worst = next(place for place in entries[0].places if place.name == "audit 1")
+    assert (worst.row, worst.col) == (120 - 48, 72 - 48)
+    assert "audit 2" not in {place.name for place in entries[0].places}
+    assert (np.asarray(Image.open(output / entries[0].audit))[100:140, 50:90] == 255).all()
+
+
+def test_without_an_audit_there_is_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auditing, "find_spec", lambda _: None)
+
+    assert auditing.audit_map(SimpleNamespace(), np.zeros((3, 8, 8), dtype=np.float32)) is None  # type: ignore[arg-type]
+
+
+def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lensmodel, "calibrate", refused)
+    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+
+    entries = list(hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore))
+
+    assert entries[0].work["state"] == "left alone"
+    assert "calibration was refused: no photo could be used" in write_page(
+        entries, tmp_path / "gallery"
+    ).read_text(encoding="utf-8")
+    assert entries[0].figures["changed"] == 0.0
+    assert all(entries[0].bars.values())
+
+
+def test_what_is_stored_is_not_made_again_unless_asked(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def counted(*args: Any, **options: Any) -> Lens:
+        calls.append(args)
+        return refused()
+
+    monkeypatch.setattr(lensmodel, "calibrate", counted)
+    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    pictures = real_pictures(folder)
+
+    for fresh in (False, False, True):
+        list(hang(pictures, tmp_path / "gallery", Wishes(fresh=fresh), on_picture=ignore))
+
+    assert len(calls) == 2
+
+
+def test_an_unreadable_file_is_named_with_its_reason(tmp_path: Path) -> None:
+    picture = Picture("raw/odd.gpr", tmp_path / "odd.gpr", unreadable="packed as VC-5 is not read")
+
+    entries = list(hang([picture], tmp_path / "gallery", Wishes(), on_picture=ignore))
+
+    assert "packed as VC-5 is not read" in write_page(entries, tmp_path / "gallery").read_text(
+        encoding="utf-8"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "frame", [f for f in FRAMES if f.name in {"red-cars", "sky-gradient"}], ids=lambda f: f.name
+)
+def test_a_simulated_frame_shows_its_truth_blurred(frame: Any, tmp_path: Path) -> None:
+    photo, truth = take(frame, tmp_path, height=160, width=224)
+
+    shown = working.rendered(*_developed(photo))
+    sharp = np.load(truth)
+
+    assert shown.shape == sharp.shape == (160, 224, 3)
+    assert np.corrcoef(shown[..., 1].ravel(), sharp[..., 1].ravel())[0, 1] > 0.7
+    assert photo.suffix == (".jpg" if frame.jpeg else ".dng")
+
+
+def _developed(photo: Path) -> Any:
+    developed = develop(photo)
+    return developed.planes, developed.encoding

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.population import library, scenes
+from lab.population.describe import describe
+from lab.population.grids import grid_of
+from lab.population.photos import KINDS, Processing, Scenes, bayer, demosaic
+from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
+from lab.population.traced import draw
+from lensmodel.neural.network import SIDE
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes that are drawn: twelve of them, so that one is held out."""
+    made = tmp_path_factory.mktemp("population")
+    scenes.build(made / "scenes", iter(()), drawn=6, side=420)
+    return made
+
+
+@pytest.fixture(scope="module")
+def lens(folder: Path) -> Lens:
+    crops = Scenes(folder / "scenes", held_out=False)
+    stored = library.make_lens("wavefront", 3, crops, held_out=False)
+    assert stored is not None
+    return Lens.of(stored)
+
+
+def test_scenes_held_out_are_none_of_the_others(folder: Path) -> None:
+    both = [Scenes(folder / "scenes", held_out=value) for value in (False, True)]
+    assert len(both[0]) + len(both[1]) == 12
+    assert len(both[1]) == 1
+
+
+def test_a_lens_is_the_same_whenever_it_is_made(folder: Path, lens: Lens) -> None:
+    crops = Scenes(folder / "scenes", held_out=False)
+    again = Lens.of(library.make_lens("wavefront", 3, crops, held_out=False) or {})
+    np.testing.assert_array_equal(again.statistics, lens.statistics)
+    np.testing.assert_array_equal(again.truth, lens.truth)
+
+
+def test_sets_hold_what_was_asked_for(lens: Lens) -> None:
+    drawn = draw_set(lens, 6, 5, np.random.default_rng(0))
+    assert len(drawn.xy) == 6
+    assert drawn.truth.shape[:2] == (5, 3)
+    np.testing.assert_allclose(drawn.truth.astype(float).sum(-1), 1.0, atol=5e-3)
+
+
+def test_sets_survive_a_file(lens: Lens, tmp_path: Path) -> None:
+    sets = fixed_set([lens], samples=8, queries=3, count=1)
+    save_sets(sets, tmp_path / "sets.npz")
+    (back,) = load_sets(tmp_path / "sets.npz")
+    np.testing.assert_array_equal(back.truth, sets[0].truth)
+    np.testing.assert_allclose(back.query_xy, of_photos(lens, 1).query_xy[:: len(lens.xy) // 3])
+
+
+def test_a_shard_that_is_there_is_not_made_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "SHARD", 1)
+    wanted = {"held_out": False, "plain": False}
+    library._make_shard(folder / "lenses", folder / "scenes", "third-order", 0, **wanted)
+    (path,) = (folder / "lenses").glob("*.npz")
+    before = path.stat().st_mtime_ns
+    assert not library._make_shard(folder / "lenses", folder / "scenes", "third-order", 0, **wanted)
+    assert path.stat().st_mtime_ns == before
+
+
+def test_demosaicking_keeps_samples_and_interpolates_a_slope() -> None:
+    rows, cols = np.mgrid[:16, :18].astype(np.float32)
+    slope = np.stack([0.1 + 0.01 * rows, 0.2 + 0.005 * cols, 0.3 + 0.01 * rows]).astype(np.float32)
+    mosaic = np.take_along_axis(slope, bayer(16, 18)[None].astype(np.intp), 0)[0]
+    made = demosaic(mosaic)
+    inner = np.s_[:, 3:-3, 3:-3]
+    np.testing.assert_allclose(made[inner], slope[inner], atol=1e-5)
+
+
+def test_what_a_camera_does_to_a_kernel_is_what_it_does_to_a_point() -> None:
+    processing = Processing(0.4, 0.0, 0.6, 1.0, 0.0, 0, mosaicked=False)
+    point = np.zeros((1, SIDE, SIDE), np.float32)
+    point[0, SIDE // 2, SIDE // 2] = 1.0
+    kernel = processing.applied(point)[0]
+    grey = np.full((3, SIDE, SIDE), 0.5, np.float32)
+    grey[:, SIDE // 2, SIDE // 2] += 1e-3  # so little that the gamma is a line
+    seen = processing.develop(np.empty((0, 0), np.float32), grey)[1] - 0.5
+    seen = np.maximum(seen / seen.sum(), 0.0)
+    np.testing.assert_allclose(kernel, seen / seen.sum(), atol=0.02)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_processing_keeps_a_flat_picture(kind: str) -> None:
+    processing = Processing.draw(np.random.default_rng(2), kind)  # type: ignore[arg-type]
+    flat = np.full((3, 64, 64), 0.25, np.float32)
+    made = processing.develop(np.full((64, 64), 0.25, np.float32), flat)
+    assert np.ptp(made) < 0.02
+    assert made.mean() == pytest.approx(0.25, abs=0.06)  # a tone curve may move it a little
+
+
+def test_describe_orders_percentiles(lens: Lens) -> None:
+    for low, middle, high in describe([lens]).values():
+        assert low <= middle <= high
+
+
+def test_a_grid_answers_as_the_lens_does() -> None:
+    lens = draw(np.random.default_rng(1), ["heliar"])
+    grid = grid_of(lens, step=0.5)
+    assert grid.kernels.shape[-1] == 55
+    np.testing.assert_allclose(grid.kernels.astype(float).sum((-1, -2)), 1.0, atol=5e-3)
+    assert grid.facts["design"] == "heliar"

@@ -1,0 +1,1172 @@
+"""`lab.reproduce`: planning, keys, tables, pages and resuming; one real run, slow."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from lab.code_version import code_of, version_of
+from lab.figure_parts import strip
+from lab.reproduce import (
+    Answer,
+    Case,
+    DirectRoute,
+    Place,
+    Reproduction,
+    collected,
+    families,
+    job,
+    measure,
+    planned,
+    run,
+    run_reproduction,
+    write_json,
+    write_page,
+)
+from lab.reproduce.cases import FIRST_SEED, Size, key_of
+from lab.reproduce.conditions import BASE, CONDITIONS, PATHS, SCENES_THAT_HURT
+from lab.reproduce.fidelity import EVERY, blocks, fidelity
+from lab.reproduce.general import (
+    MeanField,
+    SymmetricField,
+    general_field,
+    general_key,
+    general_words,
+)
+from lab.reproduce.interpolation import Flow
+from lab.reproduce.pages.bars import bars, held, missed
+from lab.reproduce.pages.tables import groups, hard_rows, kept, shares, summary
+from lab.reproduce.planning import in_turn
+from lab.reproduce.routes import paper_way
+from lab.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
+from lab.reproduce.shots import Shots, guard_of, take
+from lab.traced import read_grid
+from lensmodel import quality
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.psf import as_kernel, distance
+from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.photo import develop
+from lensmodel.quality.images import as_shown
+from lensmodel.simulate import LENS_KINDS, edge_chart
+from lensmodel.workflow.ways import Way
+
+
+def case(**changes: Any) -> Case:
+    return replace(planned("quick").cases[0], height=480, width=640, **changes)
+
+
+def plan(*cases: Case) -> Reproduction:
+    return Reproduction(
+        cases or (case(),), estimator="default", rivals=(), size="quick", paper=False, general=False
+    )
+
+
+def photographs(folder: Path, count: int) -> tuple[Path, ...]:
+    """Photographs of one colour each; every third stands upright."""
+    paths = []
+    for i in range(count):
+        size = (90, 150) if i % 3 == 0 else (150, 90)
+        path = folder / f"photo{i}.png"
+        Image.new("RGB", size, (10 * i + 5, 0, 0)).save(path)
+        paths.append(path)
+    return tuple(paths)
+
+
+# --- planning ----------------------------------------------------------------------------------
+
+
+def test_default_size_has_eight_kinds_of_lenses_on_reported_seeds() -> None:
+    cases = [one for one in planned("default", grids=()).cases if one.condition == BASE]
+    assert len({one.lens.model.split()[1] for one in cases}) == len(LENS_KINDS) == 8
+    assert min(one.seed for one in cases) >= FIRST_SEED
+
+
+def test_full_size_takes_every_lens_at_two_apertures() -> None:
+    cases = [one for one in planned("full", grids=()).cases if one.condition == BASE]
+    for seed in {one.seed for one in cases}:
+        apertures = {one.aperture for one in cases if one.seed == seed}
+        assert max(apertures) == pytest.approx(2 * min(apertures))
+    assert {round(one.stops) for one in cases} == {0, 2}
+    assert any(len({c.focal_mm for c in cases if c.seed == seed}) == 2 for seed in {c.seed for c in cases})
+
+
+@pytest.mark.parametrize(("size", "drawn"), [("default", 2), ("full", 4)])
+def test_high_iso_tiff_and_jpeg_are_taken_with_lenses_of_both_families(size: Size, drawn: int) -> None:
+    taken = [one for one in planned(size).cases if one.condition in PATHS]
+    for name in PATHS:
+        families_of = {one.seed: one.family for one in taken if one.condition == name}
+        assert sorted(families_of.values()) == ["ray-traced"] * 2 + ["third order"] * drawn
+    assert min(one.seed for one in taken) >= FIRST_SEED
+
+
+def test_each_condition_takes_other_lenses_as_unlike_as_they_come() -> None:
+    assert [in_turn(range(8), number, 2) for number in range(3)] == [[0, 4], [1, 5], [2, 6]]
+    assert in_turn(["heliar"], 2, 2) == ["heliar"]
+    assert in_turn((), 0, 2) == []
+
+
+def test_scenes_that_hurt_are_taken_in_full() -> None:
+    cases = planned("full").cases
+    assert {one.condition for one in cases} == {BASE, *PATHS, *SCENES_THAT_HURT}
+    assert {one.family for one in cases if one.condition in SCENES_THAT_HURT} == {"third order"}
+
+
+def test_unknown_condition_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="known: base, high-iso"):
+        case(condition="fog")
+
+
+def test_names_of_cases_are_unique() -> None:
+    names = [one.name for one in planned("full").cases]
+    assert len(set(names)) == len(names)
+
+
+def test_case_refuses_numbers_of_photos_that_do_not_ascend() -> None:
+    with pytest.raises(InvalidInputError, match="ascend"):
+        case(photos=(2, 1))
+
+
+# --- ray-traced lenses -------------------------------------------------------------------------
+
+
+HELIAR, TELEPHOTO = families.repository_grids()
+
+
+def traced(path: Path = HELIAR, **changes: Any) -> Case:
+    (one,) = [c for c in planned("quick", grids=[path]).cases if c.grid is not None]
+    return replace(one, height=480, width=640, **changes)
+
+
+def test_default_only_leaves_out_all_that_bars_do_not_ask_for() -> None:
+    least, usual = planned("default", default_only=True), planned("default")
+    assert (least.methods, least.rivals, least.programs) == (("standard",), (), ())
+    assert (least.paper, least.general, least.target) == (False, False, False)
+    assert (usual.rivals, usual.paper, usual.general, usual.target) == (("schuler", "kee"), True, True, True)
+    assert [one.name for one in least.cases] == [one.name for one in usual.cases]
+
+
+def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
+    cases = planned("quick").cases
+    assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2
+    assert [one.unseen for one in cases] == [True, True, False, False]
+    assert {one.name.partition("-")[0] for one in cases} == {"1008", "1004", "heliar", "reverse"}
+    assert len({one.seed for one in cases}) == 4
+
+
+def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> None:
+    one, grid = traced(), read_grid(HELIAR)
+    assert (one.aperture, one.stops, one.camera.pitch_um) == (3.5, 0.0, grid.pitch_um)
+    place = FieldPosition(0.7, 2.0)
+    expected = grid.kernel_at(place, "b", 31)
+    np.testing.assert_array_equal(one.truth().kernel_at(place, "b", 31), expected)
+
+
+def test_key_of_a_traced_lens_follows_the_content_of_its_grid(tmp_path: Path) -> None:
+    moved = tmp_path / "elsewhere.npz"
+    moved.write_bytes(HELIAR.read_bytes())
+    assert traced(moved).seed == traced().seed
+    assert key_of(traced(moved), plan(), "a", "1") == key_of(traced(), plan(), "a", "1")
+    assert key_of(traced(TELEPHOTO), plan(), "a", "1") != key_of(traced(), plan(), "a", "1")
+    with pytest.raises(InvalidInputError, match="one design"):
+        planned("quick", grids=[HELIAR, moved])
+
+
+def test_only_lenses_that_are_named_are_run() -> None:
+    assert [c.seed for c in planned("default", only=["1003"]).cases if c.condition == BASE] == [1003]
+    assert {c.family for c in planned("quick", only=["heliar"]).cases} == {"ray-traced"}
+    with pytest.raises(InvalidInputError, match="no lens's name begins with 'sonnar'"):
+        planned("quick", only=["sonnar"])
+
+
+@pytest.mark.slow
+def test_traced_lens_is_photographed(tmp_path: Path) -> None:
+    files = photographs(tmp_path, 4)
+    one = replace(traced(), photos=(1,), height=32, width=64, layout=layout_for(files, 2, (32, 64)))
+    shots = take(one, files, tmp_path / "photos", first=1)
+    seen = develop(shots.learn[0])
+    assert seen.info.metadata.aperture == pytest.approx(3.5)
+    assert seen.info.metadata.pixel_pitch_um == pytest.approx(4.5)
+
+
+class EvenField:
+    """A field that is the same under every turn of the frame about its middle, and under its mirror.
+
+    Kernels have a tail outwards: symmetric ones would hide a turn the wrong way round.
+    """
+
+    def kernel_at(self, position: FieldPosition, channel: str, size: int) -> np.ndarray:
+        del channel
+        u = np.array([-np.sin(position.phi), np.cos(position.phi)])  # (row, col)
+        places = np.moveaxis(np.mgrid[:size, :size] - size // 2, 0, -1).astype(float)
+        core, tail = (
+            np.exp(-0.5 * np.square(places - shift * u).sum(axis=-1) / width)
+            for shift, width in ((0.0, 1.0), (3.0 * position.r, 2.0))
+        )
+        return as_kernel(core + 0.5 * tail)
+
+
+def test_even_lens_is_its_own_general_profile_and_an_uneven_one_is_not() -> None:
+    place = FieldPosition(0.8, 0.6)
+    even = EvenField()
+    found = SymmetricField(even).kernel_at(place, "g", 21)
+    np.testing.assert_allclose(found, even.kernel_at(place, "g", 21), atol=1e-12)
+    assert distance(even.kernel_at(place, "g", 21), even.kernel_at(place, "g", 21)[::-1]).rel_l2 > 0.1
+    one = traced()
+    assert (
+        distance(general_field(one).kernel_at(place, "g", 25), one.truth().kernel_at(place, "g", 25)).rel_l2
+        > 0.02
+    )
+
+
+def test_general_profile_of_a_drawn_lens_is_the_mean_of_development_lenses_of_its_kind() -> None:
+    one, place = case(), FieldPosition(0.5, 1.0)
+    field = general_field(one)
+    assert isinstance(field, MeanField)
+    lenses = [each.lens for each in field.fields]  # type: ignore[attr-defined]  # simulated fields
+    assert {lens.model.split()[1] for lens in lenses} == {one.lens.model.split()[1]}
+    assert max(int(lens.serial.removeprefix("SIM")) for lens in lenses) < 100
+    mean = np.mean([each.kernel_at(place, "g", 21) for each in field.fields], axis=0)
+    np.testing.assert_allclose(field.kernel_at(place, "g", 21), mean / mean.sum())
+
+
+def test_general_profile_of_a_traced_lens_is_the_mean_of_other_copies_where_there_are_any(
+    tmp_path: Path,
+) -> None:
+    own = tmp_path / "traced-heliar.npz"
+    own.write_bytes(HELIAR.read_bytes())
+    (tmp_path / "traced-other.npz").write_bytes(TELEPHOTO.read_bytes())  # of another design
+    one = traced(own)
+    assert general_words(one) == "the lens itself made symmetric"
+    assert general_key(one) == ""
+
+    grid = read_grid(HELIAR)
+    copy = replace(
+        grid,
+        kernels=np.ascontiguousarray(grid.kernels[..., ::-1]),
+        facts={**grid.facts, "sensor_tilt_um": [-6.0, 4.0]},
+        _known={},
+    )
+    copy.write(tmp_path / "traced-heliar-copy.npz")
+    assert general_words(one) == "another copy of the design"
+    assert general_key(one) not in {"", general_key(traced(tmp_path / "traced-heliar-copy.npz"))}
+    place = FieldPosition(0.7, 0.4)
+    found = general_field(one).kernel_at(place, "g", 21)
+    np.testing.assert_allclose(found, copy.kernel_at(place, "g", 21), atol=1e-3)
+
+
+def test_flow_gives_the_psfs_of_its_windows_in_their_middles_and_their_mean_between() -> None:
+    field, frame = EvenField(), Frame(96, 144)
+    flow = Flow(field, frame, 15)
+    middles = [frame.position(11.5, 59.5), frame.position(11.5, 83.5)]
+    left, right = (field.kernel_at(place, "g", 15) for place in middles)
+    between = frame.position(12.0, 72.0)  # half a pixel beyond the middle of the two
+    assert distance(flow(middles[0]), left).rel_l2 < 0.03  # the pixel that is nearest lies half a pixel away
+    assert distance(flow(between), 0.5 * (left + right)).rel_l2 < 0.03
+    assert distance(flow(between), left).rel_l2 > 0.04
+
+
+# --- scenes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("files", "frames"), [(3, 3), (6, 3), (13, 3), (3, 5)])
+def test_no_part_of_a_photograph_serves_twice(tmp_path: Path, files: int, frames: int) -> None:
+    paths = photographs(tmp_path, files)
+    layout = layout_for(paths, frames)
+    order = np.random.default_rng(0).permutation(files * layout.pieces).tolist()
+    seen = [frame_scene(paths, layout, order, i) for i in range(frames)]
+    rows, cols = layout.tile
+    assert all(scene.shape == (3, layout.rows * rows, layout.cols * cols) for scene in seen)
+    area = {level: sum(int((scene[0] == level).sum()) for scene in seen) for level in np.unique(seen)}
+    del area[0.0]  # green and blue
+    assert max(area.values()) <= rows * cols * layout.pieces
+
+
+def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="need at least 4"):
+        layout_for(photographs(tmp_path, 3), 7)
+
+
+def test_smallest_grid_that_covers_a_wanted_frame_is_taken(tmp_path: Path) -> None:
+    paths = photographs(tmp_path, 12)
+    assert layout_for(paths, 3).frame > layout_for(paths, 6).frame
+    assert (layout_for(paths, 3, (80, 140)).rows, layout_for(paths, 3, (80, 140)).cols) == (1, 1)
+    with pytest.raises(InvalidInputError, match="give larger ones"):
+        layout_for(paths, 3, (200, 300))
+
+
+def test_only_the_test_half_of_a_folder_is_used(tmp_path: Path) -> None:
+    for name in ("s01_city_sunset", "s03_lake_mountains"):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")
+    assert [path.stem for path in scene_files(tmp_path)] == ["s01_city_sunset"]
+
+
+def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
+    scene = np.zeros((3, 161, 140), dtype=np.float32)
+    assert centred_cut(scene, 100, 100).shape == (3, 156, 140)
+    with pytest.raises(InvalidInputError, match="cover"):
+        centred_cut(scene, 100, 200)
+
+
+# --- keys --------------------------------------------------------------------------------------
+
+
+def test_key_changes_with_settings_route_and_code() -> None:
+    one = case()
+    keys = {
+        key_of(one, plan(), "a", "1"),
+        key_of(one, plan(), "a", "2"),
+        key_of(one, plan(), "b", "1"),
+        key_of(replace(one, aperture=2.8), plan(), "a", "1"),
+        key_of(replace(one, condition="jpeg"), plan(), "a", "1"),
+        key_of(one, replace(plan(), estimator="michaeli-irani"), "a", "1"),
+    }
+    assert len(keys) == 6
+    assert key_of(case(), plan(), "a", "1") in keys
+
+
+def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages() -> None:
+    names = {path.stem for path in code_of("lab.reproduce.job", without=["lensmodel.report"])}
+    assert {"job", "scenes", "model_benchmark", "richardson_lucy", "fitted"} <= names
+    assert not names & {"bars", "page_tables", "planning"}
+    rivals = {path.stem for path in code_of("lab.rivals")}
+    assert {"kee", "schuler", "gradients", "pyramid"} <= rivals
+
+
+def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
+    for name, text in {
+        "a": "from pkg import b\n",
+        "b": "def f():\n    import pkg.c\n",
+        "c": "",
+        "d": "",
+    }.items():
+        path = tmp_path / "pkg" / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    first = version_of("pkg.a", root=tmp_path)
+    (tmp_path / "pkg" / "d.py").write_text("changed = 1")
+    assert version_of("pkg.a", root=tmp_path) == first
+    (tmp_path / "pkg" / "c.py").write_text("changed = 1")
+    assert version_of("pkg.a", root=tmp_path) != first
+    assert version_of("pkg.a", without=["pkg.b"], root=tmp_path) not in {first, ""}
+
+
+# --- tables and page, from made-up results -----------------------------------------------------
+
+
+def state(mtf50: float, psnr: float) -> dict[str, Any]:
+    edge = {
+        "edges": 2,
+        "mtf50": mtf50,
+        "tangential_mtf50": mtf50,
+        "sagittal_mtf50": None,
+        "mtf_max": 1.02,
+        "overshoot": 2.0,
+        "mtf50_fair": mtf50,
+    }
+    return {
+        "edges": {zone: dict(edge) for zone in ZONES},
+        "psnr": dict.fromkeys(ZONES, psnr),
+        "ssim": dict.fromkeys(ZONES, psnr / 40.0),
+    }
+
+
+def result(*lenses: tuple[float, float]) -> dict[str, Any]:
+    """Lenses given by MTF50 and PSNR after n = 1; 100 and 30 before, 200 and 34 with the true PSF."""
+    cases = [
+        {
+            "name": f"lens{i}",
+            "title": f"Lens <{i}>",
+            "family": "third order",
+            "unseen": True,
+            "source": f"drawn, seed {1000 + i}",
+            "kind": "coma",
+            "condition": "base",
+            "condition_title": "raw",
+            "settings": {"seed": 1000 + i, "height": 480, "width": 640},
+            "stops": 0.0,
+            "frames": "each frame is a photograph",
+            "truth": {
+                "before": state(100, 30.0),
+                "true": {"paper": state(200, 34.0)},
+                "control": state(101, 30.5),
+                "pictures": {"before": "before.png", "scene": "scene.png", "true-paper": "true.png"},
+            },
+            "learned": {
+                "1": {
+                    "photos": 1,
+                    "counted": 1,
+                    "refused": [],
+                    "pictures": {"n1-paper": "after.png"},
+                    "psf": {
+                        "rel_l2": {c: dict.fromkeys(ZONES, 0.2) for c in "rgb"},
+                        "predicted_right": 0.75,
+                    },
+                    "methods": {"paper": state(mtf50, psnr)},
+                }
+            },
+            "rivals": {
+                "kee": {
+                    "pictures": {"kee-paper": "kee.png"},
+                    "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
+                    "methods": {"paper": state(130, 31.0)},
+                }
+            },
+            "programs": {
+                "G'MIC Richardson-Lucy": {
+                    "setting": 5.0,
+                    "state": state(120, 30.8),
+                    "pictures": {"gmic-richardson-lucy": "gmic.png"},
+                }
+            },
+        }
+        for i, (mtf50, psnr) in enumerate(lenses)
+    ]
+    return {
+        "route": "by the service",
+        "code": "abc",
+        "plan": {
+            "size": "quick",
+            "estimator": "default",
+            "methods": ["paper"],
+            "rivals": {"kee": "Kee et al. 2011"},
+            "programs": ["G'MIC Richardson-Lucy"],
+            "own_scenes": True,
+        },
+        "scenes": ["city", "lake"],
+        "developed_on": ["lake"],
+        "cases": cases,
+        "hard": [],
+        "figures": {},
+    }
+
+
+def hurt(made: dict[str, Any], psnr: float) -> dict[str, Any]:
+    """Add a lens whose photos were taken at night, and corrected to this PSNR from 30."""
+    (one,) = result((100, psnr))["cases"]
+    made["hard"].append({**one, "condition": "night", "condition_title": "night: lamps", "rivals": {}})
+    return made
+
+
+def test_share_is_of_the_gain_of_the_true_psf() -> None:
+    assert shares(result((160, 32.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.6))
+    assert kept(result((160, 33.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.75))
+
+
+def test_share_of_a_small_gain_is_left_out() -> None:
+    made = result((160, 32.0))
+    made["cases"][0]["truth"]["true"]["paper"] = state(104, 30.1)
+    assert shares(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
+    assert kept(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
+
+
+def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
+    found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
+    rows = {row["state"]: row for row in found["mtf"]["paper"]}
+    others = ["G'MIC Richardson-Lucy", "kee, n = 1"]
+    assert list(rows) == ["without correction", "denoised only", *others, "n = 1", "true PSF"]
+    assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
+    assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
+    assert found["worse"]["paper"]["1"] == {
+        "zones": 9,
+        "worse": 6,
+        "clearly_worse": 3,
+        "ssim_worse": 6,
+        "unimproved": 6,
+    }
+    assert found["ssim_kept"]["paper"]["1"]["mid"] == pytest.approx((0.5 - 0.005 - 0.25) / 3)
+    assert found["halo"]["paper"]["1"]["mid"] == pytest.approx(0.0)
+    assert found["psf_others"]["kee, n = 1"]["corner"] == pytest.approx(0.5)
+    assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
+    assert found["psnr_control"]["center"] == pytest.approx(0.5)
+
+
+def test_gain_that_the_lens_does_not_allow_is_not_missed() -> None:
+    made = result((100, 30.0))
+    made["cases"][0]["truth"]["true"]["paper"] = state(104, 30.1)
+    assert summary(made)["worse"]["paper"]["1"]["unimproved"] == 0
+
+
+def test_bars_are_two_sided() -> None:
+    name = "share of the true-PSF gain in MTF50"
+    for mtf50, met in ((180, False), (190, True), (210, False)):
+        found = {(bar.name, bar.place, bar.n): bar for bar in bars(result((mtf50, 33.0)))}
+        assert found[name, "corner", "1"].met is met
+        assert found[name, "corner", "5"].met is None  # this run has no n = 5
+
+
+def test_bar_of_the_highest_mtf_sees_the_one_lens_that_rings() -> None:
+    made = result((190, 33.0), (190, 33.0), (190, 33.0))
+    made["cases"][1]["learned"]["1"]["methods"]["paper"]["edges"]["mid"]["mtf_max"] = 1.3
+    found = {(bar.place, bar.n): bar for bar in bars(made) if bar.name == "highest corrected MTF of any lens"}
+    assert (found["mid", "1"].value, found["mid", "1"].met) == (1.3, False)
+    assert (found["center", "1"].value, found["center", "1"].met) == (1.02, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "limits"),
+    [
+        ("relative L2 of the PSF, green", "center", (0.25, 0.20, 0.15)),
+        ("relative L2 of the PSF, green", "corner", (0.40, 0.32, 0.25)),
+        ("relative L2 of the PSF, red", "center", (0.30, 0.25, 0.20)),
+        ("relative L2 of the PSF, blue", "corner", (0.45, 0.38, 0.30)),
+        ("highest corrected MTF of any lens", "mid", (1.25, 1.15, 1.10)),
+        ("share of the true-PSF gain in PSNR", "corner", (0.55, 0.70, 0.80)),
+        ("zones where PSNR falls by more than 0.05 dB", "of 3 zones", (0, 0, 0)),
+        ("share of PSF errors told right within a factor of 1.5", "field", (0.8, 0.8, 0.8)),
+        ("what the forecast of the gain by zone is off by, dB", "all zones", (0.5, 0.5, 0.5)),
+    ],
+)
+def test_bars_of_each_number_of_photos_are_those_that_were_set(
+    name: str, place: str, limits: tuple[float, ...]
+) -> None:
+    found = {bar.n: bar for bar in bars(result((190, 33.0))) if (bar.name, bar.place) == (name, place)}
+    at_least = "share" in name
+    assert [found[n].low if at_least else found[n].high for n in ("1", "2", "5")] == list(limits)
+
+
+def test_forecast_is_judged_by_the_mean_of_what_its_zones_are_off_by() -> None:
+    made = result((190, 33.0))
+    methods = made["cases"][0]["learned"]["1"]["methods"]
+    methods["paper"]["forecast"] = {
+        "center": {"expected": 2.0, "true": 1.0},
+        "mid": {"expected": None, "true": 1.0},
+        "corner": {"expected": 1.0, "true": 1.5},
+    }
+    (bar,) = [bar for bar in bars(made) if bar.name.startswith("what the forecast") and bar.n == "1"]
+    assert (bar.value, bar.met) == (pytest.approx(0.75), False)
+
+
+NOTHING = "lenses said to have nothing to correct though the true PSF gains 0.3 dB somewhere"
+UNSAID = "lenses not said to, though the true PSF gains less in all zones"
+
+
+@pytest.mark.parametrize(
+    ("said", "possible", "wrongly", "unsaid"),
+    [(True, 0.29, 0, 0), (True, 0.31, 1, 0), (False, 0.29, 0, 1), (False, 0.31, 0, 0)],
+)
+def test_nothing_to_correct_is_judged_by_the_true_psf_in_both_directions(
+    said: bool, possible: float, wrongly: int, unsaid: int, tmp_path: Path
+) -> None:
+    made = result((100, 30.0))
+    one = made["cases"][0]
+    one["truth"]["true"]["paper"] = state(100, 30.0)
+    one["truth"]["true"]["paper"]["psnr"]["corner"] = 30.0 + possible  # one zone is enough
+    one["learned"]["1"]["methods"]["paper"]["nothing_to_correct"] = said
+    found = {bar.name: bar for bar in bars(made) if bar.n == "1"}
+    assert (found[NOTHING].value, found[UNSAID].value) == (wrongly, unsaid)
+    assert [found[name].met for name in (NOTHING, UNSAID)] == [wrongly == 0, unsaid == 0]
+    assert summary(made)["nothing_said"]["paper"]["1"] == {
+        "lenses": 1,
+        "said": int(said),
+        "wrongly": wrongly,
+        "unsaid": unsaid,
+    }
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    words = f"n = 1: {int(said)} of 1, {wrongly} of them wrongly, and left out of {unsaid}"
+    assert words in " ".join(text.split())
+
+
+def test_lens_that_learned_nothing_is_not_judged_by_what_it_said() -> None:
+    made = result((100, 30.0))  # as stored where no photo counted: the photo as it was, and no word of it
+    assert summary(made)["nothing_said"]["paper"]["1"]["lenses"] == 0
+    (bar,) = [bar for bar in bars(made) if bar.name == NOTHING and bar.n == "5"]
+    assert bar.met is None
+
+
+def after(two: tuple[float, float], five: tuple[float, float]) -> dict[str, Any]:
+    """A lens after two and five photos: the error of its blue PSF, and PSNR, both in the corner."""
+    made = result((190, 33.0))
+    one = made["cases"][0]
+    for n, (error, psnr) in (("2", two), ("5", five)):
+        unit = json.loads(json.dumps(one["learned"]["1"]))
+        unit["psf"]["rel_l2"]["b"]["corner"] = error
+        unit["psf"]["rel_l2"]["g"]["corner"] = unit["psf"]["rel_l2"]["r"]["corner"] = 0.3 if n == "2" else 0.1
+        unit["methods"]["paper"]["psnr"]["corner"] = psnr
+        one["learned"][n] = unit
+    return made
+
+
+@pytest.mark.parametrize(
+    ("two", "five", "psf_worse", "psnr_worse"),
+    [
+        ((0.20, 33.00), (0.209, 32.96), 0, 0),
+        ((0.20, 33.00), (0.212, 33.50), 1, 0),
+        ((0.20, 33.00), (0.150, 32.94), 0, 1),
+    ],
+)
+def test_five_photos_are_never_worse_than_two(
+    two: tuple[float, float], five: tuple[float, float], psf_worse: int, psnr_worse: int, tmp_path: Path
+) -> None:
+    made = after(two, five)
+    found = [bar for bar in bars(made) if bar.name.startswith("zones where five photos")]
+    assert [(bar.n, bar.place, bar.value) for bar in found] == [
+        ("5", "of 3 zones", psf_worse),
+        ("5", "of 3 zones", psnr_worse),
+    ]
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    row = f"| Lens <0> | corner | 0.200 to {five[0]:.3f} | {two[1]:.2f} to {five[1]:.2f} |"
+    assert (row in text) is bool(psf_worse or psnr_worse)
+    where = [line for line in missed(made) if line.startswith("five photos worse than two: Lens <0>, corner")]
+    assert len(where) == (psf_worse or psnr_worse)
+
+
+def test_each_missed_bar_is_named_with_what_is_asked() -> None:
+    made = after((0.20, 33.0), (0.15, 33.5))
+    lines = missed(made)
+    assert len(lines) == held(bars(made))["missed"] > 0
+    assert all("is asked" in line and "third order, n = " in line for line in lines)
+
+
+def test_run_without_five_photos_does_not_tell_whether_they_are_worse() -> None:
+    found = [bar for bar in bars(result((190, 33.0))) if bar.name.startswith("zones where five photos")]
+    assert [bar.met for bar in found] == [None, None]
+
+
+def traced_too(made: dict[str, Any]) -> dict[str, Any]:
+    """Make the last lens a ray-traced one."""
+    made["cases"][-1] |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
+    return made
+
+
+def test_families_are_judged_and_shown_apart(tmp_path: Path) -> None:
+    made = traced_too(result((190, 33.0), (120, 29.0)))
+    falls = [b for b in bars(made) if b.name.startswith("zones where PSNR falls") and b.n == "1"]
+    assert {bar.family: bar.value for bar in falls} == {"third order": 0, "ray-traced": 3}
+    assert [name.partition(",")[0] for name in groups(made)] == ["third order", "ray-traced"]
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    assert "| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |" in text
+    assert "| third order | Lens <0> | drawn, seed 1000 | unseen |" in text
+    assert "### Third order" in text
+    assert "### Ray-traced" in text
+
+
+def with_paper(made: dict[str, Any]) -> dict[str, Any]:
+    """Add the paper's own way, a general profile and a measured lens to every lens."""
+    for number, one in enumerate(made["cases"]):
+        unit = one["learned"]["1"]
+        worse = {"rel_l2": {c: dict.fromkeys(ZONES, 0.6 + number) for c in "rgb"}, "predicted_right": 0.0}
+        pictures = {"way-paper-n1-paper": "way.png"}
+        one["paper"] = {
+            "1": {**unit, "psf": worse, "methods": {"paper": state(140, 31.5)}, "pictures": pictures}
+        }
+        one["general"] = {"psf": worse, "methods": {"paper": state(145, 31.6)}, "pictures": {}}
+        one["measured"] = {"psf": worse, "methods": {"paper": state(195, 33.9)}, "pictures": {}}
+    return made
+
+
+def test_the_papers_own_way_is_a_row_of_each_table(tmp_path: Path) -> None:
+    made = with_paper(result((160, 32.0)))
+    found = summary(made)
+    assert [row["state"] for row in found["mtf"]["paper"]][-5:] == [
+        "general profile of the lens model",
+        "the paper's own way, n = 1",
+        "n = 1",
+        "measured with a target",
+        "true PSF",
+    ]
+    rows = {row["state"]: row for row in found["psnr"]["paper"]}
+    assert rows["the paper's own way, n = 1"]["corner"] == 31.5
+    assert found["psf_others"]["the paper's own way, n = 1"]["center"] == pytest.approx(0.6)
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    assert "| the paper's own way, n = 1 | 140 |" in text
+    assert "| the paper's own way, n = 1 | 0.600 |" in text
+    assert "| the paper's own way, n = 1 | 31.50 |" in text
+    assert "corrected blindly, the paper's own way, n = 1" in text
+    assert "### Deconvolution: Richardson-Lucy" in text
+    assert not re.search(r"[Mm]ethod paper", text)
+
+
+def test_bars_compare_with_rivals_at_equal_overshoot() -> None:
+    made = result((120, 30.5))
+    place = "MTF50 ahead of kee at equal overshoot, LP/PH", "center"
+    assert {(b.name, b.place): b for b in bars(made)}[place].met is False
+    for zone in ZONES:  # the rival's 130 were bought by overshoot
+        made["cases"][0]["rivals"]["kee"]["methods"]["paper"]["edges"][zone]["mtf50_fair"] = 115
+    found = {(b.name, b.place): b for b in bars(made)}
+    assert found[place].value == pytest.approx(5)
+    assert found[place].met is True
+    assert found["PSNR ahead of kee, dB", "mid"].met is False
+
+
+def test_bars_count_what_holds() -> None:
+    every = bars(result((190, 33.0)))
+    count = held(every)
+    assert sum(count.values()) == len(every)
+    assert count["held"] == sum(bar.met is True for bar in every) > 0
+
+
+def test_what_hurts_is_counted_apart(tmp_path: Path) -> None:
+    made = hurt(hurt(result((190, 33.0)), 30.5), 29.9)
+    (row,) = hard_rows(made)
+    assert (row["condition"], row["lenses"]) == ("night", 2)
+    assert row["gain"]["corner"] == pytest.approx(0.2)
+    assert row["counts"] == {"zones": 6, "worse": 3, "clearly_worse": 3, "ssim_worse": 3, "unimproved": 3}
+    assert summary(made)["lenses"] == 1
+    missed = [bar for bar in bars(made) if bar.name.startswith("night")]
+    assert [bar.met for bar in missed] == [False, None]
+    markdown, _ = write_page(made, tmp_path)
+    wanted = "| night: lamps | third order | 2 | 0 | 0.20 / 0.20 / 0.20 |"
+    assert wanted in markdown.read_text(encoding="utf-8")
+
+
+def test_what_hurts_is_counted_for_each_family() -> None:
+    made = hurt(hurt(result((190, 33.0)), 30.5), 29.9)
+    made["hard"][1] |= {"family": "ray-traced"}
+    found = [bar for bar in bars(made) if "zones where PSNR falls" in bar.name and not bar.family]
+    assert [(bar.name.partition(":")[0], bar.value) for bar in found] == [("night", 0), ("night", 3)]
+    assert [row["family"] for row in hard_rows(made)] == ["third order", "ray-traced"]
+
+
+def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> None:
+    markdown, html = write_page(result((160, 32.0)), tmp_path)
+    text = html.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|//[a-z]|<script|<link|@import", text)
+    sources = re.findall(r'src="([^"]+)"', text)
+    assert sources
+    assert all(source.startswith("pictures/") for source in sources)
+    assert "Lens &lt;0&gt;" in text
+    assert "developed on 1 of them" in text
+    text = markdown.read_text(encoding="utf-8")
+    assert "| default, n = 1 | 160 |" in text
+    assert "| kee, n = 1 | 130 |" in text
+    assert "| G'MIC Richardson-Lucy | 120 |" in text
+    assert "corrected by G'MIC Richardson-Lucy, its best setting 5" in text
+    assert "MISSED" in text
+
+
+def test_json_holds_results_and_summary(tmp_path: Path) -> None:
+    path = write_json(result((160, 32.0)), tmp_path / "all.json")
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["summary"]["third order, wide open, frames of 640 x 480"]["share"]["paper"]["1"][
+        "corner"
+    ] == pytest.approx(0.6)
+    assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
+    assert stored["bars_held"] == held(bars(result((160, 32.0))))
+    assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
+    assert stored["hard_summary"] == []
+
+
+def test_lenses_at_other_apertures_get_tables_of_their_own(tmp_path: Path) -> None:
+    made = result((160, 32.0), (120, 31.0))
+    made["cases"][1]["stops"] = 2.0
+    found = {label: summary(group) for label, group in groups(made).items()}
+    assert [one["lenses"] for one in found.values()] == [1, 1]
+    markdown, _ = write_page(made, tmp_path)
+    assert "2 stops down, frames of 640 x 480" in markdown.read_text(encoding="utf-8")
+
+
+def test_page_says_when_photos_did_not_count(tmp_path: Path) -> None:
+    made = result((100, 30.0))
+    unit = made["cases"][0]["learned"]["1"]
+    unit["refused"], unit["counted"], unit["psf"] = ["photo-00: flat"], 0, None
+    markdown, _ = write_page(made, tmp_path)
+    assert "photo-00: flat" in markdown.read_text(encoding="utf-8")
+
+
+def test_fig1_comes_from_a_stored_benchmark(tmp_path: Path) -> None:
+    bench = tmp_path / "bench"
+    bench.mkdir()
+    assert collected(bench, tmp_path) is None
+    row = {"method": "default", "noise": 0.01, "cases": 4, "improved": 0.5, "er_lt_3": 0.25}
+    settings = {"noise": [0.01], "half": "test", "patch": 128, "variant": "bayer", "judge": "epll", "seed": 0}
+    stored = {"settings": settings, "summary": [{**row, "er_median": 3.0, "rel_l2": 0.4}]}
+    (bench / "blind.json").write_text(json.dumps(stored))
+    Image.new("L", (4, 4)).save(bench / "blind-er-1percent.png")
+    made = result((160, 32.0))
+    made["figures"]["fig1"] = collected(bench, tmp_path / "pictures")
+    markdown, _ = write_page(made, tmp_path)
+    assert "| default | 1 % | 4 | 50 | 25 | 3.00 | 0.40 |" in markdown.read_text(encoding="utf-8")
+    assert (tmp_path / "pictures" / "fig1-blind-er-1percent.png").exists()
+
+
+def test_fig1_of_a_damaged_benchmark_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "blind.json").write_text("{}")
+    with pytest.raises(InvalidInputError, match="no benchmark"):
+        collected(tmp_path, tmp_path)
+
+
+# --- measuring ---------------------------------------------------------------------------------
+
+
+def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = [(FieldPosition(r, 0.5), c) for r in (0.1, 0.5, 0.9) for c in CHANNELS]
+    monkeypatch.setattr(measure, "places", lambda: few)
+    field = case().truth()
+    exact = [Answer(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in measure.places()]
+    found = measure.psf_errors(exact, field)
+    assert max(v for zones in found["rel_l2"].values() for v in zones.values()) < 1e-3
+    assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
+
+
+def test_fidelity_is_the_registered_psnr_where_all_blocks_count() -> None:
+    frame, rng = Frame(300, 420), np.random.default_rng(0)
+    reference = ndimage.gaussian_filter(rng.random((3, 300, 420)), (0, 2, 2)).astype(np.float32)
+    image = reference + rng.normal(0.0, 0.01, reference.shape).astype(np.float32)
+    found = fidelity(image, reference, frame)
+    assert len(blocks(frame)) <= EVERY
+    wanted = quality.registered_zone_psnr(image, reference, frame, srgb=True)
+    assert found["psnr"] == pytest.approx(wanted)
+    assert all(0.0 < value < 1.0 for value in found["ssim"].values())
+    assert fidelity(reference, reference, frame)["ssim"] == pytest.approx(dict.fromkeys(ZONES, 1.0))
+
+
+def test_every_second_block_of_a_large_frame_still_meets_every_zone() -> None:
+    frame = Frame(1500, 2200)
+    found = blocks(frame)
+    whole = len(range(0, 1500 - 128, 112)) + 1, len(range(0, 2200 - 128, 112)) + 1
+    assert len(found) == -(-whole[0] * whole[1] // 2)
+    assert {zone_of(frame.position(row + 64.0, col + 64.0).r) for row, col in found} == set(ZONES)
+
+
+@pytest.mark.parametrize("name", SCENES_THAT_HURT)
+def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) -> None:
+    scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
+    change = CONDITIONS[name].scenery
+    assert change is not None
+    made = change(scene, np.random.default_rng(2))
+    assert made.shape == scene.shape
+    assert made.dtype == np.float32
+    assert made.min() >= 0.0
+    assert np.abs(made - scene).mean() > 0.01
+    assert np.array_equal(made, change(scene, np.random.default_rng(2)))
+
+
+def test_night_clips_at_lamps_and_snow_at_its_brightest() -> None:
+    scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
+    dark = CONDITIONS["night"].scenery(scene, np.random.default_rng(2))  # type: ignore[misc]
+    assert float((dark > 1.0).any(axis=0).mean()) < 0.02
+    assert float(np.median(dark)) < 0.05
+    assert dark.max() > 2.0
+    bright = CONDITIONS["snow"].scenery(scene, np.random.default_rng(2))  # type: ignore[misc]
+    assert bright.min() > 0.8
+    assert bright.max() > 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tiff", "jpeg"])
+def test_photo_of_another_path_shows_what_the_raw_one_does(tmp_path: Path, name: str) -> None:
+    files = photographs(tmp_path, 4)
+    one = Case(1006, 24.0, 4.0, (1,), 32, 64, layout_for(files, 2, (32, 64)), condition=name)
+    one = replace(one, focal_mm=one.lens.focal_mm[0], aperture=one.lens.f_number(LensSettings()))
+    shots = take(one, files, tmp_path / "photos", first=2)
+    assert not list((tmp_path / "photos").glob("*.dng"))
+    seen = develop(shots.held_out)
+    assert seen.info.kind == name
+    assert seen.info.metadata.aperture == pytest.approx(one.aperture, abs=0.01)
+    gains = np.asarray(one.camera.white_balance, dtype=np.float32)[:, None, None]
+    red = (shots.truth() * gains)[0]
+    assert float(np.median(seen.planes[0])) == pytest.approx(float(np.median(red)), abs=0.02)
+
+
+def test_overshoot_buys_no_mtf50_at_equal_overshoot() -> None:
+    one = case()
+    scene = edge_chart(one.camera.frame, guard=guard_of(one)).scene
+    spare = [(n - m) // 2 for n, m in zip(scene.shape[1:], (480, 640), strict=True)]
+    sharp = scene[:, spare[0] : spare[0] + 480, spare[1] : spare[1] + 640]
+    before = ndimage.gaussian_filter(sharp, (0, 1.5, 1.5))
+    mild = ndimage.gaussian_filter(sharp, (0, 1.0, 1.0))
+    bold = before + 2.5 * (before - ndimage.gaussian_filter(before, (0, 1.5, 1.5)))
+    raw, edge = measure.edges(bold, one), measure.fair_mtf50(bold, before, one)
+    plain = measure.fair_mtf50(mild, before, one)
+    unsharp, milder = measure.edges(before, one), measure.edges(mild, one)
+    for zone in ZONES:
+        assert raw[zone]["overshoot"] > measure.FAIR_OVERSHOOT
+        assert unsharp[zone]["mtf50"] <= edge[zone] < raw[zone]["mtf50"]
+        assert plain[zone] == milder[zone]["mtf50"]
+
+
+def test_strip_shows_the_corners_of_a_picture() -> None:
+    planes = np.zeros((3, 80, 120), dtype=np.float32)
+    planes[0, :30, :30] = 1.0  # upper left
+    crops = strip(as_shown(planes), 20, gap=2)
+    assert crops.shape == (20, 108, 3)
+    assert (crops[:, 22:42, 0] == 255).all()
+    assert (crops[:, 44:64, 0] == 0).all()
+
+
+# --- running -----------------------------------------------------------------------------------
+
+
+class Nothing:
+    """A route that never learns anything; counts what it is asked."""
+
+    def __init__(self) -> None:
+        self.learned: list[str] = []
+
+    def learn(self, photo: Path) -> str:
+        self.learned.append(photo.stem)
+        return "too dark"
+
+    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
+        raise AssertionError((places, settings, size))
+
+    def corrected(self, photo: Path, method: str) -> Planes:
+        raise AssertionError((photo, method))
+
+
+@pytest.fixture
+def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Photos and truth are made up, so that only the order of work is under test."""
+    taken: list[str] = []
+
+    def made_up(one: Case, files: Sequence[Path], folder: Path, **_: object) -> Shots:
+        taken.append(one.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        return Shots.of(one, folder)
+
+    def truth(self: Any, shots: Shots) -> dict[str, Any]:
+        made: dict[str, Any] = result((160, 32.0))["cases"][0]["truth"]
+        return made
+
+    def by_target(self: Any, shots: Shots) -> dict[str, Any]:
+        del self, shots
+        return {"refused": "no page was photographed", "psf": None, "methods": {}, "pictures": {}}
+
+    monkeypatch.setattr(job, "take", made_up)
+    monkeypatch.setattr(job.CaseJob, "_measured_truth", truth)
+    monkeypatch.setattr(job.CaseJob, "_measured_by_target", by_target)
+    return taken
+
+
+def reproduced(
+    folder: Path, route: Nothing, chosen: Reproduction, results: Path | None = None
+) -> dict[str, Any]:
+    announced: list[tuple[float, float]] = []
+
+    @contextmanager
+    def opened(one: Case, work: Path) -> Iterator[Nothing]:
+        del one
+        work.mkdir(parents=True, exist_ok=True)
+        yield route
+
+    def on_work(words: str, done: float, total: float, *, fresh: bool) -> None:
+        del words, fresh
+        announced.append((done, total))
+
+    made = run_reproduction(
+        chosen,
+        opened,
+        folder,
+        route="test",
+        workers=1,
+        with_figures=False,
+        results=results,
+        on_work=on_work,
+    )
+    assert announced[-1][0] == pytest.approx(announced[-1][1])  # all the work that was announced is over
+    return made
+
+
+def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) -> None:
+    chosen = plan(case(photos=(1, 2)))
+    first = reproduced(tmp_path, Nothing(), chosen)
+    again = Nothing()
+    assert reproduced(tmp_path, again, chosen) == first
+    assert again.learned == []
+    assert len(quick_photos) == 1
+    assert not list(tmp_path.rglob("work"))
+
+
+def test_results_of_another_sitting_are_taken_and_their_pictures_left_out(
+    tmp_path: Path, quick_photos: list[str]
+) -> None:
+    chosen = replace(plan(case(photos=(1,))), methods=("paper",))
+    first = reproduced(tmp_path / "one", Nothing(), chosen, results=tmp_path / "results")
+    assert not (tmp_path / "one" / "cache").exists()
+    kept_files = [path for path in (tmp_path / "results").rglob("*") if path.is_file()]
+    assert {path.suffix for path in kept_files} == {".json"}
+    again = Nothing()
+    made = reproduced(tmp_path / "other", again, chosen, results=tmp_path / "results")
+    assert again.learned == []
+    assert len(quick_photos) == 1
+    assert made["cases"][0]["learned"] == first["cases"][0]["learned"]
+    assert made["cases"][0]["truth"]["pictures"] == {}
+    assert "were made by other runs" in write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+
+
+def test_papers_own_way_is_learned_beside_the_default_and_taken_up_again(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    opened: list[tuple[str, int]] = []
+
+    class Paper(Nothing):
+        def __init__(self, folder: Path, *, workers: int, way: Way) -> None:
+            super().__init__()
+            del folder, workers
+            opened.append((way.estimator, way.kernel_size))
+
+    monkeypatch.setattr(job, "DirectRoute", Paper)
+    chosen = replace(plan(case(photos=(1, 2))), paper=True)
+    made = reproduced(tmp_path, Nothing(), chosen)
+    assert set(made["cases"][0]["paper"]) == {"1", "2"}
+    assert list(made["cases"][0]["paper"]["1"]["methods"]) == ["paper"]
+    next(tmp_path.rglob("paper-2.json")).unlink()
+    reproduced(tmp_path, Nothing(), chosen)
+    assert opened == [("michaeli-irani", 31)] * 2
+    assert paper_way(replace(chosen.cases[0], height=2000, width=3000)).kernel_size == 55
+    assert made["plan"]["paper_kernel"] == 31
+
+
+def test_stopped_run_goes_on_where_it_was(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    chosen = plan(case(photos=(1, 2)))
+    first = reproduced(tmp_path, Nothing(), chosen)
+    path = next(tmp_path.rglob("learned-2.json"))
+    path.unlink()
+    assert reproduced(tmp_path, Nothing(), chosen) == first
+    assert path.exists()
+    assert not list(tmp_path.rglob("*.part"))
+
+
+class Killed(Nothing):
+    """A route that is killed while it learns from the second photo."""
+
+    def learn(self, photo: Path) -> str:
+        if photo.stem == "photo-01":
+            raise KeyboardInterrupt
+        return super().learn(photo)
+
+
+def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
+    tmp_path: Path, quick_photos: list[str]
+) -> None:
+    second = replace(planned("quick", grids=()).cases[1], height=480, width=640, photos=(1, 2))
+    chosen = plan(case(photos=(1, 2)), second)
+    with pytest.raises(KeyboardInterrupt):
+        reproduced(tmp_path / "killed", Killed(), chosen)
+    (kept_result,) = (tmp_path / "killed").rglob("learned-1.json")
+    written = kept_result.stat().st_mtime_ns
+    assert len(quick_photos) == 1
+    again = Nothing()
+    made = reproduced(tmp_path / "killed", again, chosen)
+    assert kept_result.stat().st_mtime_ns == written
+    assert not list((tmp_path / "killed").rglob("work"))
+
+    def timeless(found: dict[str, Any]) -> list[Any]:
+        units = [unit for one in found["cases"] for unit in one["learned"].values()]
+        return [{**unit, "learning_seconds": 0} for unit in units]
+
+    assert timeless(made) == timeless(reproduced(tmp_path / "whole", Nothing(), chosen))
+
+
+def test_new_version_of_the_rivals_computes_them_alone(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    asked: list[str] = []
+
+    def measured(self: job.CaseJob, name: str, shots: Shots) -> dict[str, Any]:
+        del shots
+        asked.append(name)
+        return {"refused": "", "psf": None, "pictures": {}, "methods": {}}
+
+    monkeypatch.setattr(job.CaseJob, "_measured_rival", measured)
+    chosen = replace(plan(case(photos=(1,))), rivals=("kee",))
+    reproduced(tmp_path, Nothing(), chosen)
+    monkeypatch.setattr(run, "rivals_version", lambda: "other")
+    again = Nothing()
+    made = reproduced(tmp_path, again, chosen)
+    assert asked == ["kee", "kee"]
+    assert again.learned == []
+    assert set(made["cases"][0]["rivals"]) == {"kee"}
+
+
+def test_program_that_fails_is_left_out_and_tried_again(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    asked: list[str] = []
+
+    def fails(self: job.CaseJob, name: str, shots: Shots) -> dict[str, Any]:
+        del self, shots
+        asked.append(name)
+        raise InvalidInputError(f"{name} failed with status 1")
+
+    monkeypatch.setattr(job.CaseJob, "_measured_program", fails)
+    monkeypatch.setattr(
+        job.CaseJob, "_measured_rival", lambda *_: {"refused": "", "psf": None, "methods": {}}
+    )
+    chosen = replace(plan(case(photos=(1,))), rivals=("kee",), programs=("G'MIC Richardson-Lucy",))
+    for _ in range(2):
+        made = reproduced(tmp_path, Nothing(), chosen)
+        assert made["cases"][0]["programs"] == {}
+    assert len(asked) == 2
+
+
+def test_other_settings_are_computed_anew(tmp_path: Path, quick_photos: list[str]) -> None:
+    reproduced(tmp_path, Nothing(), plan(case(photos=(1,))))
+    reproduced(tmp_path, Nothing(), plan(case(photos=(1,), aperture=4.0)))
+    assert len(quick_photos) == 2
+
+
+def test_lens_that_learned_nothing_leaves_photos_as_they_are(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    made = reproduced(tmp_path, Nothing(), plan(case(photos=(1,))))
+    unit = made["cases"][0]["learned"]["1"]
+    assert unit["counted"] == 0
+    assert unit["methods"]["paper"] == made["cases"][0]["truth"]["before"]
+    assert unit["refused"] == ["photo-00: too dark"]
+
+
+def test_damaged_result_is_reported(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    chosen = plan(case(photos=(1,)))
+    reproduced(tmp_path, Nothing(), chosen)
+    next(tmp_path.rglob("learned-1.json")).write_text("{")
+    with pytest.raises(InvalidInputError, match="delete it"):
+        reproduced(tmp_path, Nothing(), chosen)
+
+
+def unheard(words: str, done: float, total: float, *, fresh: bool) -> None:
+    del words, done, total, fresh
+
+
+@pytest.mark.slow
+def test_lens_is_learned_and_corrected_from_end_to_end(tmp_path: Path) -> None:
+    one = case(photos=(1,))
+
+    @contextmanager
+    def opened(of: Case, folder: Path) -> Iterator[DirectRoute]:
+        del of
+        yield DirectRoute(folder / "models", "default", workers=1)
+
+    made = run_reproduction(
+        replace(plan(one, replace(one, condition="high-iso")), rivals=("schuler",)),
+        opened,
+        tmp_path,
+        route="in the library",
+        workers=1,
+        on_work=unheard,
+    )
+    truth, learned = made["cases"][0]["truth"], made["cases"][0]["learned"]["1"]
+    for zone in ("center", "corner"):
+        before, true = truth["before"], truth["true"]["standard"]
+        assert true["psnr"][zone] > before["psnr"][zone]
+        assert true["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
+        assert learned["methods"]["standard"]["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
+    assert learned["methods"]["standard"]["nothing_to_correct"] is False
+    rival = made["cases"][0]["rivals"]["schuler"]
+    assert rival["psf"]["rel_l2"]["g"]["center"] < 1.0
+    assert (
+        rival["methods"]["standard"]["edges"]["center"]["mtf50"] > truth["before"]["edges"]["center"]["mtf50"]
+    )
+    (noisy,) = made["hard"]
+    assert noisy["truth"]["before"]["psnr"]["center"] < truth["before"]["psnr"]["center"]
+    assert noisy["truth"]["true"]["standard"]["psnr"]["center"] > noisy["truth"]["before"]["psnr"]["center"]
+    _, html = write_page(made, tmp_path)
+    for source in re.findall(r'src="([^"]+)"', html.read_text(encoding="utf-8")):
+        assert (tmp_path / source).stat().st_size > 0

@@ -1,0 +1,229 @@
+"""`lab.rivals`: recovery of fields that lie in the model class of each rival."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.signal import fftconvolve
+
+from lab.rivals import BasisField, Kee, RadialBasis, Schuler, load_basis, principal, rivals
+from lab.rivals.basis import save_basis
+from lab.rivals.kee import core_variance
+from lab.rivals.rival import PhotoWindow, polynomial, powers
+from lab.scenes import dead_leaves
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import distance, gaussian, second_moments
+from lensmodel.core.types import FieldPosition, NoiseModel
+from lensmodel.simulate import draw_lens
+
+FRAME = Frame(2000, 3000)
+RADII = (0.0, 0.5, 1.0)
+SIDE = 15
+NOISE = NoiseModel(1e-6, 1e-7)
+
+
+@lru_cache(maxsize=1)
+def leaves() -> np.ndarray:
+    return dead_leaves(2 * 140, 3 * 140, np.random.default_rng(5), smallest=4.0)[1]
+
+
+@lru_cache(maxsize=1)
+def straight_edges() -> np.ndarray:
+    """Squares turned by many angles, four in each window, their borders area-sampled."""
+    rows, cols = np.mgrid[0:280, 0:420].astype(np.float64)
+    scene = np.full(rows.shape, 0.2)
+    for number in range(24):
+        middle = 35.0 + 70.0 * (number // 6), 35.0 + 70.0 * (number % 6)
+        angle = 0.13 + 1.7 * number
+        along = np.cos(angle) * (cols - middle[1]) - np.sin(angle) * (rows - middle[0])
+        beside = np.sin(angle) * (cols - middle[1]) + np.cos(angle) * (rows - middle[0])
+        share = np.clip(22.5 - np.maximum(np.abs(along), np.abs(beside)), 0.0, 1.0)
+        scene += share * (0.4 + 0.02 * (number % 5))
+    return scene
+
+
+def windows(kernel_of: object, scene: np.ndarray, side: int = 140) -> list[PhotoWindow]:
+    """A scene photographed at six places of the frame, each with the kernel of its middle."""
+    found = []
+    rng = np.random.default_rng(0)
+    for i in range(2):
+        for j in range(3):
+            place = FRAME.position(400.0 + 1200 * i, 300.0 + 1200 * j)
+            sharp = scene[i * 140 : (i + 1) * 140, j * 140 : (j + 1) * 140]
+            wide = np.pad(sharp, 20, mode="symmetric")
+            seen = fftconvolve(wide, kernel_of(place), mode="same")[20 : 20 + side, 20 : 20 + side]  # type: ignore[operator]
+            seen = seen + rng.normal(0.0, 1e-3, seen.shape)
+            found.append(PhotoWindow(np.stack([seen] * 3).astype(np.float32), (NOISE,) * 3, place))
+    return found
+
+
+def local(place: FieldPosition, across: float, out: float) -> np.ndarray:
+    """Covariance (row, col) of a Gaussian with these widths along v and u."""
+    u = np.array([-math.sin(place.phi), math.cos(place.phi)])
+    v = np.array([-math.cos(place.phi), -math.sin(place.phi)])
+    return np.asarray(out**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+
+
+def radial(across: float, out: float) -> list[np.ndarray]:
+    """Kernels of one lens at the radii, in the local frame."""
+    return [gaussian(SIDE, local(FieldPosition(r, 0.0), 0.5 + across * r, 0.5 + out * r)) for r in RADII]
+
+
+@lru_cache(maxsize=1)
+def small_basis() -> RadialBasis:
+    lenses = [radial(a, b) for a in np.linspace(0.0, 1.6, 7) for b in np.linspace(0.0, 1.6, 7)]
+    return principal(np.array(lenses), RADII, 8)
+
+
+def test_every_rival_has_a_name_and_a_source() -> None:
+    for name in rivals:
+        made = rivals.create(name)
+        assert made.name == name
+        assert "20" in made.source
+
+
+# --- Kee ---------------------------------------------------------------------------------------
+
+
+def test_polynomial_has_one_term_for_each_power() -> None:
+    terms = polynomial(np.array([2.0]), np.array([3.0]), 2)[0]
+    assert powers(2) == [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
+    assert terms.tolist() == [1.0, 2.0, 3.0, 4.0, 6.0, 9.0]
+
+
+def test_field_of_gaussians_is_found_from_exact_edge_widths() -> None:
+    rng = np.random.default_rng(3)
+    true = rng.normal(size=(6, 3))
+    places, angle = rng.uniform(-0.7, 0.7, (400, 2)), rng.uniform(0.0, math.pi, 400)
+    entries = polynomial(places[:, 0], places[:, 1], 2) @ true
+    normal = np.stack([-np.sin(angle), np.cos(angle)])
+    variance = (
+        entries[:, 0] * normal[0] ** 2
+        + 2 * entries[:, 1] * normal[0] * normal[1]
+        + entries[:, 2] * normal[1] ** 2
+    )
+    found = Kee(degree=2, pull=1e-9, expectile=0.5).solved(places, angle, variance)
+    assert found == pytest.approx(true, abs=1e-3)
+
+
+def test_soft_edges_of_the_scene_move_the_field_less_than_their_share() -> None:
+    rng = np.random.default_rng(4)
+    places, angle = rng.uniform(-0.7, 0.7, (600, 2)), rng.uniform(0.0, math.pi, 600)
+    variance = np.full(600, 1.0)
+    variance[rng.random(600) < 0.4] += rng.uniform(0.5, 6.0)
+    found = Kee(degree=0).solved(places, angle, variance)[0]
+    assert found[0] == pytest.approx(1.0, abs=0.1)
+    assert found[2] == pytest.approx(1.0, abs=0.1)
+
+
+def test_variance_of_a_gaussian_line_is_its_own() -> None:
+    s = (np.arange(72) - 36 + 0.5) * 0.25
+    # cut at a twentieth of the peak it loses a little
+    assert core_variance(np.exp(-0.5 * (s / 1.5) ** 2)) == pytest.approx(1.5**2, rel=0.15)
+
+
+@pytest.mark.slow  # its parts are tested above, each by itself
+def test_kee_recovers_widths_and_axes_of_a_field_of_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    def truth(place: FieldPosition) -> np.ndarray:
+        return gaussian(SIDE, local(place, 0.8, math.hypot(0.8, 1.5 * place.r)))
+
+    monkeypatch.setattr("lab.rivals.kee.windows_of", lambda _: windows(truth, straight_edges()))
+    field = Kee(expectile=0.5, softness_px2=0.0).field(())
+    errors = []
+    for window in windows(truth, straight_edges()):
+        found = field.kernel_at(window.position, "g", SIDE)
+        errors.append(distance(found, truth(window.position)).rel_l2)
+        rr, rc, cc = second_moments(found)[[0, 0, 1], [0, 1, 1]]
+        wanted = second_moments(truth(window.position))
+        assert np.sign(rc) == np.sign(wanted[0, 1]) or abs(wanted[0, 1]) < 0.1
+        assert (rr > cc) == (wanted[0, 0] > wanted[1, 1])
+    assert np.median(errors) < 0.12
+
+
+def test_kee_refuses_photos_without_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    flat = PhotoWindow(np.full((3, 128, 128), 0.5, dtype=np.float32), (NOISE,) * 3, FieldPosition(0.5, 0.0))
+    monkeypatch.setattr("lab.rivals.kee.windows_of", lambda _: [flat])
+    with pytest.raises(NotEnoughEvidenceError, match="straight edges"):
+        Kee().field(())
+
+
+# --- Schuler -----------------------------------------------------------------------------------
+
+
+def test_basis_holds_the_fields_that_it_was_made_of() -> None:
+    lenses = np.array([radial(a, 0.5) for a in (0.0, 0.4, 0.9, 1.3)])
+    basis = principal(lenses, RADII, 7)
+    seen = (lenses[2] - basis.mean).ravel()
+    parts = basis.parts.reshape(7, -1)
+    norms = np.square(parts).sum(axis=1)
+    kept = norms > 1e-12 * norms.max()
+    back = ((parts[kept] @ seen) / norms[kept]) @ parts[kept]
+    assert np.linalg.norm(back - seen) < 1e-6 * np.linalg.norm(seen) + 1e-9
+
+
+def test_basis_needs_as_many_fields_as_components() -> None:
+    with pytest.raises(InvalidInputError, match="as many fields"):
+        principal(np.array([radial(0.1, 0.2)]), RADII, 3)
+
+
+def test_basis_survives_its_file(tmp_path: object) -> None:
+    path = tmp_path / "basis.npz"  # type: ignore[operator]
+    save_basis(small_basis(), path)
+    back = load_basis(path)
+    assert np.abs(back.parts - small_basis().parts).max() < 1e-3 * np.abs(small_basis().parts).max()
+    assert back.mean == pytest.approx(small_basis().mean, abs=1e-6)
+
+
+def test_components_turn_with_the_place() -> None:
+    upright = small_basis().turned(FieldPosition(1.0, 0.0))
+    turned = small_basis().turned(FieldPosition(1.0, math.pi / 2))
+    assert turned == pytest.approx(np.rot90(upright, axes=(1, 2)), abs=1e-6)
+
+
+def test_field_between_two_radii_is_their_mean() -> None:
+    basis = small_basis()
+    field = BasisField(basis, {"g": np.zeros((8, 3))})
+    middle = field.kernel_at(FieldPosition(0.25, 0.0), "g", SIDE)
+    assert distance(middle, 0.5 * (basis.mean[0] + basis.mean[1])).rel_l2 < 0.02
+
+
+@pytest.mark.slow  # its parts are tested above, each by itself
+def test_schuler_recovers_a_lens_within_its_basis(monkeypatch: pytest.MonkeyPatch) -> None:
+    def truth(place: FieldPosition) -> np.ndarray:
+        return gaussian(SIDE, local(place, 0.5 + 0.35 * place.r, 0.5 + 1.45 * place.r))
+
+    monkeypatch.setattr("lab.rivals.schuler.windows_of", lambda _: windows(truth, leaves()))
+    field = Schuler(basis=small_basis()).field(())
+    mean = BasisField(small_basis(), {"g": np.zeros((8, 3))})
+    found, naive = [], []
+    for window in windows(truth, leaves()):
+        true = truth(window.position)
+        found.append(distance(field.kernel_at(window.position, "g", SIDE), true).rel_l2)
+        naive.append(distance(mean.kernel_at(window.position, "g", SIDE), true).rel_l2)
+    assert np.median(found) < 0.5 * np.median(naive)
+    assert np.median(found) < 0.2
+
+
+def test_schuler_refuses_too_few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lab.rivals.schuler.windows_of", lambda _: [])
+    with pytest.raises(NotEnoughEvidenceError, match="determine no field"):
+        Schuler(basis=small_basis()).field(())
+
+
+def test_stored_basis_holds_lenses_that_it_was_not_made_of() -> None:
+    basis, left = load_basis(), []
+    for seed in range(200, 208):
+        lens = draw_lens(seed)
+        true = np.stack([lens.kernel(FieldPosition(float(r), 0.0), None, basis.side) for r in basis.radii])
+        parts = basis.parts.reshape(len(basis.parts), -1).T
+        wanted = (true - basis.mean).ravel()
+        best, *_ = np.linalg.lstsq(parts, wanted, rcond=None)
+        rest = (wanted - parts @ best).reshape(true.shape)
+        left.append([np.linalg.norm(a) / np.linalg.norm(b) for a, b in zip(rest, true, strict=True)])
+    center, *_, corner = np.median(left, axis=0)
+    assert center < 0.1
+    assert corner < 0.3

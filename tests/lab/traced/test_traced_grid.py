@@ -1,0 +1,166 @@
+"""Grids of traced lenses: what stands at a node comes back, and cameras photograph through them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.scenes import dead_leaves
+from lab.traced import GridField, GridLens, read_grid
+from lab.traced.copies import another, copies
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import centroid, distance, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.photo import develop
+from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
+
+DATA = Path(__file__).parents[2] / "lensmodel" / "data"
+GRIDS = sorted(DATA.glob("traced-*.npz"))
+
+
+def linear_field(f_number: float = 2.8) -> GridField:
+    """Gaussians that widen to the right, with lateral colour of red."""
+    axis = np.linspace(-1.5, 1.5, 7)
+    kernels = np.zeros((3, 7, 7, 15, 15), dtype=np.float16)
+    centers = np.zeros((3, 7, 7, 2), dtype=np.float32)
+    for i, up in enumerate(axis):
+        for j, right in enumerate(axis):
+            kernels[:, i, j] = gaussian(15, [[1.0 + 0.2 * up, 0.0], [0.0, 2.0 + 0.5 * right]])
+            centers[0, i, j] = 0.8 * right, 0.8 * up
+    facts = {
+        "design": "gaussian",
+        "f_number": f_number,
+        "focal_mm": 50.0,
+        "pitch_um": 4.5,
+        "half_diagonal_mm": 0.45,
+    }
+    return GridField(axis, kernels, centers, np.ones((7, 7), dtype=np.float32), facts)
+
+
+def test_repository_has_traced_lenses_within_bounds() -> None:
+    assert len(GRIDS) >= 2
+    assert max(path.stat().st_size for path in GRIDS) < 300 * 1024
+
+
+@pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
+def test_kernels_of_a_grid_are_kernels(path: Path) -> None:
+    grid = read_grid(path)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        place = FieldPosition(math.sqrt(rng.random()), float(rng.uniform(-math.pi, math.pi)))
+        for channel in CHANNELS:
+            kernel = grid.kernel_at(place, channel, grid.size)
+            assert kernel.sum() == pytest.approx(1.0)
+            assert kernel.min() >= 0.0
+            assert np.hypot(*centroid(kernel)) < 0.05
+
+
+@pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
+def test_traced_lenses_differ_between_corners_and_channels(path: Path) -> None:
+    grid = read_grid(path)
+    corners = [
+        grid.kernel_at(FieldPosition(1.0, a), "g", grid.size) for a in (0.6, math.pi - 0.6, math.pi + 0.6)
+    ]
+    center = {c: grid.kernel_at(FieldPosition(0.0, 0.0), c, grid.size) for c in CHANNELS}
+
+    assert distance(np.fliplr(corners[1]), corners[0]).rel_l2 > 0.05
+    assert distance(corners[0], center["g"]).rel_l2 > 0.15
+    assert distance(center["r"], center["b"]).rel_l2 > 0.05
+
+
+def test_node_comes_back_as_it_was_stored_and_up_is_up() -> None:
+    field = linear_field()
+    kernel = field.kernel_at_field((0.5, -1.0), "g", 15)
+    stored = field.kernels[1, 1, 4].astype(np.float64)
+
+    np.testing.assert_allclose(kernel, stored / stored.sum(), atol=1e-6)
+
+
+def test_grid_between_nodes_is_near_the_truth() -> None:
+    wanted = gaussian(15, [[1.0 + 0.2 * 0.3, 0.0], [0.0, 2.0 - 0.5 * 0.7]])
+    kernel = linear_field().kernel_at_field((-0.7, 0.3), "b", 15)
+
+    assert distance(kernel, wanted).rel_l2 < 0.01
+
+
+def test_grid_survives_its_file(tmp_path: Path) -> None:
+    field = linear_field()
+    field.write(tmp_path / "a.npz")
+    again = read_grid(tmp_path / "a.npz")
+
+    np.testing.assert_array_equal(again.kernels, field.kernels)
+    assert again.facts == field.facts
+
+
+def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", format=np.array(99))
+    with pytest.raises(InvalidInputError, match="format 99"):
+        read_grid(tmp_path / "a.npz")
+
+
+def test_point_light_becomes_the_kernel_of_its_place() -> None:
+    lens, frame = GridLens((linear_field(),)), Frame(120, 160)
+    scene = np.zeros((3, 134, 174), dtype=np.float32)
+    scene[:, 7 + 30, 7 + 120] = 1.0
+    options = BlurOptions(size=15, step=0.25, lateral=False)
+    image = blurred(scene, lens, LensSettings(), frame, options)
+    expected = lens.field().kernel_at(frame.position(30, 120), "g", 15)
+
+    np.testing.assert_allclose(image[1, 23:38, 113:128], expected, atol=2e-3)
+
+
+def test_lateral_colour_moves_red_outwards() -> None:
+    lens, frame = GridLens((linear_field(),)), Frame(120, 160)
+    scene = np.zeros((3, 134, 174), dtype=np.float32)
+    scene[:, 7 + 60, 7 + 140] = 1.0
+    image = blurred(scene, lens, LensSettings(), frame, BlurOptions(size=15, step=0.25))
+    red, green = (centroid(image[c, 53:68, 133:148].astype(np.float64)) for c in (0, 1))
+    r = frame.position(60, 140).r
+
+    assert red[1] - green[1] == pytest.approx(0.8 * r, abs=0.02)
+    assert red[0] - green[0] == pytest.approx(0.0, abs=0.02)
+
+
+def test_camera_writes_raw_photos_through_a_traced_lens(tmp_path: Path) -> None:
+    grid = read_grid(GRIDS[0])
+    lens = GridLens((grid,))
+    camera = SimulatedCamera(height=160, width=240)
+    scene = dead_leaves(160, 240, np.random.default_rng(1))
+    settings = LensSettings(aperture=grid.f_number)
+    photo = photograph(
+        scene, lens, settings, camera, np.random.default_rng(2), options=BlurOptions(size=25, step=0.5)
+    )
+    write_photo(tmp_path / "a.dng", photo)
+    developed = develop(tmp_path / "a.dng")
+
+    assert developed.planes.shape == (3, 160, 240)
+    assert photo.clean.std() < photo.sharp.std()
+
+
+def test_lens_answers_only_for_what_it_was_traced_for() -> None:
+    lens = GridLens((linear_field(2.8), linear_field(5.6)))
+
+    assert lens.f_number(LensSettings()) == 2.8
+    assert lens.field(LensSettings(aperture=5.6)).f_number == 5.6
+    with pytest.raises(InvalidInputError, match=r"f/2\.8, f/5\.6"):
+        lens.f_number(LensSettings(aperture=4.0))
+    with pytest.raises(InvalidInputError, match="pitch"):
+        lens.kernel_at_field((0.0, 0.0), LensSettings(), 15, pitch_um=6.0)
+    with pytest.raises(InvalidInputError, match="sorted"):
+        GridLens((linear_field(5.6), linear_field(2.8)))
+
+
+def test_other_copies_of_a_design_have_other_faults_of_like_size() -> None:
+    own, first, second = copies["tronnier"], another("tronnier", 1), another("tronnier", 2)
+    assert first == another("tronnier", 1)
+    assert (first.design, first.f_number, first.corner_light) == (own.design, own.f_number, own.corner_light)
+    for fault, former in zip((*first.faults, *second.faults), (*own.faults, *own.faults), strict=True):
+        assert fault.element == former.element
+        assert fault.shift_um != former.shift_um
+        assert 0.5 <= math.hypot(*fault.shift_um) / math.hypot(*former.shift_um) <= 1.5
+    assert first.faults[0].shift_um != second.faults[0].shift_um
+    assert first.sensor_tilt_um != second.sensor_tilt_um

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.training.train_regions import Labelled, _arrays, fit, judged, read_table
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble
+
+pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
+
+
+def labelled(count: int, half: str, seed: int) -> list[Labelled]:
+    """Windows whose similarity follows the first feature, in groups of eight."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for i in range(count):
+        features = rng.normal(size=len(FEATURES))
+        unlike = float(np.exp(-2.0 + features[0] + 0.1 * rng.normal()))
+        rows.append(
+            Labelled(
+                group=f"{half}/{i // 8}",
+                half=half,
+                features=tuple(features.tolist()),
+                r_map_score=float(rng.random()),
+                ncc=1.0 - min(unlike, 0.99),
+                rel_l2=unlike,
+                mtf_rmse=0.1,
+                error_ratio=1.0 + unlike,
+                untouched_ratio=2.0,
+            )
+        )
+    return rows
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.jsonl"
+    rows = labelled(240, "dev", 0) + labelled(80, "test", 1)
+    path.write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
+    return path
+
+
+def test_training_finds_what_the_similarity_depends_on(table: Path, tmp_path: Path) -> None:
+    pytest.importorskip("sklearn")
+    report = fit(table, tmp_path / "model.npz")
+
+    assert (report.windows, report.groups) == (80, 10)
+    assert report.overall > 0.8
+    assert abs(report.r_map_overall) < 0.4  # the r-map scores of this table are random
+    assert report.similarity[0] > report.similarity[2] > 0
+    assert report.error_ratio_over_untouched[0] < report.error_ratio_over_untouched[2]
+
+
+def test_report_of_a_stored_model_is_that_of_its_training(table: Path, tmp_path: Path) -> None:
+    pytest.importorskip("sklearn")
+    report = fit(table, tmp_path / "model.npz")
+    held = [row for row in read_table(table) if row.half == "test"]
+
+    assert judged(TreeEnsemble.load(tmp_path / "model.npz"), held) == report
+
+
+def test_plain_arrays_answer_as_scikit_learn_does() -> None:
+    ensemble = pytest.importorskip("sklearn.ensemble")
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(300, 6))
+    model = ensemble.GradientBoostingRegressor(n_estimators=30, loss="huber", random_state=0)
+    model.fit(features, features[:, 0] * features[:, 1] + features[:, 2])
+
+    np.testing.assert_allclose(_arrays(model).predict(features), model.predict(features), atol=1e-5)
+
+
+def test_a_table_with_one_half_only_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("sklearn")
+    path = tmp_path / "table.jsonl"
+    path.write_text("".join(json.dumps(asdict(row)) + "\n" for row in labelled(16, "dev", 0)))
+
+    with pytest.raises(InvalidInputError, match="both halves"):
+        fit(path, tmp_path / "model.npz")

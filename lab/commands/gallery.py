@@ -56,24 +56,25 @@ def gallery(
 
     Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
     """
-    from lab import gallery as hall  # noqa: PLC0415 - it needs half of SciPy
+    from lab.gallery import pictures, run  # noqa: PLC0415 - it needs half of SciPy
+    from lab.gallery.page import text, write_page  # noqa: PLC0415 - same
 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     named = os.environ.get(DATA_VARIABLE)
     folder = data or (Path(named) if named else None)
     began = time.monotonic()
     with as_usage():
-        wishes = hall.Wishes(mode=mode, workers=workers, fresh=fresh)
+        wishes = run.Wishes(mode=mode, workers=workers, fresh=fresh)
         _ = wishes.model
-        known = [] if folder is None else hall.real_pictures(folder)
-        pictures = hall.chosen([*known, *hall.simulated_pictures(output / hall.CACHE)], only or [])
+        known = [] if folder is None else pictures.real_pictures(folder)
+        hung = pictures.chosen([*known, *pictures.simulated_pictures(output / run.CACHE)], only or [])
 
     def progress(words: str, done: int, total: int) -> None:
         shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
 
     entries = []
-    for entry in hall.hang(pictures, output, wishes, on_picture=progress):
+    for entry in run.hang(hung, output, wishes, on_picture=progress):
         entries.append(entry)
-        page = hall.write_page(entries, output)  # after each: a run that is stopped leaves a page
-    shown.result(hall.text(entries))
+        page = write_page(entries, output)  # after each: a run that is stopped leaves a page
+    shown.result(text(entries))
     shown.note(f"written: {page}")

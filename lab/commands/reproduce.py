@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
+from typing import Annotated, Literal, cast, get_args
 
 import typer
 
 from lensmodel.cli.console import display
 from lensmodel.cli.console.files import refuse_existing
 from lensmodel.cli.console.options import Force, Quiet, Verbose, choice
-
-if TYPE_CHECKING:
-    from lab.reproduce import Case, DirectRoute
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
 Size = Literal["quick", "small", "default", "full"]
@@ -103,20 +98,10 @@ def reproduce(
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(*(output / name for name in PAGE), force=force)
-    from lab.reproduce import (  # noqa: PLC0415 - the simulation is slow to import
-        DirectRoute,
-        collected,
-        missed,
-        planned,
-        run_reproduction,
-        write_json,
-        write_page,
-    )
-
-    @contextmanager
-    def library(case: Case, folder: Path) -> Iterator[DirectRoute]:
-        del case
-        yield DirectRoute(folder / "models")
+    from lab.reproduce.bars import missed  # noqa: PLC0415 - the simulation is slow to import
+    from lab.reproduce.cases import planned  # noqa: PLC0415 - same
+    from lab.reproduce.job import run_reproduction  # noqa: PLC0415 - same
+    from lab.reproduce.page import collected, write_json, write_page  # noqa: PLC0415 - same
 
     plan = planned(
         cast("Size", size),
@@ -126,7 +111,7 @@ def reproduce(
         default_only=default_only,
     )
     work = WorkLines(quiet=shown.quiet)
-    result = run_reproduction(plan, library, output, route="in the library", results=results, on_work=work)
+    result = run_reproduction(plan, output, results=results, on_work=work, workers=os.cpu_count() or 1)
     result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
     written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
@@ -136,25 +121,21 @@ def reproduce(
 
 
 class WorkLines:
-    """One line on standard error after each piece of work, with the time left."""
+    """One line on standard error after each result, with the time left."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
         self._began = time.monotonic()
-        self._stored = 0.0
-        self._last = 0.0
+        self._computed = 0
 
-    def __call__(self, words: str, done: float, total: float, *, fresh: bool) -> None:
+    def __call__(self, words: str, done: int, total: int, *, fresh: bool) -> None:
         """Say what was done; see `OnWork`."""
-        if not fresh:
-            self._stored += done - self._last
-        self._last = done
+        self._computed += fresh
         if self._quiet:
             return
-        spent, computed = time.monotonic() - self._began, done - self._stored
         left = ""
-        if computed > 0 and done < total:
-            seconds = spent / computed * (total - done)
+        if self._computed and done < total:
+            seconds = (time.monotonic() - self._began) / self._computed * (total - done)
             left = f", about {_duration(seconds)} left"
         typer.echo(f"[{100 * done / total:3.0f} %] {words}{left}", err=True)
 

@@ -29,28 +29,21 @@ Place = tuple[str, int, int]
 def places(
     before: Rendered,
     after: Rendered,
-    keep: NDArray[np.float32] | None,
     named: Sequence[tuple[str, Sequence[int] | None]] = (),
 ) -> list[Place]:
-    """Center, corners, and the worst three: by the audit, or else where most was changed.
+    """Center, corners, and the three places where most was changed.
 
     Parameters
     ----------
     before, after : ndarray of uint16, shape (row, col, 3)
-    keep : ndarray, shape (row, col), or None
-        Share of the correction that the audit would keep; its worst places are where it takes most away.
     named : sequence of (str, (row, col) or None)
         Further places by the pixel in their middle; left out where another crop shows most of them.
     """
     height, width = before.shape[:2]
     side = side_of(before)
     found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]
-    score = _change(before, after)
-    if keep is not None:
-        score = score * _held_back(keep)  # where nothing was changed there is nothing to hold back
-    word = "most changed" if keep is None else "audit"
-    for number, (row, col) in enumerate(_peaks(score, side), start=1):
-        found.append((f"{word} {number}", *_inside(row, col, side, height, width)))
+    for number, (row, col) in enumerate(_peaks(_change(before, after), side), start=1):
+        found.append((f"most changed {number}", *_inside(row, col, side, height, width)))
     for name, pixel in named:
         if pixel is None:
             continue
@@ -76,15 +69,6 @@ def sheet(pictures: Sequence[Rendered], row: int, col: int, side: int) -> Shown:
     return out
 
 
-def drawn(keep: NDArray[np.float32], longest: int = 640) -> Shown:
-    """Map of what the audit would hold back: black where it keeps everything; the least of each square."""
-    step = max(-(-max(keep.shape) // longest), 1)
-    height, width = (n // step * step for n in keep.shape)
-    least = keep[:height, :width].reshape(height // step, step, width // step, step).min(axis=(1, 3))
-    shade = np.rint(255.0 * (1.0 - np.clip(least, 0.0, 1.0))).astype(np.uint8)
-    return np.repeat(shade[..., None], 3, axis=-1)
-
-
 def _change(before: Rendered, after: Rendered) -> NDArray[np.float64]:
     """Mean change of each block over the original's contrast there."""
     across = before.shape[1] // _BLOCK
@@ -98,13 +82,6 @@ def _change(before: Rendered, after: Rendered) -> NDArray[np.float64]:
         contrast = old.std(axis=(0, 2)).mean(axis=-1)
         rows.append(np.abs(new - old).mean(axis=(0, 2, 3)) / (contrast + _EVEN))
     return np.array(rows)
-
-
-def _held_back(keep: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Mean share of the correction that each block loses by the audit."""
-    down, across = (n // _BLOCK for n in keep.shape)
-    blocks = keep[: down * _BLOCK, : across * _BLOCK].reshape(down, _BLOCK, across, _BLOCK)
-    return 1.0 - blocks.mean(axis=(1, 3), dtype=np.float64)
 
 
 def _peaks(score: NDArray[np.float64], side: int) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lab.gallery import figures
 from lab.gallery.rendering import Rendered
-from lab.gallery.truth import gains
+from lab.images import gains
 
 TILE: Final = 1024
 """Side of a tile: a multiple of the squares of the figures; bounds the memory."""

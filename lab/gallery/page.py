@@ -1,18 +1,16 @@
-"""The gallery's page: one file of HTML beside its crops, and the same figures as a table of text."""
+"""The gallery's page beside its crops, and the same figures as a table of text."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Final
 
 from lab.gallery.crops import SIDE, ZOOM
 from lab.gallery.run import GalleryEntry
-from lab.reproduce.pages.sheet import written_whole
-from lab.reproduce.pages.tables import table
+from lab.page import Page, table
 
-PAGE: Final = "index.html"
+PAGE: Final = "index.md"
 
 HEAD: Final = (
     "picture",
@@ -26,15 +24,6 @@ HEAD: Final = (
     "blocks < -0.5 dB",
     "worst block",
 )
-
-_STYLE: Final = """
-body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1400px;padding:0 1rem;color:#202124}
-table{border-collapse:collapse;margin:1rem 0;font-size:14px}
-td,th{border:1px solid #dadce0;padding:.25rem .6rem;text-align:left}
-td.missed{background:#fce8e6}h2{margin-top:3rem}
-figure{margin:1rem 0}figcaption{font-size:14px;color:#5f6368}
-img{display:block;max-width:none;image-rendering:pixelated}
-"""
 
 _COLUMN_OF: Final = {
     "dots": "dots",
@@ -88,18 +77,31 @@ def text(entries: Sequence[GalleryEntry]) -> str:
 
 
 def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
-    """Write the page; its crops are there already."""
-    output.mkdir(parents=True, exist_ok=True)
-    parts = ["<h1>Gallery</h1>", f"<p>{escape(_INTRODUCTION)}</p>", "<h2>Bars</h2>"]
-    parts.append("<ul>" + "".join(f"<li>{escape(line)}</li>" for line in summary(entries)) + "</ul>")
-    parts.append(_figures(entries))
+    """Write the page as Markdown and HTML; its crops are there already. Returns the path of the HTML."""
+    page = Page()
+    page.title("Gallery", 1)
+    page.text(_INTRODUCTION)
+    page.title("Bars")
+    page.text("; ".join(summary(entries)) + ".")
+    rows = []
     for entry in entries:
-        parts += _section(entry)
-    html = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Gallery</title>'
-        f"<style>{_STYLE}</style></head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
-    return written_whole(output / PAGE, html)
+        missed = {_COLUMN_OF[bar] for bar, kept in entry.bars.items() if not kept}
+        named = zip(HEAD, cells(entry), strict=True)
+        rows.append([f"**{cell}**" if name in missed else cell for name, cell in named])
+    page.table(HEAD, rows)
+    for entry in entries:
+        page.title(entry.picture.name)
+        page.text("; ".join(_words(entry)) + ".")
+        if entry.work.get("announced"):
+            gains = ", ".join(
+                f"{zone} {'not known' if value is None else f'{value:+.1f} dB'}"
+                for zone, value in entry.work["announced"].items()
+            )
+            page.text(f"Announced gain: {gains}.")
+        columns = ", ".join(entry.columns)
+        for place in entry.places:
+            page.picture(place.file, f"{place.name}: {columns}; row {place.row}, column {place.col}")
+    return page.write(output / PAGE, "Gallery")[1]
 
 
 _INTRODUCTION: Final = (
@@ -109,47 +111,8 @@ _INTRODUCTION: Final = (
     "is the 99th percentile beside clean edges, in percent of the step; grain is noise power in even places, "
     "corrected over original, coarse, middle and fine; texture kept is the 5th percentile of the contrast of "
     "low-contrast places, corrected over original; gains are against the truth, after each block's own "
-    "best shift. A shaded figure misses its bar."
+    "best shift. A figure in bold misses its bar."
 )
-
-
-def _figures(entries: Sequence[GalleryEntry]) -> str:
-    head = "".join(f"<th>{escape(word)}</th>" for word in HEAD)
-    rows = []
-    for entry in entries:
-        missed = {_COLUMN_OF[bar] for bar, kept in entry.bars.items() if not kept}
-        row = [
-            f"<td{' class=missed' if name in missed else ''}>{escape(cell)}</td>"
-            for name, cell in zip(HEAD, cells(entry), strict=True)
-        ]
-        row[0] = f'<td><a href="#{entry.picture.slug}">{escape(entry.picture.name)}</a></td>'
-        rows.append(f"<tr>{''.join(row)}</tr>")
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-
-
-def _section(entry: GalleryEntry) -> list[str]:
-    unit = entry.work
-    parts = [f'<h2 id="{entry.picture.slug}">{escape(entry.picture.name)}</h2>']
-    parts.append(f"<p>{escape('; '.join(_words(entry)))}.</p>")
-    if unit.get("announced"):
-        gains = ", ".join(
-            f"{zone} {'not known' if value is None else f'{value:+.1f} dB'}"
-            for zone, value in unit["announced"].items()
-        )
-        parts.append(f"<p>Announced gain: {escape(gains)}.</p>")
-    if entry.audit:
-        words = "What the audit would hold back: white is everything"
-        parts.append(
-            f'<figure><img src="{entry.audit}" alt="{words}"><figcaption>{words}</figcaption></figure>'
-        )
-    columns = ", ".join(entry.columns)
-    for place in entry.places:
-        caption = f"{place.name}: {columns}; row {place.row}, column {place.col}"
-        parts.append(
-            f'<figure><img src="{place.file}" alt="{escape(caption)}">'
-            f"<figcaption>{escape(caption)}</figcaption></figure>"
-        )
-    return parts
 
 
 def _words(entry: GalleryEntry) -> list[str]:

@@ -1,4 +1,4 @@
-"""Which pictures hang in the gallery: every real one of the test data, and the simulated frames."""
+"""Which pictures hang in the gallery: every real one of the test data, and frames of hard scenes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from lab.gallery.frames import FRAMES
-from lab.gallery.frames import version as frames_version
+import numpy as np
+
+from lab.code_version import version_of
+from lab.gallery.rendering import rendered
+from lab.reproduce.frames import JPEG_QUALITY, MARGIN
+from lab.scenes import hard_scene
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotAnImageError
-from lensmodel.photo import inspect
+from lensmodel.core.files import atomic
+from lensmodel.core.types import LensSettings
+from lensmodel.photo import develop, inspect, write_image
+from lensmodel.simulate import SimulatedCamera, draw_lens, photograph, write_photo
+
+HEIGHT: Final = 832
+WIDTH: Final = 1248
+"""A megapixel: all demo photographs cover it, and it is calibrated in half a minute."""
 
 FOLDERS: Final = ("real", "large", "raw", "series", "meta")
 STARS: Final = ("psf", (".tif", ".tiff"))
@@ -22,6 +33,96 @@ SUBJECTS: Final = {"faces": (215, 230)}
 
 SMALLEST: Final = 64
 """Shorter side of a picture that shows anything; stand-ins for metadata are smaller."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedFrame:
+    """One simulated photo.
+
+    Parameters
+    ----------
+    name : str
+        Of its file, too.
+    scene : str
+        Name in `lab.scenes.HARD_SCENES`.
+    lens : int
+        Seed of the lens.
+    jpeg : bool
+        Whether it is a camera's JPEG, else a DNG.
+    full_well_electrons, read_noise : float
+        Of the sensor at this ISO, electrons.
+    """
+
+    name: str
+    scene: str
+    lens: int
+    jpeg: bool = False
+    full_well_electrons: float = 50_000.0
+    read_noise: float = 50.0
+
+    @property
+    def file(self) -> str:
+        """Name of its file."""
+        return f"{self.name}{'.jpg' if self.jpeg else '.dng'}"
+
+
+FRAMES: Final = (
+    SimulatedFrame("clipped-lamps", "lamps", 1000),
+    SimulatedFrame("red-cars", "red-cars", 1001),
+    SimulatedFrame("night-high-iso", "night", 1002, full_well_electrons=2500.0, read_noise=7.5),
+    SimulatedFrame("snow-twigs", "snow", 1003),
+    SimulatedFrame("faces", "faces", 1004, jpeg=True),
+    SimulatedFrame("foliage", "foliage", 1005),
+    SimulatedFrame("text", "text", 1006),
+    SimulatedFrame("sky-gradient", "sky", 1007, jpeg=True),
+)
+"""Each through another kind of lens; the noise is that of the reproduction at base and high ISO."""
+
+
+def take(
+    frame: SimulatedFrame, folder: Path, *, height: int = HEIGHT, width: int = WIDTH
+) -> tuple[Path, Path]:
+    """Take a frame unless it is there.
+
+    Returns
+    -------
+    photo : Path
+        DNG or JPEG.
+    truth : Path
+        npy, uint16 `(row, col, 3)`: what a perfect lens would have shown, rendered as the photo is.
+    """
+    photo, truth = folder / frame.file, folder / f"{frame.name}-truth.npy"
+    if photo.exists() and truth.exists():
+        return photo, truth
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng([frame.lens, 18])
+    lens = draw_lens(frame.lens)
+    camera = SimulatedCamera(
+        height=height,
+        width=width,
+        full_well_electrons=frame.full_well_electrons,
+        read_noise=frame.read_noise,
+    )
+    focal = lens.focal_mm[0]
+    settings = LensSettings(aperture=lens.at_focal(focal).f_number, focal_mm=focal)
+    scene = hard_scene(frame.scene, height + 2 * MARGIN, width + 2 * MARGIN, rng)
+    taken = photograph(scene, lens, settings, camera, rng)
+    raw = folder / f"{frame.name}.dng"
+    write_photo(raw, taken)
+    developed = develop(raw)
+    with atomic(truth) as file:
+        np.save(file, rendered(taken.sharp, developed.encoding), allow_pickle=False)
+    if frame.jpeg:
+        write_image(
+            photo,
+            developed.planes,
+            developed.encoding,
+            format="jpeg",
+            color_space="srgb",
+            quality=JPEG_QUALITY,
+        )
+        raw.unlink()
+    return photo, truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +186,7 @@ def real_pictures(folder: Path) -> list[Picture]:
 
 def simulated_pictures(cache: Path) -> list[Picture]:
     """Name the simulated frames; they are taken when their turn comes."""
-    folder = cache / f"frames-{frames_version()}"
+    folder = cache / f"frames-{version_of('lab.gallery.pictures')[:12]}"
     return [
         Picture(
             f"simulated/{frame.name}",

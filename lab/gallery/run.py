@@ -1,26 +1,51 @@
-"""Hang the gallery: picture by picture, whatever is stored already is not made again."""
+"""Hang the gallery: each picture calibrated from itself, corrected by default, given to others, and measured.
+
+Whatever is stored already is not made again.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
+import shutil
+import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
-from lab.gallery import crops, figures, measure, truth
-from lab.gallery.pictures import Picture
-from lab.gallery.work import Wishes, work
-from lab.reproduce.store import Unit, stored
+import lensmodel
+from lab import images, peers
+from lab.code_version import version_of
+from lab.gallery import crops, measure
+from lab.gallery.pictures import FRAMES, Picture, take
+from lab.gallery.rendering import Rendered, aligned, read_rendered, rendered
+from lab.store import Unit, stored
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.files import atomic
+from lensmodel.core.types import LensSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
+from lensmodel.photo import develop
+from lensmodel.workflow import pipeline
+from lensmodel.workflow.lens import Lens
 
 OnPicture = Callable[[str, int, int], None]
 """Hears what is being done, and how many of how many pictures are finished."""
 
 CACHE = "cache"
 CROPS = "crops"
+ANY_APERTURE: Final = 5.6
+"""f-number of photos that do not say theirs: chosen, of no effect where one photo is the whole profile."""
+
+RIVALS: Final = ("RawTherapee capture sharpening", "RawTherapee RL")
+"""For a mosaic, and for a developed picture."""
+
+Words = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +84,6 @@ class GalleryEntry:
     columns : tuple of str
         What stands side by side in the crops.
     places : tuple of PicturePlace
-    audit : str
-        File of the audit's map, "" without one.
     """
 
     picture: Picture
@@ -69,7 +92,61 @@ class GalleryEntry:
     bars: dict[str, bool]
     columns: tuple[str, ...]
     places: tuple[PicturePlace, ...]
-    audit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """How pictures are worked on.
+
+    Parameters
+    ----------
+    mode : str or None
+        Mode of the lens model; None is the default one.
+    workers : int
+        Processes of a calibration, threads of a correction.
+    fresh : bool
+        Whether stored results are made anew.
+    """
+
+    mode: str | None = None
+    workers: int = 2
+    fresh: bool = False
+
+    @property
+    def model(self) -> ModelSettings:
+        """Settings of the lens model."""
+        return ModelSettings() if self.mode is None else ModelSettings(mode=self.mode)
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Where everything about one picture is kept."""
+
+    folder: Path
+
+    @property
+    def before(self) -> Path:
+        """The original, rendered."""
+        return self.folder / "before.npy"
+
+    @property
+    def after(self) -> Path:
+        """The corrected picture, rendered; missing where the photo was left alone."""
+        return self.folder / "after.npy"
+
+    @property
+    def rival(self) -> Path:
+        """What RawTherapee makes of it; missing where it makes nothing."""
+        return self.folder / "rawtherapee.npy"
+
+    def picture(self, path: Path) -> Rendered | None:
+        """Map a picture, or None where it is missing."""
+        return np.load(path, mmap_mode="r", allow_pickle=False) if path.exists() else None
+
+    def save(self, path: Path, values: NDArray[Any]) -> None:
+        """Keep an array, whole or not at all."""
+        with atomic(path) as file:
+            np.save(file, values, allow_pickle=False)
 
 
 def hang(
@@ -112,7 +189,7 @@ def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], 
     shown = before if after is None else after
     known = None if picture.truth is None else np.load(picture.truth, mmap_mode="r", allow_pickle=False)
     say("measuring")
-    name = f"figures-{_version()}.json"
+    name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
     found, _ = stored(room.folder / name, lambda: measure.measured(before, shown, known))
     columns, sheets = ["original", "corrected"], [before, shown]
     for word, other in ((unit["rival"]["name"], room.picture(room.rival)), ("truth", known)):
@@ -120,29 +197,154 @@ def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], 
             columns.append(word)
             sheets.append(other)
     say("cutting crops")
-    keep = room.kept()
     side = crops.side_of(before)
     named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
     named += [("most dots", found["dots_at"]), ("most hue flips", found["hue_flips_at"])]
     if found["gains"] is not None and found["gains"]["worst_db"] < 0.0:
-        middle = [k + truth.BLOCK // 2 for k in found["gains"]["worst_at"]]
+        middle = [k + images.BLOCK // 2 for k in found["gains"]["worst_at"]]
         named.append((f"worst block, {found['gains']['worst_db']:+.2f} dB", middle))
-    where = crops.places(before, shown, keep, named)
+    where = crops.places(before, shown, named)
     made = []
     for number, (words, row, col) in enumerate(where, start=1):
         file = f"{CROPS}/{picture.slug}-{number}.png"
         Image.fromarray(crops.sheet(sheets, row, col, side)).save(output / file, optimize=True)
         made.append(PicturePlace(words, row, col, file))
-    audit = ""
-    if keep is not None:
-        audit = f"{CROPS}/{picture.slug}-audit.png"
-        Image.fromarray(crops.drawn(keep)).save(output / audit, optimize=True)
-    return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made), audit)
+    return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made))
 
 
-def _version() -> str:
-    """Hash of the code that figures come from."""
-    total = hashlib.sha256()
-    for module in (figures, measure, truth):
-        total.update(Path(str(module.__file__)).read_bytes())
-    return total.hexdigest()[:8]
+def work(picture: Picture, cache: Path, wishes: Wishes, say: Words) -> tuple[Room, Unit]:
+    """Calibrate a picture from itself and correct it, unless that is stored.
+
+    Returns
+    -------
+    room : Room
+        Where the pictures are.
+    unit : dict
+        `state` ("corrected" or "left alone"), `reason`, `notes`, `announced` (dB by zone), `seconds`.
+    """
+    _taken(picture, say)
+    content = _hash(picture.path)
+    code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))
+    settings = hashlib.sha256(f"{code} {wishes.model}".encode()).hexdigest()[:8]
+    room = Room(cache / f"{picture.slug}-{content[:8]}-{settings}")
+    if wishes.fresh and room.folder.exists():
+        shutil.rmtree(room.folder)
+    room.folder.mkdir(parents=True, exist_ok=True)
+    unit, _ = stored(room.folder / "work.json", lambda: _worked(picture, room, wishes, say))
+    rival, _ = stored(
+        room.folder / f"rival-{version_of('lab.peers')[:12]}.json", lambda: _rival(picture, room, unit, say)
+    )
+    return room, {**unit, "rival": rival}
+
+
+def _taken(picture: Picture, say: Words) -> None:
+    """Take a simulated frame whose turn has come."""
+    if picture.truth is None or (picture.path.exists() and picture.truth.exists()):
+        return
+    say("taking the photo")
+    take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
+
+
+def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
+    say("developing")
+    developed = develop(picture.path)
+    room.save(room.before, rendered(developed.planes, developed.encoding))
+    notes = []
+    override = LensSettings()
+    if developed.info.metadata.aperture is None:
+        override = LensSettings(aperture=ANY_APERTURE)
+        notes.append("the file does not say its aperture, which was given as by --aperture")
+    unit: Unit = {
+        "state": "left alone",
+        "reason": "",
+        "notes": notes,
+        "announced": {},
+        "raw": developed.cfa is not None,
+        "orientation": developed.encoding.orientation,
+    }
+    began = time.monotonic()
+    try:
+        model = _model(picture, room, wishes, override, say)
+    except LensModelError as error:
+        return {**unit, "reason": f"calibration was refused: {error}", "seconds": [_since(began), 0.0]}
+    calibrated = _since(began)
+    began = time.monotonic()
+    say("correcting")
+    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
+        output = Path(name) / "corrected.tif"
+        try:
+            corrected = lensmodel.correct(
+                picture.path,
+                Lens(LensProfile(model)),
+                output,
+                aperture=override.aperture,
+                color_space="srgb",
+                workers=wishes.workers,
+            )
+        except LensModelError as error:
+            reason = f"correction was refused: {error}"
+            return {**unit, "reason": reason, "seconds": [calibrated, _since(began)]}
+        seconds = [calibrated, _since(began)]
+        room.save(room.after, read_rendered(output))
+    announced = {zone: _finite(report.expected_gain_db) for zone, report in corrected.zones.items()}
+    return {**unit, "state": "corrected", "announced": announced, "seconds": seconds}
+
+
+def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings, say: Words) -> LensModel:
+    path = room.folder / "own.lensprofile"
+    if path.exists():
+        return load_profile(path).model
+    reasons: list[str] = []
+    heard_last = [""]
+
+    def heard(event: pipeline.CalibrationEvent) -> None:
+        if event.stage == "skipped":
+            reasons.append(event.detail)
+        quarter = f" {25 * (4 * event.done // event.total)} %" if event.total else ""
+        if heard_last[-1] != (words := f"calibrating: {event.stage}{quarter}"):
+            heard_last.append(words)
+            say(words)
+
+    try:
+        model = lensmodel.calibrate(
+            picture.path,
+            aperture=override.aperture,
+            model=wishes.model,
+            workers=wishes.workers,
+            on_event=heard,
+        ).model
+    except LensModelError as error:
+        raise InvalidInputError(reasons[0] if reasons else str(error)) from error
+    save_profile(path, LensProfile(model))
+    return model
+
+
+def _rival(picture: Picture, room: Room, unit: Unit, say: Words) -> Unit:
+    peer = next(p for p in peers.PEERS if p.name == RIVALS[0 if unit["raw"] else 1])
+    room.rival.unlink(missing_ok=True)
+    if not peer.installed:
+        return {"name": peer.name, "reason": f"{peer.program} is not installed"}
+    say(peer.name)
+    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
+        try:
+            made, _ = peer.run(picture.path.resolve(), Path(name), peer.usual)
+            picture_of_it = read_rendered(made)
+        except (LensModelError, OSError, ValueError) as error:
+            return {"name": peer.name, "reason": str(error)}
+    before = room.picture(room.before)
+    assert before is not None
+    room.save(room.rival, aligned(picture_of_it, before, unit["orientation"]))
+    return {"name": peer.name, "reason": ""}
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _since(began: float) -> float:
+    return round(time.monotonic() - began, 1)
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]

@@ -1,4 +1,4 @@
-"""Fig. 2 (interpolation against regression) and Fig. 4 (from edges to the field)."""
+"""Fig. 2 (interpolation against regression), Fig. 4 (from edges to the field), and crops side by side."""
 
 from __future__ import annotations
 
@@ -12,19 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from lab.figure_parts import kernel_tile
-from lab.reproduce import interpolation
+from lab.reproduce import fields
 from lab.reproduce.cases import Case, Reproduction
-from lab.reproduce.conditions import BASE
-from lab.reproduce.shots import take
+from lab.reproduce.frames import take
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width
-from lensmodel.core.types import FieldPosition, Plane
+from lensmodel.core.types import FieldPosition, Kernel, Plane
 from lensmodel.estimation.patches import r_map
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
-from lensmodel.quality.images import as_shown
+from lensmodel.quality.images import Picture, as_shown, crop_boxes
 from lensmodel.workflow import pipeline
 
 # Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.
@@ -37,14 +35,14 @@ _GRID: Final = (6, 9)
 def version() -> str:
     """Hash of the code: drawings of another version are drawn again."""
     total = hashlib.sha256()
-    for path in (Path(__file__), Path(interpolation.__file__)):
+    for path in (Path(__file__), Path(fields.__file__)):
         total.update(path.read_bytes())
     return total.hexdigest()[:8]
 
 
-def draw(plan: Reproduction, case: Case, folder: Path, *, workers: int | None = None) -> dict[str, Any]:
+def draw(plan: Reproduction, case: Case, folder: Path, *, workers: int = 1) -> dict[str, Any]:
     """Draw both figures into a folder and return their names and figures."""
-    whole = {c.name: c for c in plan.cases if c.condition == BASE and c.stops < 0.1 and c.photos[0] <= 2}
+    whole = {c.name: c for c in plan.cases if c.is_whole and c.stops < 0.1}
     return {"fig2": _fig2(list(whole.values()), folder), "fig4": _fig4(plan, case, folder, workers)}
 
 
@@ -65,7 +63,7 @@ def _fig2(cases: Sequence[Case], folder: Path) -> dict[str, Any]:
     field = worst.truth()
     truth = [field.kernel_at(place, "g", _SIZE) for place in _SHOWN]
     rows, errors = [[kernel_tile(k) for k in truth]], {}
-    for name, predict in interpolation.predictors(worst).items():
+    for name, predict in fields.predictors(worst).items():
         found = [predict(place) for place in _SHOWN]
         errors[name] = [distance(a, b).rel_l2 for a, b in zip(found, truth, strict=True)]
         rows.append([kernel_tile(k) for k in found])
@@ -79,7 +77,7 @@ def _fig2(cases: Sequence[Case], folder: Path) -> dict[str, Any]:
         "table": [
             {"family": family, "lenses": len(lenses), **row}
             for family, lenses in families.items()
-            for row in interpolation.compared(lenses)
+            for row in fields.compared(lenses)
         ],
     }
 
@@ -93,7 +91,7 @@ def _sheet(rows: Sequence[Sequence[NDArray[np.uint8]]], gap: int = 4) -> NDArray
     return sheet
 
 
-def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int | None) -> dict[str, Any]:
+def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int) -> dict[str, Any]:
     """Confidence map with the patches, the PSF of each patch, and the regressed field."""
     with TemporaryDirectory(prefix="lensmodel-figure-") as work:
         shots = take(case, plan.files(), Path(work), first=1)
@@ -165,3 +163,20 @@ def _field(field: PsfField, frame: Frame) -> Image.Image:
             tile = Image.fromarray(kernel_tile(field.kernel_at(frame.position(row, col), "g", _SIZE), zoom=2))
             sheet.paste(tile, (round(col * scale - tile.width / 2), round(row * scale - tile.height / 2)))
     return sheet
+
+
+def strip(picture: Picture, side: int, gap: int = 6) -> Picture:
+    """Put the five crops of `crop_boxes` side by side on white, `(side, 5 side + 4 gap, 3)`."""
+    side = min(side, picture.shape[0] // 2, picture.shape[1] // 2)
+    boxes = crop_boxes(picture.shape[0], picture.shape[1], side)
+    sheet = np.full((side, len(boxes) * (side + gap) - gap, 3), 255, dtype=np.uint8)
+    for i, (row, col) in enumerate(boxes.values()):
+        left = i * (side + gap)
+        sheet[:, left : left + side] = picture[row : row + side, col : col + side]
+    return sheet
+
+
+def kernel_tile(kernel: Kernel, zoom: int = 3, gamma: float = 0.5) -> NDArray[np.uint8]:
+    """Draw a kernel, its peak white, each pixel `zoom` times; the paper's figures use gamma 0.5."""
+    shown = np.rint((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
+    return np.kron(shown, np.ones((zoom, zoom), dtype=np.uint8))

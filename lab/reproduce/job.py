@@ -1,194 +1,290 @@
-"""One case of a reproduction: take its photos, learn, correct, measure; keep every result."""
+"""Run a reproduction case by case: take photos, learn, correct, measure; nothing stored is computed again.
+
+Stored for each case, one JSON file each, under a name that hashes all that it depends on::
+
+    <key>/truth.json                  as photographed, with the true PSF, denoised only
+    <key>/learned-<n>.json            after n photos
+    <key>/paper-<n>.json              the same the paper's own way from end to end
+    <key>/measured.json               with PSFs measured on a target
+    <key>/general.json                with a general profile of the lens model
+    <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
+    <key>/program-<name>-<version>.json  corrected by a program of others
+
+They hold figures only, some ten kilobytes a lens: carried to another machine they serve a run there. Photos
+and models of an unfinished case lie in `work` of the output folder, pictures in `pictures`.
+"""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 from PIL import Image
 
-from lab.figure_parts import strip
-from lab.reproduce import measure, programs
-from lab.reproduce.cases import Case, Reproduction
-from lab.reproduce.general import general_field, general_key, general_words
-from lab.reproduce.measured import measured_field, photograph_target
-from lab.reproduce.progress import (
-    CORRECT,
-    LEARN,
-    MEASURE,
-    PAPER_CORRECT,
-    PAPER_LEARN,
-    PROGRAM,
-    RIVAL,
-    SHOT,
-    Progress,
-    corrections,
-    methods_of,
-    programs_of,
-    rivals_of,
-    weight_of,
-    with_general,
-    with_paper,
-    with_target,
-)
-from lab.reproduce.routes import (
-    Answer,
-    DirectRoute,
-    OpenRoute,
-    PointField,
-    Remembered,
-    Route,
-    corrected_with,
-    paper_way,
-)
-from lab.reproduce.shots import Shots, take
-from lab.reproduce.store import Unit, read, stored
+from lab.cases import photo_half
+from lab.code_version import version_of
+from lab.reproduce import figures, measure, programs
+from lab.reproduce.cases import BASE, HARD_METHODS, Case, Reproduction, fingerprint, key_of
+from lab.reproduce.fields import PointField, Remembered, general_field, general_words, measured_field
+from lab.reproduce.frames import Shots, take
+from lab.reproduce.learners import Answer, Learner, LibraryLearner, corrected_with, paper_way
 from lab.rivals import rivals
+from lab.store import Unit, read, stored
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.quality import images
-from lensmodel.workflow.ways import WAYS
+from lensmodel.quality.images import as_shown
+from lensmodel.workflow.ways import WAYS, Way
 
-CROP_PX = 128  # side of a crop in a strip (chosen)
-_ALONE = ("truth", "measured", "general")
-CONTROL = "standard"
+CROP_PX: Final = 128  # side of a crop in a strip (chosen)
+CONTROL: Final = "standard"
 """Method whose denoising alone is the control."""
 
+_ALONE: Final = ("truth", "measured", "general")
+NewLearner: TypeAlias = Callable[[Path, Way, int], Learner]
+"""From a folder that keeps what was learned, the way of learning, and a number of processes."""
 
-@dataclass(frozen=True, slots=True)
+
+class OnWork(Protocol):
+    """Hears of progress."""
+
+    def __call__(self, words: str, done: int, total: int, *, fresh: bool) -> None:
+        """Say that `done` of `total` results are there, and whether the last was computed or found stored."""
+
+
+def run_reproduction(
+    plan: Reproduction,
+    folder: Path,
+    *,
+    on_work: OnWork,
+    results: Path | None = None,
+    workers: int = 1,
+    with_figures: bool = True,
+    learner: NewLearner = LibraryLearner,
+) -> dict[str, Any]:
+    """Run what is missing and return everything.
+
+    Parameters
+    ----------
+    plan : Reproduction
+    folder : Path
+        Pictures go to `pictures` in it.
+    on_work : OnWork
+        Called after each result.
+    results : Path, optional
+        Where results are stored and taken from; by default `cache` in `folder`.
+    workers : int
+        Processes.
+    with_figures : bool
+        Whether to draw Fig. 2 and Fig. 4 too.
+    learner : callable
+        What is under test.
+
+    Returns
+    -------
+    dict
+        Plain values: `code`, `plan`, `scenes`, `cases`, `hard` (scenes and paths that hurt), `figures`.
+    """
+    version = fingerprint()
+    cache, shown = results or folder / "cache", folder / "pictures"
+    shown.mkdir(parents=True, exist_ok=True)
+    keys = [key_of(case, plan, version) for case in plan.cases]
+    jobs = [
+        CaseJob(case, plan, cache / key, folder / "work" / key, shown, workers, learner)
+        for case, key in zip(plan.cases, keys, strict=True)
+    ]
+    done, total = 0, sum(len(job.files) for job in jobs) + with_figures
+
+    def told(words: str, *, fresh: bool) -> None:
+        nonlocal done
+        done += 1
+        on_work(words, done, total, fresh=fresh)
+
+    finished = [_with_pictures_there(job.run(told), shown) for job in jobs]
+    with suppress(OSError):  # not there, or another run's work is in it
+        (folder / "work").rmdir()
+    drawn: Unit = {}
+    if with_figures:
+        make = partial(figures.draw, plan, plan.cases[0], shown, workers=workers)
+        drawn, fresh = stored(cache / keys[0] / f"figures-{figures.version()}.json", make)
+        if not fresh and not all((shown / name).exists() for name in figures.names(drawn)):
+            drawn, fresh = make(), True
+        told("figures 2 and 4", fresh=fresh)
+    files = plan.files()
+    return {
+        "code": version,
+        "plan": {
+            "size": plan.size,
+            "estimator": plan.estimator,
+            "methods": list(plan.methods),
+            "rivals": {name: rivals.create(name).source for name in plan.rivals},
+            "programs": list(plan.programs),
+            "own_scenes": plan.scenes is None,
+            "paper_kernel": max(
+                (paper_way(case).kernel_size for case in plan.cases if plan.paper and case.is_whole),
+                default=None,
+            ),
+        },
+        "scenes": [path.stem for path in files],
+        "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],
+        "cases": [one for one in finished if one["condition"] == BASE],
+        "hard": [one for one in finished if one["condition"] != BASE],
+        "figures": drawn,
+    }
+
+
+def _with_pictures_there(unit: Unit, shown: Path) -> Unit:
+    """Leave out the names of pictures that another run made and that were not carried along."""
+    kept = {
+        key: _with_pictures_there(value, shown) if isinstance(value, dict) else value
+        for key, value in unit.items()
+    }
+    if "pictures" in kept:
+        kept["pictures"] = {k: v for k, v in kept["pictures"].items() if (shown / v).exists()}
+    return kept
+
+
+def rivals_version() -> str:
+    """Hash of the rivals' code and basis: they are no part of what a case's key depends on."""
+    return version_of("lab.rivals")[:8]
+
+
+@dataclass(frozen=True)
 class CaseJob:
-    """One case; `truth` keeps the kernels that were asked for, which are slow to make."""
+    """One case of a reproduction."""
 
     case: Case
-    truth: PsfField
     plan: Reproduction
-    open_route: OpenRoute
     folder: Path
     work: Path
     shown: Path
-    progress: Progress
     workers: int
-    rival_code: str
+    learner: NewLearner
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Non-blind methods of this case."""
-        return methods_of(self.case, self.plan)
+        return self.plan.methods if self.case.condition == BASE else HARD_METHODS
 
-    def run(self) -> Unit:
+    @cached_property
+    def truth(self) -> Remembered:
+        """The true PSFs, which are slow to make."""
+        return Remembered(self.case.truth())
+
+    @cached_property
+    def files(self) -> dict[tuple[str, str], Path]:
+        """Where each result of the case is stored, by part and name in it."""
+        plan, folder, counts = self.plan, self.folder, [str(n) for n in self.case.photos]
+        whole = self.case.is_whole  # what is compared with is done once for each lens
+        found = {("truth", ""): folder / "truth.json"}
+        found |= {("learned", n): folder / f"learned-{n}.json" for n in counts}
+        found |= {("paper", n): folder / f"paper-{n}.json" for n in counts if whole and plan.paper}
+        for part, wanted in (("measured", plan.target), ("general", plan.general)):
+            found |= {(part, ""): folder / f"{part}.json"} if whole and wanted else {}
+        if whole:
+            code = rivals_version()
+            found |= {("rivals", name): folder / f"rival-{name}-{code}.json" for name in plan.rivals}
+            code = programs.version()
+            for name in plan.programs:
+                found["programs", name] = folder / f"program-{programs.label_of(name)}-{code}.json"
+        return found
+
+    def run(self, told: Callable[..., None]) -> Unit:
         """Compute what is missing, and return all of it."""
-        case, files = self.case, self._files()
-        every = [path for part in files.values() for path in part.values()]
-        if all(path.exists() for path in every):
-            self.progress.tell(f"{case.title}: stored", weight_of(case, self.plan), fresh=False)
-        else:
-            shots = self._shots(self.work / "photos")
-            for path in files["truth"].values():
-                self._truth(path, shots)
-            for path in files["measured"].values():
-                self._target(path, shots)
-            if all(path.exists() for path in files["learned"].values()):
-                self.progress.tell(f"{case.title}: learned before", self._learning(), fresh=False)
-            else:
-                with self.open_route(case, self.work) as route:
-                    self._learned(route, shots, files["learned"])
-            self._paper(shots, files["paper"])
-            for path in files["general"].values():
-                self._general(path, shots)
-            self._beside(files["rivals"], shots)
-            self._programs(files["programs"], shots)
+        case, complete = self.case, all(path.exists() for path in self.files.values())
+        if not complete:
+            shots = take(case, self.plan.files(), self.work / "photos", workers=self.workers)
+        makers: dict[str, Callable[[str], Unit]] = {}
+        if not complete:
+            own, paper = WAYS["default"], paper_way(case)
+            own = replace(own, estimator=self.plan.estimator)
+            makers = {
+                "truth": lambda _: self._truth(shots),
+                "learned": partial(self._learned, self._learning("models", own), shots, own_way=False),
+                "paper": partial(self._learned, self._learning("paper", paper), shots, own_way=True),
+                "measured": lambda _: self._measured(shots),
+                "general": lambda _: self._by_field(general_field(case), 0.0, shots, "general"),
+                "rivals": lambda name: self._rival(name, shots),
+                "programs": lambda name: self._program(name, shots),
+            }
+        units: dict[str, dict[str, Unit]] = {part: {} for part in ("learned", "paper", "rivals", "programs")}
+        for (part, name), path in self.files.items():
+            words, fresh = f"{case.title}: {part} {name}".rstrip(), True
+            try:
+                unit, fresh = stored(path, partial(makers[part], name)) if makers else (read(path), False)
+                units.setdefault(part, {})[name] = unit
+            except LensModelError as error:
+                if part != "programs":
+                    raise
+                words += f" left out: {error}"  # of others: the page goes without, the next run tries again
+            told(words, fresh=fresh)
+        if not complete:
             shutil.rmtree(self.work)
-        units = {
-            part: {name: read(path) for name, path in paths.items() if part != "programs" or path.exists()}
-            for part, paths in files.items()
-        }
         return {
             "name": case.name,
             "title": case.title,
             "family": case.family,
             "unseen": case.unseen,
             "source": case.source,
-            "general_profile": general_words(case) if with_general(case, self.plan) else "",
-            "kind": case.lens.model.split()[1].lower(),
+            "general_profile": general_words(case) if ("general", "") in self.files else "",
             "condition": case.condition,
             "condition_title": case.conditions.title,
             "settings": {k: v for k, v in asdict(case).items() if k not in {"layout", "grid"}},
             "stops": case.stops,
             "frames": case.layout.words(),
-            **{name: units[name][""] if units[name] else None for name in _ALONE},
-            **{name: units[name] for name in units if name not in _ALONE},
+            **{part: units.pop(part, {}).get("") for part in _ALONE},
+            **units,
         }
 
-    def _files(self) -> dict[str, dict[str, Path]]:
-        """Where each unit of the case is stored, by part of the result and name in it."""
-        case, plan, folder = self.case, self.plan, self.folder
-        program = programs.version()
-        counts = [str(n) for n in case.photos]
-        return {
-            "truth": {"": folder / "truth.json"},
-            "measured": {"": folder / "measured.json"} if with_target(case, plan) else {},
-            "general": {"": folder / f"general{general_key(case)}.json"} if with_general(case, plan) else {},
-            "learned": {n: folder / f"learned-{n}.json" for n in counts},
-            "paper": {n: folder / f"paper-{n}.json" for n in counts} if with_paper(case, plan) else {},
-            "rivals": {
-                name: folder / f"rival-{name}-{self.rival_code}.json" for name in rivals_of(case, plan)
-            },
-            "programs": {
-                name: folder / f"program-{programs.label_of(name)}-{program}.json"
-                for name in programs_of(case, plan)
+    def _learning(self, name: str, way: Way) -> _Learning:
+        return _Learning(partial(self.learner, self.work / name, way, self.workers))
+
+    def _truth(self, shots: Shots) -> Unit:
+        case, photo = self.case, develop(shots.held_out)
+        chart = None if shots.chart is None else develop(shots.chart)
+        before = measure.state(None if chart is None else chart.planes, photo.planes, shots, case)
+        if self._raw:
+            before["light"] = measure.light(photo.planes, shots, case)
+        unit: Unit = {
+            "before": before,
+            "true": {},
+            "pictures": {
+                "before": self._picture("before", photo.planes),
+                "scene": self._picture("scene", self._as_photo(shots.truth())),
             },
         }
+        for method in self.methods:
+            unit["true"][method], name = self._corrected(chart, photo, self.truth, method, shots, "true")
+            unit["pictures"] |= name
+        unit["control"], _ = self._corrected(chart, photo, PointField(), CONTROL, shots, None)
+        return unit
 
-    def _learning(self) -> float:
-        return self.case.photos[-1] * LEARN + len(self.case.photos) * corrections(self.case, self.plan)
-
-    def _shots(self, folder: Path) -> Shots:
-        total = (self.case.photos[-1] + 2) * SHOT
-        reported = 0.0
-
-        def on_step(done: int, count: int) -> None:
-            nonlocal reported
-            share = total * done / count
-            self.progress.tell(f"{self.case.title}: photo {done} of {count} taken", share - reported)
-            reported = share
-
-        shots = take(self.case, self.plan.files(), folder, workers=self.workers, on_step=on_step)
-        self.progress.tell(f"{self.case.title}: photos are there", total - reported, fresh=reported > 0)
-        return shots
-
-    def _truth(self, path: Path, shots: Shots) -> None:
-        weight = corrections(self.case, self.plan) + 2 * CORRECT
-        _, fresh = stored(path, lambda: self._measured_truth(shots))
-        self.progress.tell(f"{self.case.title}: with the true PSF", weight, fresh=fresh)
-
-    def _target(self, path: Path, shots: Shots) -> None:
-        weight = MEASURE + corrections(self.case, self.plan)
-        _, fresh = stored(path, lambda: self._measured_by_target(shots))
-        self.progress.tell(f"{self.case.title}: measured with a target", weight, fresh=fresh)
-
-    def _measured_by_target(self, shots: Shots) -> Unit:
+    def _measured(self, shots: Shots) -> Unit:
         """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
-        page = self.work / "target.dng"
         try:
-            photograph_target(self.case, page)
             began = time.monotonic()
-            field = measured_field(self.case, page)
+            field = measured_field(self.case, self.work / "target.dng")
         except LensModelError as error:  # frames too small for a page: the row is left out
             return {"refused": str(error), "psf": None, "methods": {}, "pictures": {}}
         return self._by_field(field, time.monotonic() - began, shots, "measured")
 
-    def _general(self, path: Path, shots: Shots) -> None:
-        weight = MEASURE + corrections(self.case, self.plan)
-        make = partial(self._by_field, general_field(self.case), 0.0, shots, "general")
-        _, fresh = stored(path, make)
-        self.progress.tell(f"{self.case.title}: with a general profile", weight, fresh=fresh)
+    def _rival(self, name: str, shots: Shots) -> Unit:
+        """What a rival makes of the first photo, corrected by our methods."""
+        began = time.monotonic()
+        try:
+            field = rivals.create(name).field([develop(shots.learn[0])])
+        except LensModelError as error:
+            unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
+            return {**unit, "methods": dict.fromkeys(self.methods, self._before)}
+        return self._by_field(field, time.monotonic() - began, shots, name)
 
     def _by_field(self, psfs: PsfField, seconds: float, shots: Shots, label: str) -> Unit:
         """Errors of a PSF field, and what corrections with it come to."""
@@ -208,25 +304,6 @@ class CaseJob:
             unit["pictures"] |= made
         return unit
 
-    def _measured_truth(self, shots: Shots) -> Unit:
-        case = self.case
-        chart = None if shots.chart is None else develop(shots.chart)
-        photo = develop(shots.held_out)
-        before = measure.state(None if chart is None else chart.planes, photo.planes, shots, case)
-        unit: Unit = {
-            "before": {**before, "light": measure.light(photo.planes, shots, case)} if self._raw else before,
-            "true": {},
-            "pictures": {
-                "before": self._picture("before", photo.planes),
-                "scene": self._picture("scene", self._as_photo(shots.truth())),
-            },
-        }
-        for method in self.methods:
-            unit["true"][method], name = self._corrected(chart, photo, self.truth, method, shots, "true")
-            unit["pictures"] |= name
-        unit["control"], _ = self._corrected(chart, photo, PointField(), CONTROL, shots, None)
-        return unit
-
     def _corrected(
         self,
         chart: LinearPhoto | None,
@@ -243,45 +320,10 @@ class CaseJob:
         before = None if chart is None else chart.planes
         return measure.state(edges, after, shots, self.case, before=before), name
 
-    def _as_photo(self, planes: Planes) -> Planes:
-        """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
-        if self._raw:
-            return planes
-        return planes * np.asarray(self.case.camera.white_balance, dtype=np.float32)[:, None, None]
-
-    def _beside(self, targets: Mapping[str, Path], shots: Shots) -> None:
-        weight = RIVAL + corrections(self.case, self.plan)
-        for name, path in targets.items():
-            _, fresh = stored(path, partial(self._measured_rival, name, shots))
-            self.progress.tell(f"{self.case.title}: rival {name}", weight, fresh=fresh)
-
-    def _measured_rival(self, name: str, shots: Shots) -> Unit:
-        """What a rival makes of the first photo, corrected by our methods."""
-        began = time.monotonic()
-        try:
-            field = rivals.create(name).field([develop(shots.learn[0])])
-        except LensModelError as error:
-            before = read(self.folder / "truth.json")["before"]
-            unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
-            return {**unit, "methods": dict.fromkeys(self.methods, before)}
-        return self._by_field(field, time.monotonic() - began, shots, name)
-
-    def _programs(self, targets: Mapping[str, Path], shots: Shots) -> None:
-        for name, path in targets.items():
-            words, fresh = f"{self.case.title}: {name}", True
-            try:
-                _, fresh = stored(path, partial(self._measured_program, name, shots))
-            except (
-                LensModelError
-            ) as error:  # of another program: the page goes without, the next run tries again
-                words = f"{words} left out: {error}"
-            self.progress.tell(words, PROGRAM, fresh=fresh)
-
-    def _measured_program(self, name: str, shots: Shots) -> Unit:
+    def _program(self, name: str, shots: Shots) -> Unit:
         """What a program of others makes of chart and photo, at its best setting."""
         peer, gains = programs.named(name), self.case.camera.white_balance
-        photo = develop(shots.held_out).planes
-        setting, after = programs.best_setting(peer, photo, shots.truth(), gains)
+        setting, after = programs.best_setting(peer, develop(shots.held_out).planes, shots.truth(), gains)
         chart = None if shots.chart is None else develop(shots.chart).planes
         edges = None if chart is None else programs.corrected_by(peer, chart, setting, gains)
         label = programs.label_of(name)
@@ -291,76 +333,72 @@ class CaseJob:
             "pictures": {label: self._picture(label, after)},
         }
 
-    def _paper(self, shots: Shots, targets: Mapping[str, Path]) -> None:
-        """Learn and correct the paper's own way from end to end, in the library."""
-        if not targets:
-            return
-        weight = self.case.photos[-1] * PAPER_LEARN + len(targets) * PAPER_CORRECT
-        if all(path.exists() for path in targets.values()):
-            self.progress.tell(f"{self.case.title}: the paper's way, stored", weight, fresh=False)
-            return
-        route = DirectRoute(self.work / "paper", workers=self.workers, way=paper_way(self.case))
-        self._learned(route, shots, targets, own_way=True)
-
-    def _learned(
-        self, route: Route, shots: Shots, targets: Mapping[str, Path], *, own_way: bool = False
-    ) -> None:
-        refused: list[str] = []
-        learn = PAPER_LEARN if own_way else LEARN
-        weight = PAPER_CORRECT if own_way else corrections(self.case, self.plan)
-        said, seen = "the paper's way, " if own_way else "", 0
-        for number, path in targets.items():
-            n, began = int(number), time.monotonic()
-            for photo in shots.learn[seen:n]:
-                if reason := route.learn(photo):
-                    refused.append(f"{photo.stem}: {reason}")
-                self.progress.tell(f"{self.case.title}: {said}learned from {photo.stem}", learn)
-            seconds = time.monotonic() - began
-            make = partial(self._measured, route, shots, n, tuple(refused), seconds, own_way)
-            _, fresh = stored(path, make)
-            self.progress.tell(f"{self.case.title}: {said}measured after {n}", weight, fresh=fresh)
-            seen = n
-
-    def _measured(
-        self, route: Route, shots: Shots, n: int, refused: Sequence[str], seconds: float, own_way: bool
-    ) -> Unit:
-        case, methods = self.case, (WAYS["paper"].method,) if own_way else self.methods
+    def _learned(self, learning: _Learning, shots: Shots, number: str, *, own_way: bool) -> Unit:
+        """What is known after so many photos, and what corrections with it come to."""
+        case, n = self.case, int(number)
+        methods = (WAYS["paper"].method,) if own_way else self.methods
         label = f"way-paper-n{n}" if own_way else f"n{n}"
+        learner, refused, seconds = learning.of(shots.learn[:n])
         unit: Unit = {
             "photos": n,
             "counted": n - len(refused),
-            "refused": list(refused),
+            "refused": refused,
             "learning_seconds": round(seconds, 1),
             "pictures": {},
         }
-        before = read(self.folder / "truth.json")["before"]
-        if n == len(refused):
-            # no model: a user gets no correction, so the photos stay as they are
-            return {**unit, "psf": None, "methods": dict.fromkeys(methods, before)}
+        if n == len(refused):  # no model: a user gets no correction, so the photos stay as they are
+            return {**unit, "psf": None, "methods": dict.fromkeys(methods, self._before)}
         unit["methods"] = {}
         chart = None if shots.chart is None else develop(shots.chart).planes
         for method in methods:
-            after = route.corrected(shots.held_out, method)
-            edges = None if shots.chart is None else route.corrected(shots.chart, method).planes
+            after = learner.corrected(shots.held_out, method)
+            edges = None if shots.chart is None else learner.corrected(shots.chart, method).planes
             state = measure.state(edges, after.planes, shots, case, before=chart)
             state["nothing_to_correct"] = after.nothing_to_correct
             if self._raw:
-                light = before["light"]
+                light = self._before["light"]
                 state["forecast"] = measure.forecast(light, after.planes, after.expected_db, shots, case)
             unit["methods"][method] = state
             unit["pictures"][f"{label}-{method}"] = self._picture(f"{label}-{method}", after.planes)
-        # not before: until a correction, or its own leisure, has fitted the model, a service answers in part
-        answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
+        answers = learner.answers(measure.places(), case.settings, measure.PSF_SIZE)
         unit["psf"] = measure.psf_errors(answers, self.truth)
         return unit
+
+    @property
+    def _before(self) -> Unit:
+        state: Unit = read(self.folder / "truth.json")["before"]
+        return state
 
     @property
     def _raw(self) -> bool:
         return self.case.conditions.container == "dng"
 
+    def _as_photo(self, planes: Planes) -> Planes:
+        """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
+        gains = np.asarray(self.case.camera.white_balance, dtype=np.float32)[:, None, None]
+        return planes if self._raw else planes * gains
+
     def _picture(self, label: str, planes: Planes) -> str:
         name = f"{self.folder.name}-{label}.png"
         gains = self.case.camera.white_balance if self._raw else (1.0, 1.0, 1.0)
-        crops = strip(images.as_shown(planes, gains), CROP_PX)
+        crops = figures.strip(as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name
+
+
+class _Learning:
+    """A learner that is opened when it is first needed, and the photos that did not count."""
+
+    def __init__(self, opened: Callable[[], Learner]) -> None:
+        self._opened = opened
+        self._learner: Learner | None = None
+        self._seconds = 0.0
+
+    def of(self, photos: Sequence[Path]) -> tuple[Learner, list[str], float]:
+        """Return what has learned from these photos, which of them did not count, and the seconds it took."""
+        self._learner = self._learner or self._opened()
+        began = time.monotonic()
+        reasons = {photo: self._learner.learn(photo) for photo in photos}
+        self._seconds += time.monotonic() - began
+        refused = [f"{photo.stem}: {reason}" for photo, reason in reasons.items() if reason]
+        return self._learner, refused, self._seconds

@@ -1,4 +1,4 @@
-"""What is measured of a route, all against a truth that it never saw."""
+"""What is measured of a lens model and its corrections, all against a truth that it never saw."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from lab.images import fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
-from lab.reproduce.fidelity import fidelity, linear_psnr
-from lab.reproduce.routes import Answer, Place
-from lab.reproduce.shots import Shots, guard_of
+from lab.reproduce.frames import Shots, guard_of
+from lab.reproduce.learners import Answer, Place
 from lensmodel import quality
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import PsfField, distance
-from lensmodel.core.types import CHANNELS, ZONES, Planes
+from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
 from lensmodel.simulate import edge_chart
 
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
@@ -82,7 +82,7 @@ def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
     return row
 
 
-def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[str, float]]:
+def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[Zone, float]]:
     """PSNR and SSIM of the held-out photo against the sharp scene; see `fidelity`.
 
     Photos of the raw path are white-balanced for it; others are already.
@@ -116,7 +116,7 @@ def forecast(
 
 def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
     """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
-    return dict(linear_psnr(photo, shots.truth(), case.camera.frame).items())
+    return dict(fidelity(photo, shots.truth(), case.camera.frame, srgb=False)["psnr"].items())
 
 
 def state(

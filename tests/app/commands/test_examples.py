@@ -36,7 +36,7 @@ from app.store.access.access_tables import KeyRow
 from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep.migrate import upgrade
-from lab.measured import scenes
+from lab import targets
 from lensmodel.cli.console.on_demand import OnDemand
 from lensmodel.cli.main import app, main
 from lensmodel.core.psf import PsfSample, gaussian
@@ -130,7 +130,7 @@ def marked(lines: Iterable[str]) -> list[Any]:
 
 def write_what_measures(folder: Path) -> None:
     """Write a photo of a printed page, and one scene at two apertures."""
-    page = 0.8 * scenes.target_scene(TargetPage(1000), (360, 510), scenes.Setup(fill=0.97))[1]
+    page = 0.8 * targets.target_scene(TargetPage(1000), (360, 510), targets.Setup(fill=0.97))[1]
     noise = 0.4 + 0.12 * np.random.default_rng(7).standard_normal((720, 960))
     noise = np.clip(ndimage.gaussian_filter(noise, 0.5), 0.05, 0.9)
     for name, light, sigma, aperture in (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,8 @@ from PIL import Image
 from scipy import ndimage, special
 
 import lensmodel
-from lab.gallery import Picture, Wishes, chosen, crops, hang, real_pictures, text, write_page
-from lab.gallery import audit as auditing
-from lab.gallery import work as working
+from lab import peers
+from lab.gallery import crops
 from lab.gallery.crops import ZOOM, places, sheet
 from lab.gallery.figures import (
     chromaticity,
@@ -29,10 +27,12 @@ from lab.gallery.figures import (
     texture_kept,
     textures,
 )
-from lab.gallery.frames import FRAMES, take
 from lab.gallery.measure import TILE, bars, measured
-from lab.gallery.rendering import aligned
-from lab.gallery.truth import best_shift, gains
+from lab.gallery.page import text, write_page
+from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, take
+from lab.gallery.rendering import aligned, rendered
+from lab.gallery.run import Wishes, hang
+from lab.images import gains
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -304,17 +304,16 @@ def test_a_ruined_block_is_found() -> None:
     assert found is not None
     assert found.worst_db < -10.0
     assert abs(found.worst_at[0] - 136) <= 28
-    assert found.worst_at[1] == 136
+    assert abs(found.worst_at[1] - 136) <= 28
     assert found.loss_share > 0.0
 
 
-def test_a_shift_is_measured_and_costs_nothing() -> None:
+def test_a_shift_costs_nothing() -> None:
     truth = leaves(160, 160)
     moved = np.stack(
         [ndimage.shift(truth[..., k], (0.4, -1.3), order=5, mode="nearest") for k in range(3)], -1
     )
 
-    assert best_shift(moved, truth) == pytest.approx((0.4, -1.3), abs=0.02)
     found = gains(blurred(truth, 0.7), moved, truth)
     assert found is not None
     assert found.worst_db > 5.0
@@ -361,7 +360,7 @@ def test_the_most_changed_places_are_those_that_were_changed() -> None:
     after = before.copy()
     after[300:340, 440:480] //= 2
 
-    found = {name: (row, col) for name, row, col in places(before, after, None)}
+    found = {name: (row, col) for name, row, col in places(before, after)}
 
     row, col = found["most changed 1"]
     assert row <= 300
@@ -448,7 +447,7 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lensmodel, "calibrate", known_lens)
-    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    monkeypatch.setattr(peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
     entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
@@ -464,41 +463,11 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     assert "| real/leaves.png | corrected |" in text(entries)
 
 
-def test_the_audits_map_and_its_worst_places_are_shown_where_there_is_an_audit(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def audit_photo(original: Any, corrected: Any, evidence: Any) -> SimpleNamespace:
-        assert evidence("a place", "a window").clip == (1.0, 1.0, 1.0)
-        keep = np.ones(corrected.shape[1:])
-        keep[96:144, 48:96] = 0.0
-        return SimpleNamespace(keep=keep)
-
-    fake = SimpleNamespace(audit_photo=audit_photo, Evidence=SimpleNamespace)
-    monkeypatch.setattr(auditing, "find_spec", lambda _: object())
-    monkeypatch.setattr(auditing, "import_module", lambda _: fake)
-    monkeypatch.setattr(lensmodel, "calibrate", known_lens)
-    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
-    output = tmp_path / "gallery"
-
-    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
-
-    worst = next(place for place in entries[0].places if place.name == "audit 1")
-    assert (worst.row, worst.col) == (120 - 48, 72 - 48)
-    assert "audit 2" not in {place.name for place in entries[0].places}
-    assert (np.asarray(Image.open(output / entries[0].audit))[100:140, 50:90] == 255).all()
-
-
-def test_without_an_audit_there_is_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auditing, "find_spec", lambda _: None)
-
-    assert auditing.audit_map(SimpleNamespace(), np.zeros((3, 8, 8), dtype=np.float32)) is None  # type: ignore[arg-type]
-
-
 def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lensmodel, "calibrate", refused)
-    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    monkeypatch.setattr(peers.Peer, "installed", property(lambda _: False))
 
     entries = list(hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore))
 
@@ -520,7 +489,7 @@ def test_what_is_stored_is_not_made_again_unless_asked(
         return refused()
 
     monkeypatch.setattr(lensmodel, "calibrate", counted)
-    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    monkeypatch.setattr(peers.Peer, "installed", property(lambda _: False))
     pictures = real_pictures(folder)
 
     for fresh in (False, False, True):
@@ -546,7 +515,7 @@ def test_an_unreadable_file_is_named_with_its_reason(tmp_path: Path) -> None:
 def test_a_simulated_frame_shows_its_truth_blurred(frame: Any, tmp_path: Path) -> None:
     photo, truth = take(frame, tmp_path, height=160, width=224)
 
-    shown = working.rendered(*_developed(photo))
+    shown = rendered(*_developed(photo))
     sharp = np.load(truth)
 
     assert shown.shape == sharp.shape == (160, 224, 3)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import signal
 
-from lab.measured import scenes
+from lab import targets
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
@@ -61,7 +61,7 @@ def photo_of(
     """One Bayer photo of a scene with its margin."""
     rng = np.random.default_rng(seed)
     blurred = signal.fftconvolve(scene, kernel, mode="same")[
-        scenes.MARGIN : -scenes.MARGIN, scenes.MARGIN : -scenes.MARGIN
+        targets.MARGIN : -targets.MARGIN, targets.MARGIN : -targets.MARGIN
     ]
     noisy = blurred + rng.standard_normal(blurred.shape) * np.sqrt(NOISE.variance(blurred))
     plane = np.clip(noisy, 0.0, 1.0).astype(np.float32)
@@ -191,7 +191,7 @@ def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> N
 
 @pytest.fixture(scope="module")
 def target_photo() -> LinearPhoto:
-    scene = 0.8 * scenes.target_scene(TargetPage(500), SHAPE, scenes.Setup(fill=0.97))[1]
+    scene = 0.8 * targets.target_scene(TargetPage(500), SHAPE, targets.Setup(fill=0.97))[1]
     return photo_of(scene, lopsided())
 
 
@@ -219,13 +219,13 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
 
 
 def test_a_photo_without_a_target_is_refused() -> None:
-    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
     with pytest.raises(NotEnoughEvidenceError, match="corner discs"):
         Target(details=(500,)).measure([photo_of(grey, lopsided())], size=21)
 
 
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
-    scene = scenes.light_scene(60, SHAPE, np.random.default_rng(3))[1]
+    scene = targets.light_scene(60, SHAPE, np.random.default_rng(3))[1]
     photo = photo_of(scene, lopsided())
     found = Points(across=2, down=2, detector="own").measure([photo], size=21, channels=("g",))
     errors = [distance(one.kernel, lopsided()).rel_l2 for one in found]
@@ -260,11 +260,11 @@ def test_an_unknown_detector_is_refused() -> None:
 
 def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     rng = np.random.default_rng(5)
-    height, width = (n + 2 * scenes.MARGIN for n in PAIR_SHAPE)
+    height, width = (n + 2 * targets.MARGIN for n in PAIR_SHAPE)
     scene = np.clip(0.4 + 0.12 * rng.standard_normal((height, width)), 0.05, 0.9)
     scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
     sharp = at_f8()
-    moved = scenes.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    moved = targets.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
     found = AperturePair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
     assert found
@@ -276,14 +276,14 @@ def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(6)
-    height, width = (n + 2 * scenes.MARGIN for n in SHAPE)
+    height, width = (n + 2 * targets.MARGIN for n in SHAPE)
     f = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
     natural = np.fft.irfft2(
         np.fft.rfft2(rng.standard_normal((height, width))) / np.maximum(f, 0.01), (height, width)
     )
     scene = np.clip(0.4 + 0.12 * natural / natural.std(), 0.05, 0.9)
     sharp = at_f8()
-    moved = scenes.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    moved = targets.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     pair = [demosaiced(photo_of(scene, lopsided())), demosaiced(photo_of(moved, sharp, 1, 8.0))]
 
     def error() -> float:
@@ -310,7 +310,7 @@ def demosaiced(photo: LinearPhoto) -> LinearPhoto:
 
 def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
     rng = np.random.default_rng(5)
-    height, width = (n + 2 * scenes.MARGIN for n in PAIR_SHAPE)
+    height, width = (n + 2 * targets.MARGIN for n in PAIR_SHAPE)
     contrast = np.clip(np.linspace(-0.06, 0.3, width), 0.0, 0.12)  # the left of the frame is quiet
     scene = np.clip(0.4 + contrast * rng.standard_normal((height, width)), 0.05, 0.9)
     scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
@@ -325,7 +325,7 @@ def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
 
 
 def test_a_pair_of_one_aperture_is_refused() -> None:
-    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
     photo = photo_of(grey, lopsided())
     with pytest.raises(InvalidInputError, match="two stops"):
         AperturePair().measure([photo, photo], size=21)
@@ -335,7 +335,7 @@ def test_a_pair_of_one_aperture_is_refused() -> None:
 
 def test_edges_anywhere_give_a_constraint_with_both_widths() -> None:
     kernel = gaussian(21, np.array([[3.0, 0.0], [0.0, 0.8]]))
-    photo = photo_of(scenes.board_scene(110.0, SHAPE, scenes.Setup(distortion=0.0))[1], kernel)
+    photo = photo_of(targets.board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1], kernel)
     found = SlantedEdges().measure([photo], size=21, channels=("g",))
     assert found
     seen = np.median([distance(one.kernel, kernel).rel_l2 for one in found])
@@ -380,6 +380,6 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
 
 
 def test_a_measurement_needs_an_aperture(target_photo: LinearPhoto) -> None:
-    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    grey = np.full((SHAPE[0] + 2 * targets.MARGIN, SHAPE[1] + 2 * targets.MARGIN), 0.4)
     with pytest.raises(Exception, match="aperture"):
         samples_of_developed("target", [photo_of(grey, lopsided(), aperture=None)], photo_id="x")

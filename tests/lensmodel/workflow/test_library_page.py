@@ -91,7 +91,6 @@ def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPa
     assert names["kernel"].shape == (55, 55)
     assert names["photo"].planes.shape == (3, CAMERA.height, CAMERA.width)
     assert {"c.tif", "my-24mm.lensprofile"} <= {path.name for path in photos.iterdir()}
-    assert names["lens"].model.warm
     assert sorted(names["lens"].profile.photos.values()) == ["a.dng", "b.dng"]
 
 

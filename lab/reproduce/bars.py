@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from lab.reproduce.families import FAMILIES
-from lab.reproduce.pages.tables import (
+from lab.reproduce.cases import FAMILIES
+from lab.reproduce.tables import (
     BEFORE,
     DENOISED,
     MEASURED,
+    MORE,
     TRUE,
     groups,
     hard_rows,
+    more_photos,
     nothing_said,
     summary,
 )
-from lab.reproduce.pages.verdicts import MORE, more_photos
 from lensmodel.core.types import ZONES
 
 PLACES: Final = ("center", "corner")
@@ -77,16 +78,7 @@ class Bar:
 
     def plain(self) -> dict[str, Any]:
         """As values for JSON."""
-        return {
-            "family": self.family,
-            "n": self.n,
-            "name": self.name,
-            "place": self.place,
-            "value": self.value,
-            "low": self.low,
-            "high": self.high,
-            "met": self.met,
-        }
+        return {**asdict(self), "met": self.met}
 
 
 def _within(value: float | None, low: float | None, high: float | None) -> bool | None:

@@ -1,27 +1,39 @@
-"""The tables of the page."""
+"""The page of a reproduction: its tables, figures and bars, and every figure as JSON."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from lab.page import Page
+from lab.reproduce import programs
+from lab.reproduce.bars import Bar, bars, held
 from lab.reproduce.cases import HARD_METHODS
 from lab.reproduce.measure import FAIR_OVERSHOOT
-from lab.reproduce.pages.bars import Bar, held
-from lab.reproduce.pages.sheet import Page
-from lab.reproduce.pages.tables import (
+from lab.reproduce.tables import (
     DENOISED,
+    GENERAL,
+    NOTHING_DB,
     PAPER_WAY,
+    TOLERATED_DB,
+    TOLERATED_L2,
     deconvolution,
+    groups,
     hard_rows,
     number,
     others,
     shown,
     states,
+    summary,
 )
-from lab.reproduce.pages.verdicts import NOTHING_DB, TOLERATED_DB, TOLERATED_L2
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import write_atomically
 from lensmodel.core.types import ZONES
 
+PICTURES = "pictures/"
 _PAPER = [
     ("without correction", "613", "383"),
     ("n = 1", "923", "545"),
@@ -33,7 +45,139 @@ _PAPER = [
 _COUNTED = ("zones", "worse", "clearly_worse", "ssim_worse", "unimproved")
 
 
-def table1(page: Page, found: Mapping[str, Any], label: str) -> None:
+def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
+    """Write `reproduction.md` and `reproduction.html`; the pictures lie in `pictures` beside them.
+
+    Parameters
+    ----------
+    result : mapping
+        What `run_reproduction` returned.
+
+    Returns
+    -------
+    tuple of Path
+    """
+    page = Page()
+    page.title("The paper's figures with this software", 1)
+    page.text(_conditions(result))
+    _which_lenses(page, result)
+    _bars_table(page, bars(result))
+    for label, group in groups(result).items():
+        found = summary(group)
+        _table1(page, found, label)
+        _psf_tables(page, found, label)
+        _photo_tables(page, found, label)
+    _hard_table(page, result)
+    _lenses(page, result)
+    _fig1(page, result["figures"].get("fig1"))
+    _fig2(page, result["figures"].get("fig2"))
+    _fig4(page, result["figures"].get("fig4"))
+    _before_after(page, result)
+    return page.write(folder / "reproduction.md", "Reproduction")
+
+
+def write_json(result: Mapping[str, Any], path: Path) -> Path:
+    """Write every figure, the summary of each group of lenses, the rows of what hurts, and the bars."""
+    found = {label: summary(group) for label, group in groups(result).items()}
+    every = bars(result)
+    whole = {
+        **result,
+        "summary": found,
+        "hard_summary": hard_rows(result),
+        "bars": [bar.plain() for bar in every],
+        "bars_held": held(every),
+    }
+    write_atomically(path, (json.dumps(whole, indent=1) + "\n").encode())
+    return path
+
+
+def _conditions(result: Mapping[str, Any]) -> str:
+    plan, cases = result["plan"], result["cases"]
+    frames = sorted({(c["settings"]["width"], c["settings"]["height"]) for c in cases})
+    sizes = ", ".join(f"{w} x {h} ({w * h / 1e6:.1f} MP)" for w, h in frames)
+    whose = "the library's own" if plan["own_scenes"] else "given from outside"
+    seen = result["developed_on"]
+    unseen = f"methods were developed on {len(seen)} of them" if seen else "nothing was developed on them"
+    scenes = f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}"
+    made = "; ".join(sorted({c["frames"] for c in cases}))
+    families = ", ".join(
+        f"{sum(c['family'] == name for c in cases)} {name}"
+        for name in dict.fromkeys(c["family"] for c in cases)
+    )
+    paper = (
+        "The paper's own way from end to end (Michaeli and Irani's kernels up to "
+        f"{plan['paper_kernel']} pixels, its regression, Richardson-Lucy deconvolution alone) stands beside "
+        "the default; it runs in the library. "
+        if plan.get("paper_kernel")
+        else ""
+    )
+    return (
+        f"Size {plan['size']}: {len(cases)} simulated lenses ({families}), each at one setting. {scenes}; "
+        f"{made}; no part of any photograph serves twice for one lens. Frames of {sizes}. The photos are "
+        "Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping and lateral "
+        f"colour. {paper}{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
+        f"Calibrated and corrected by the library, estimator {plan['estimator']}; "
+        "the true PSF and the control go through the same correction in the library. "
+        f"Code {result['code']}."
+    )
+
+
+def _rivals(sources: Mapping[str, str]) -> str:
+    if not sources:
+        return ""
+    named = "; ".join(f"{name}: {source}" for name, source in sources.items())
+    return f"Beside it, made anew by us, the blind rivals {named}. "
+
+
+def _programs(names: Sequence[str]) -> str:
+    if not names:
+        return "No program of others was installed to compare with. "
+    return (
+        f"Beside it the programs {', '.join(names)}, each at the best of its settings, chosen against the "
+        "truth. "
+    )
+
+
+def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
+    """Take tables and curves of a finished benchmark; None where there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder of the benchmark.
+    pictures : Path
+        Where its curves are copied to.
+
+    Returns
+    -------
+    dict or None
+        `rows`, one a method and noise level; `settings`; `pictures`, names of the copies.
+
+    Raises
+    ------
+    InvalidInputError
+        If the stored benchmark cannot be read.
+    """
+    path = folder / "blind.json"
+    if not path.exists():
+        return None
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        settings, rows = stored["settings"], stored["summary"]
+        kept = {name: settings[name] for name in ("noise", "half", "patch", "variant", "judge", "seed")}
+    except (OSError, ValueError, KeyError) as error:
+        raise InvalidInputError(f"{path} is no benchmark; run `lensmodel bench blind` again") from error
+    pictures.mkdir(parents=True, exist_ok=True)
+    curves = sorted(folder.glob("blind-er-*.png"))
+    for curve in curves:
+        shutil.copyfile(curve, pictures / f"fig1-{curve.name}")
+    return {"rows": rows, "settings": kept, "pictures": [f"fig1-{curve.name}" for curve in curves]}
+
+
+# --- tables ---
+
+
+def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
     """MTF50 by zone, with what makes it honest."""
     page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
     page.text(
@@ -91,7 +235,7 @@ def _edge_cells(row: Mapping[str, Any]) -> list[str]:
     return cells
 
 
-def psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
+def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     """Error of the PSF, ours and the rivals'."""
     page.title(f"Error of the PSF, {label}")
     page.text(
@@ -114,7 +258,7 @@ def psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     )
 
 
-def photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
+def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     """PSNR and SSIM of the photo never learned from."""
     page.title(f"A photo never used for calibration, {label}")
     page.text(
@@ -190,7 +334,7 @@ def _from_to(pair: Sequence[float] | None, digits: int) -> str:
     return "-" if pair is None else " to ".join(number(value, digits) for value in pair)
 
 
-def bars_table(page: Page, every: Sequence[Bar]) -> None:
+def _bars_table(page: Page, every: Sequence[Bar]) -> None:
     """Every bar, its value, and whether it holds: for each family a table, a column for each n."""
     if not every:
         return
@@ -232,7 +376,7 @@ def _verdict(bar: Bar) -> str:
     return "held" if bar.met else "MISSED"
 
 
-def hard_table(page: Page, result: Mapping[str, Any]) -> None:
+def _hard_table(page: Page, result: Mapping[str, Any]) -> None:
     """What became of scenes and paths that hurt."""
     rows = hard_rows(result)
     if not rows:
@@ -284,7 +428,7 @@ def _slashed(row: Mapping[str, float | None], digits: int) -> str:
     return " / ".join(number(row[zone], digits) for zone in ZONES)
 
 
-def which_lenses(page: Page, result: Mapping[str, Any]) -> None:
+def _which_lenses(page: Page, result: Mapping[str, Any]) -> None:
     """Name every lens, where it comes from, and whether anything was developed on it."""
     page.title("The lenses")
     page.text(
@@ -306,7 +450,7 @@ def which_lenses(page: Page, result: Mapping[str, Any]) -> None:
     page.table(["family", "lens", "source", "", "general profile"], rows)
 
 
-def lenses(page: Page, result: Mapping[str, Any]) -> None:
+def _lenses(page: Page, result: Mapping[str, Any]) -> None:
     """Every lens in every state."""
     page.title("Every lens")
     for method in result["plan"]["methods"]:
@@ -349,3 +493,142 @@ def _lens_cells(state: Mapping[str, Any], psf: Mapping[str, float] | None) -> li
 
 def _count_rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
     return [[f"default, n = {n}", *(number(row[zone], digits) for zone in ZONES)] for n, row in rows.items()]
+
+
+# --- figures ---
+
+
+def _fig1(page: Page, fig: Mapping[str, Any] | None) -> None:
+    """Error ratio of blind estimators."""
+    if not fig:
+        return
+    page.title("Fig. 1: blind estimators on single patches")
+    page.text(
+        "Share of cases whose error ratio stays below a bound, higher is better; from "
+        f"`lensmodel bench blind`, half {fig['settings']['half']}, "
+        f"patches of {fig['settings']['patch']} pixels, "
+        f"camera {fig['settings']['variant']}, judged by {fig['settings']['judge']}."
+    )
+    rows = [
+        [
+            row["method"],
+            f"{100 * row['noise']:g} %",
+            str(row["cases"]),
+            number(100 * row["improved"]),
+            number(100 * row["er_lt_3"]),
+            number(row["er_median"], 2),
+            number(row["rel_l2"], 2),
+        ]
+        for row in fig["rows"]
+    ]
+    page.table(["", "noise", "cases", "improved %", "ER < 3 %", "median ER", "PSF error"], rows)
+    for name in fig["pictures"]:
+        page.picture(PICTURES + name, "Cumulative error ratio")
+
+
+def _fig2(page: Page, fig: Mapping[str, Any] | None) -> None:
+    """Interpolation against regression."""
+    if not fig:
+        return
+    page.title("Fig. 2: interpolation against regression")
+    page.text(
+        "Ways to answer between 24 true PSFs of one lens: of a regular grid of windows, blurred by the "
+        "operator of efficient filter flow (half overlap, Bartlett-Hann windows), and regressions of one PSF "
+        "at a random place of each window. Relative L2, mean over the lenses of a family:"
+    )
+    page.table(
+        ["family", "", *ZONES],
+        [
+            [
+                f"{row['family']} ({row['lenses']})",
+                row["method"],
+                *(number(row["errors"].get(zone), 3) for zone in ZONES),
+            ]
+            for row in fig["table"]
+        ],
+    )
+    places = "; ".join(f"r = {r:g}, phi = {phi:g}" for r, phi in fig["places"])
+    page.picture(
+        fig["picture"], f"Rows: {', '.join(fig['rows'])}. Columns: {places}. {fig['lens']}, gamma 0.5"
+    )
+
+
+def _fig4(page: Page, fig: Mapping[str, Any] | None) -> None:
+    """From edges to the field."""
+    if not fig:
+        return
+    page.title("Fig. 4: from edges to the field")
+    if "failed" in fig:
+        page.text(f"The photo told nothing about the blur: {fig['failed']}.")
+        return
+    words = (
+        "Confidence map",
+        f"The {fig['patches']} patches",
+        f"Local PSFs of {fig['samples']} patches",
+        "Regressed field",
+        "The truth",
+    )
+    page.text(f"{fig['lens']}, one photo, green, calibrated in the library. Kernels with gamma 0.5.")
+    for name, label in zip(fig["pictures"], words, strict=True):
+        page.picture(PICTURES + name, label)
+
+
+def _before_after(page: Page, result: Mapping[str, Any]) -> None:
+    """Crops of the photo never learned from."""
+    page.title("Figs. 5 and 6: before and after")
+    page.text(
+        "1:1 crops of the photo never used for calibration: center, upper left, upper right, lower left, "
+        "lower right."
+    )
+    absent = sum(not case["truth"]["pictures"] for case in result["cases"])
+    if absent:
+        page.text(
+            f"Crops of {absent} of {len(result['cases'])} lenses were made by other runs and are not here."
+        )
+    for case in result["cases"]:
+        names = _pictures(case)
+        if names:
+            page.title(case["title"], 3)
+        for label, words in _labels(case, result["plan"]).items():
+            if label in names:
+                page.picture(PICTURES + names[label], words)
+    _hard(page, [case for case in result.get("hard", ()) if "before" in case["truth"]["pictures"]])
+
+
+def _hard(page: Page, cases: Sequence[Mapping[str, Any]]) -> None:
+    if cases:
+        page.title("Scenes and paths that hurt")
+    for case in cases:
+        page.title(f"{case['condition_title']}: {case['title']}", 3)
+        page.picture(PICTURES + case["truth"]["pictures"]["before"], "as photographed")
+        for name in next(iter(case["learned"].values()))["pictures"].values():
+            page.picture(PICTURES + name, "corrected blindly, learned from one photo of this kind")
+
+
+def _pictures(case: Mapping[str, Any]) -> dict[str, str]:
+    """Files of all pictures of a lens by label."""
+    units = [case["truth"], *(case[part] for part in ("general", "measured") if case.get(part))]
+    units += [
+        unit for part in ("learned", "paper", "rivals", "programs") for unit in case.get(part, {}).values()
+    ]
+    return {label: name for unit in units for label, name in unit["pictures"].items()}
+
+
+def _labels(case: Mapping[str, Any], plan: Mapping[str, Any]) -> dict[str, str]:
+    """Pictures of a lens in their order, with what they show."""
+
+    def each(label: str, words: str) -> dict[str, str]:
+        return {f"{label}-{m}": f"{words}, deconvolution {deconvolution(m)}" for m in plan["methods"]}
+
+    n = max(int(n) for n in case["learned"])
+    found = {"before": "as photographed", **each(f"n{n}", f"corrected blindly by default, n = {n}")}
+    found[f"way-paper-n{n}-paper"] = f"corrected blindly, {PAPER_WAY}, n = {n}"
+    for name, source in plan["rivals"].items():
+        found |= each(name, f"corrected with the PSFs of {source}")
+    found |= {
+        programs.label_of(name): f"corrected by {name}, its best setting {unit['setting']:g}"
+        for name, unit in case.get("programs", {}).items()
+    }
+    found |= each("general", f"corrected with a {GENERAL} (in place of a commercial one)")
+    found |= each("measured", "corrected with PSFs measured with a target (non-blind)")
+    return {**found, **each("true", "corrected with the true PSF"), "scene": "the scene itself"}

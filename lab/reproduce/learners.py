@@ -1,18 +1,15 @@
-"""Ways from photo files to a lens model and to corrected photos: what is under test."""
+"""From photo files to a lens model and to corrected photos, as a user goes: what is under test."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
 from lab.reproduce.cases import Case
-from lensmodel.core import psf
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
@@ -25,10 +22,14 @@ from lensmodel.workflow.ways import WAYS, Way
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
 
+_SMALL_FRAME: Final = 2e6
+"""Pixels below which the paper's way estimates kernels of the default's size (chosen): its 55 pixels are of
+frames of 21 megapixels, a hundredth of their width, and take several times as long."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """A PSF as the route gives it.
+    """A PSF as the lens model gives it.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPhoto:
-    """A photo as the route corrects it.
+    """A photo as the lens model corrects it.
 
     Parameters
     ----------
@@ -61,13 +62,13 @@ class CorrectedPhoto:
     nothing_to_correct: bool = False
 
 
-class Route(Protocol):
+class Learner(Protocol):
     """One lens that learns from photos, answers for its PSF, and corrects photos."""
 
     def learn(self, photo: Path) -> str:
         """Learn from one more photo; return why it did not count, or nothing.
 
-        A photo that has been learned from before changes nothing.
+        A photo that has been learned from before changes nothing; the answer is the same.
         """
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
@@ -83,11 +84,6 @@ class Route(Protocol):
         """Correct a photo that takes no part in learning, with what is known now."""
 
 
-_SMALL_FRAME: Final = 2e6
-"""Pixels below which the paper's way estimates kernels of the default's size (chosen): its 55 pixels are of
-frames of 21 megapixels, a hundredth of their width, and take several times as long."""
-
-
 def paper_way(case: Case) -> Way:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
@@ -95,45 +91,34 @@ def paper_way(case: Case) -> Way:
     return replace(WAYS["paper"], kernel_size=pipeline.DEFAULT_KERNEL_SIZE)
 
 
-OpenRoute: TypeAlias = Callable[[Case, Path], AbstractContextManager[Route]]
-"""Opens the route of a case; the folder keeps what was learned, should the run be stopped."""
-
-
-class DirectRoute:
-    """The library in this process, without the service.
+class LibraryLearner:
+    """The library in this process.
 
     Parameters
     ----------
     folder : Path
         Where models are kept between runs.
-    estimator : str or None
-        Name in the registry of blind estimators; None takes that of the way.
-    workers : int or None
-        Processes; None takes all cores.
     way : Way
         How the lens is learned.
+    workers : int
+        Processes.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        estimator: str | None = None,
-        workers: int | None = None,
-        *,
-        way: Way = WAYS["default"],
-    ) -> None:
+    def __init__(self, folder: Path, way: Way, workers: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._workers = folder, workers
-        self._way = way if estimator is None else replace(way, estimator=estimator)
-        self._seen: list[str] = []
+        self._folder, self._way, self._workers = folder, way, workers
+        self._seen: dict[str, str] = {}
         self._model: LensModel | None = None
 
     def learn(self, photo: Path) -> str:
-        """Learn from one more photo; see `Route`."""
+        """Learn from one more photo; see `Learner`."""
         name = pipeline.photo_id(photo)
         if name in self._seen:
-            return ""
-        self._seen.append(name)
+            return self._seen[name]
+        self._seen[name] = self._learned(photo, name)
+        return self._seen[name]
+
+    def _learned(self, photo: Path, name: str) -> str:
         chosen = ModelSettings(mode=self._way.mode)
         stored = self._folder / f"{name}.lensprofile"
         refused = self._folder / f"{name}.json"
@@ -158,13 +143,13 @@ class DirectRoute:
         return ""
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
-        """Return the PSFs at some places; see `Route`."""
+        """Return the PSFs at some places; see `Learner`."""
         model = self._known()
         found = [model.query(place, settings.with_channel(channel), size) for place, channel in places]
         return [Answer(answer.kernel, answer.predicted_error) for answer in found]
 
     def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
-        """Correct a photo; see `Route`."""
+        """Correct a photo; see `Learner`."""
         developed = develop(photo)
         done = pipeline.correct_photo(
             developed,
@@ -172,7 +157,7 @@ class DirectRoute:
             pipeline.settings_of(developed),
             method=method,
             lateral=pipeline.lateral_of(developed),
-            workers=self._workers or os.cpu_count() or 1,
+            workers=self._workers,
         )
         expected: dict[str, float | None] = {
             zone: report.expected_gain_db for zone, report in done.zones.items()
@@ -185,33 +170,8 @@ class DirectRoute:
         return self._model
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Remembered:
-    """A PSF field whose kernels are made once: several photos are corrected with it."""
-
-    field: PsfField
-    _known: dict[tuple[float, float, Channel, int], Kernel] = dataclass_field(default_factory=dict)
-
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the kernel of a place; see `PsfField`."""
-        key = (position.r, position.phi, channel, size)
-        if key not in self._known:
-            self._known[key] = self.field.kernel_at(position, channel, size)
-        return self._known[key]
-
-
-@dataclass(frozen=True, slots=True)
-class PointField:
-    """A lens without any blur: what is left of a correction with it is denoising and demosaicing."""
-
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return a point."""
-        del position, channel
-        return psf.delta(size)
-
-
 def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, workers: int = 1) -> Planes:
-    """Correct a photo with a PSF field taken as right, as the routes do with theirs."""
+    """Correct a photo with a PSF field taken as right, as learners do with theirs."""
     planes, cfa = developed.planes, developed.cfa
     lateral: LateralColour | None = pipeline.lateral_of(developed)
     if method == "paper" and lateral is not None:

@@ -1,4 +1,4 @@
-"""Tables from results: means over lenses, in the paper's order."""
+"""Tables from results: means over lenses in the paper's order, and what is good or bad for each lens."""
 
 from __future__ import annotations
 
@@ -7,18 +7,25 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
-from lab.reproduce.pages.verdicts import (
-    FEWER,
-    MEASURABLE,
-    MORE,
-    Result,
-    counted,
-    gain,
-    get,
-    more_photos,
-    said_nothing,
-)
 from lensmodel.core.types import CHANNELS, ZONES
+
+Result = Mapping[str, Any]
+
+TOLERATED_DB: Final = 0.05  # dB of a zone (chosen): less counts as equal
+
+MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
+"""Gains of the true PSF below these say nothing of a lens."""
+
+NOTHING_DB: Final = 0.3
+"""Where the true PSF gains less than this in every zone, there is nothing to correct (chosen: a bar)."""
+
+FEWER: Final = "2"
+MORE: Final = "5"
+"""Numbers of photos that are compared: the larger may be worse in nothing."""
+
+TOLERATED_L2: Final = 0.01
+"""Of the PSF error, by which more photos may be worse (chosen: a bar)."""
+
 
 SMALL_GAIN: Final = 0.05
 """Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
@@ -87,8 +94,8 @@ def summary(result: Result) -> dict[str, Any]:
         `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
         `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
         the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
-        that a correction expects of itself in a zone, dB; `nothing_said`, see the function; `more_photos` of
-        `verdicts.more_photos`.
+        that a correction expects of itself in a zone, dB; `nothing_said` and `more_photos`,
+        see the functions.
     """
     methods = result["plan"]["methods"]
     return {
@@ -253,7 +260,7 @@ def hard_rows(result: Result) -> list[dict[str, Any]]:
         `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
         denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
         gain in MTF50 where there was a chart; `psf`; `counts` of `counted`; `nothing` of
-        `verdicts.said_nothing`.
+        `said_nothing`.
     """
     every: dict[tuple[str, str], list[Result]] = {}
     for case in result.get("hard", ()):
@@ -304,12 +311,6 @@ def _of(unit: Result, name: str, method: str) -> Mapping[str, Any] | None:
     """Corrected with a method; what is done the paper's own way has none but its own."""
     methods: Mapping[str, Mapping[str, Any]] = unit["methods"]
     return next(iter(methods.values())) if name.startswith(PAPER_WAY) else methods.get(method)
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Write a Markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def number(value: float | None, digits: int = 0) -> str:
@@ -388,3 +389,92 @@ def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
 def _edge(state: Result, zone: str, name: str) -> float | None:
     value: float | None = get(state["edges"].get(zone, {}), name)
     return value
+
+
+def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int]:
+    """Count zones that fell, of rows `(case, zone, corrected, with the true PSF)`; see `worse`."""
+    found = dict.fromkeys(("zones", "worse", "clearly_worse", "ssim_worse", "unimproved"), 0)
+    for case, zone, after, true in rows:
+        psnr, ssim = gain(case, after, zone), gain(case, after, zone, "ssim")
+        possible = gain(case, true, zone)
+        if psnr is None or ssim is None or possible is None:
+            continue
+        found["zones"] += 1
+        found["worse"] += psnr < 0.0
+        found["clearly_worse"] += psnr < -TOLERATED_DB
+        found["ssim_worse"] += ssim < 0.0
+        found["unimproved"] += possible >= MEASURABLE["psnr"] and (psnr <= 0.0 or ssim <= 0.0)
+    return found
+
+
+def said_nothing(rows: Iterable[tuple[Result, Result, Result]]) -> dict[str, int]:
+    """Count lenses said to have nothing to correct, of rows `(case, corrected, with the true PSF)`.
+
+    Returns
+    -------
+    dict
+        `lenses` that were corrected, not those of which no photo counted; `said`; `wrongly`, of these, though
+        the true PSF gains 0.3 dB or more of PSNR in some zone; `unsaid`, not said though it gains less.
+    """
+    found = dict.fromkeys(("lenses", "said", "wrongly", "unsaid"), 0)
+    for case, corrected, true in rows:
+        said = corrected.get("nothing_to_correct")
+        gains = [g for zone in ZONES if (g := gain(case, true, zone)) is not None]
+        if said is None or not gains:
+            continue
+        nothing = max(gains) < NOTHING_DB
+        found["lenses"] += 1
+        found["said"] += bool(said)
+        found["wrongly"] += bool(said) and not nothing
+        found["unsaid"] += nothing and not said
+    return found
+
+
+def more_photos(cases: Iterable[Result], method: str) -> dict[str, Any]:
+    """Compare what five photos give of each lens with what two of them gave.
+
+    Returns
+    -------
+    dict
+        `zones` of lenses that have both; `psf_worse`, where the median PSF error of some channel is larger by
+        more than 0.01; `psnr_worse`, where PSNR of the corrected picture is lower by more than 0.05 dB;
+        `rows`, one for each of these zones: `lens`, `zone`, and with two and five photos `psf` (largest
+        difference of a channel, its error before and after) and `psnr`.
+    """
+    found: dict[str, Any] = {"zones": 0, "psf_worse": 0, "psnr_worse": 0, "rows": []}
+    for case in cases:
+        if not {FEWER, MORE} <= case["learned"].keys():
+            continue
+        fewer, more = case["learned"][FEWER], case["learned"][MORE]
+        for zone in ZONES:
+            psf = _largest_rise(fewer["psf"], more["psf"], zone)
+            psnr = [get(unit["methods"][method]["psnr"], zone) for unit in (fewer, more)]
+            if psnr[0] is None or psnr[1] is None:
+                continue
+            psf_worse = psf is not None and psf[1] - psf[0] > TOLERATED_L2
+            psnr_worse = psnr[1] - psnr[0] < -TOLERATED_DB
+            found["zones"] += 1
+            found["psf_worse"] += psf_worse
+            found["psnr_worse"] += psnr_worse
+            if psf_worse or psnr_worse:
+                found["rows"].append({"lens": case["title"], "zone": zone, "psf": psf, "psnr": psnr})
+    return found
+
+
+def _largest_rise(fewer: Result | None, more: Result | None, zone: str) -> list[float] | None:
+    """PSF error of the channel that became worse by most, before and after."""
+    if fewer is None or more is None:
+        return None
+    pairs = [[fewer["rel_l2"][c][zone], more["rel_l2"][c][zone]] for c in CHANNELS]
+    return max(pairs, key=lambda pair: pair[1] - pair[0])
+
+
+def gain(case: Result, state: Result, zone: str, of: str = "psnr") -> float | None:
+    """Gain in PSNR (dB) or SSIM over the photo as it was; None where the zone is not there."""
+    before, after = get(case["truth"]["before"][of], zone), get(state[of], zone)
+    return None if before is None or after is None else after - before
+
+
+def get(row: Mapping[str, Any] | None, name: str) -> float | None:
+    """Value of a row; None where there is no row, or none of that name."""
+    return None if row is None else row.get(name)

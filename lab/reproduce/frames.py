@@ -1,23 +1,37 @@
-"""Frames for the simulated camera, composed of sharp photographs; none serves twice for one lens."""
+"""The photos of a case: frames composed of sharp photographs, as DNG files with noise.
+
+No part of a photograph serves twice for one lens. Where a case's path is not raw, the files are what our own
+development makes of these DNG files.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from PIL import Image
 
 from lab.cases import list_photos, photo_half
+from lab.scenes import HARD_SCENES
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import atomic, save_array
 from lensmodel.core.types import Planes
-from lensmodel.simulate import load_scene
+from lensmodel.photo import develop, write_image
+from lensmodel.simulate import edge_chart, load_scene, photograph, write_photo
+
+if TYPE_CHECKING:
+    from lab.reproduce.cases import Case
 
 MARGIN: Final = 28
 """Pixels that a scene reaches beyond the frame on every side: half a kernel."""
+
+JPEG_QUALITY: Final = 92  # of 100 (chosen): that of a fine JPEG of a camera
 
 _GRIDS: Final = {1: (1, 1), 2: (1, 2), 4: (2, 2)}  # rows and columns of so many
 
@@ -183,3 +197,105 @@ def _turned_size(path: Path, pieces: int, *, upright: bool) -> tuple[int, int]:
     if pieces == 2:
         short, long = sorted((short, long // 2))
     return (long, short) if upright else (short, long)
+
+
+@dataclass(frozen=True, slots=True)
+class Shots:
+    """Files of the photos of one case.
+
+    Parameters
+    ----------
+    learn : tuple of Path
+        In the order in which the lens learns from them.
+    held_out, chart : Path
+        Never used for calibration; the chart is None where the case has none.
+    sharp : Path
+        npy, the light that a perfect lens would have put on the sensor for `held_out`.
+    """
+
+    learn: tuple[Path, ...]
+    held_out: Path
+    chart: Path | None
+    sharp: Path
+
+    @classmethod
+    def of(cls, case: Case, folder: Path) -> Shots:
+        """Name the files of a case in a folder."""
+        suffix = case.conditions.suffix
+        return cls(
+            tuple(folder / f"photo-{i:02d}{suffix}" for i in range(case.photos[-1])),
+            folder / f"held-out{suffix}",
+            folder / f"chart{suffix}" if case.conditions.with_chart else None,
+            folder / "held-out-sharp.npy",
+        )
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All photos, in the order in which they are taken."""
+        return (*self.learn, self.held_out, *(() if self.chart is None else (self.chart,)))
+
+    def truth(self) -> Planes:
+        """Load the truth behind `held_out`: camera colours, not white-balanced."""
+        planes: Planes = np.load(self.sharp, allow_pickle=False)
+        return planes
+
+
+def take(
+    case: Case,
+    files: Sequence[Path],
+    folder: Path,
+    *,
+    first: int | None = None,
+    workers: int = 1,
+) -> Shots:
+    """Take the photos of a case that are not there yet; only the `first` so many if that is given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shots = Shots.of(case, folder)
+    missing = [number for number, path in enumerate(shots.files[:first]) if not path.exists()]
+    if workers <= 1 or len(missing) == 1:
+        for number in missing:
+            _take(case, tuple(files), folder, number)
+        return shots
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for job in as_completed(
+            [pool.submit(_take, case, tuple(files), folder, number) for number in missing]
+        ):
+            job.result()
+    return shots
+
+
+def _take(case: Case, files: tuple[Path, ...], folder: Path, number: int) -> None:
+    shots, camera = Shots.of(case, folder), case.camera
+    frames = len(shots.learn) + 1  # the held-out photo is the last of them
+    if number < frames:
+        order = case.order(len(files) * case.layout.pieces)
+        scene = centred_cut(frame_scene(files, case.layout, order, number), case.height, case.width)
+    else:
+        scene = edge_chart(camera.frame, guard=guard_of(case)).scene
+    rng = np.random.default_rng([case.seed, number])
+    if number < frames and case.conditions.scene:
+        drawn = HARD_SCENES[case.conditions.scene]
+        scene = np.ascontiguousarray(drawn(scene, np.random.default_rng([case.seed, number, 1])))
+    photo = photograph(scene, case.lens, case.settings, camera, rng)
+    if number == frames - 1:
+        with atomic(shots.sharp) as file:
+            save_array(file, photo.sharp)
+    # last, and whole or not at all: a photo that is there is complete
+    path, container = shots.files[number], case.conditions.container
+    if container == "dng":
+        write_photo(path, photo)
+        return
+    raw = path.with_suffix(".raw.dng")
+    write_photo(raw, photo)
+    developed = develop(raw)
+    kind: Literal["jpeg", "tiff16"] = "jpeg" if container == "jpeg" else "tiff16"
+    write_image(
+        path, developed.planes, developed.encoding, format=kind, color_space="srgb", quality=JPEG_QUALITY
+    )
+    raw.unlink()
+
+
+def guard_of(case: Case) -> int:
+    """Pixels between an edge and the border of its tile of the chart: half a kernel if it fits."""
+    tile = min(case.height // 6, case.width // 8)
+    return min(27, (tile - 32) // 2)

@@ -1,0 +1,148 @@
+r"""What a photo gains that is corrected by a lens known only from other photos, and whether any of it loses.
+
+    LENSMODEL_TEST_DATA=... python -m lab.blind_gain --seeds 1000:1008 --photos 1 2 \
+        [--grids FILE.npz] [--electrons 2500]
+
+Each lens takes Bayer DNG files of 1.2 megapixels of different photographs of the test half (the development
+half for seeds below 1000), is learned from the first n by default settings, and a photo that was not learned
+from is corrected by default settings. Lenses are of third-order theory (`--seeds`) or ray-traced (`--grids`).
+
+Printed are the gains in PSNR of the picture as shown by zone, each block at its best shift
+(`lab.images.gains`), what the correction expected of itself (of linear light), the median error of green PSFs
+all over the field, true and expected, the share of blocks that lose more than 0.5 dB, and the worst of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.cases import list_photos, photo_half
+from lab.images import gains
+from lab.traced import GridLens
+from lensmodel import photo
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import PsfSample, distance
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.model import LensModel
+from lensmodel.quality import to_srgb
+from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, load_scene, photograph, write_photo
+from lensmodel.workflow import pipeline
+
+CAMERA: Final = SimulatedCamera(height=900, width=1350, full_well_electrons=20_000.0)
+MARGIN: Final = 64  # pixels of a scene beyond the frame (chosen)
+PLACES: Final = [FieldPosition(r, phi) for r in (0.05, 0.35, 0.6, 0.85) for phi in (0.4, 2.0, -2.4, -0.9)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownLens:
+    """A lens with known PSFs wide open, and the camera that it is on."""
+
+    name: str
+    lens: SimulatedLens | GridLens
+    number: int
+    camera: SimulatedCamera
+
+    @property
+    def settings(self) -> LensSettings:
+        """Wide open."""
+        return LensSettings(aperture=self.lens.widest())
+
+    def shot(self, number: int, path: Path) -> Planes:
+        """Take a photo as a DNG file; return the sharp light behind it."""
+        half = "test" if self.number >= 1000 else "dev"
+        folder = Path(os.environ["LENSMODEL_TEST_DATA"]) / "sharp"
+        files = [file for file in list_photos(folder) if photo_half(file.stem) == half]
+        scene = load_scene(files[(5 * self.number + 3 * number) % len(files)])
+        if scene.shape[1] > scene.shape[2]:
+            scene = np.rot90(scene, axes=(1, 2))
+        wanted = self.camera.height, self.camera.width
+        size = [min(n, w + MARGIN) // 2 * 2 for n, w in zip(scene.shape[1:], wanted, strict=True)]
+        cut = [slice((n - s) // 2, (n - s) // 2 + s) for n, s in zip(scene.shape[1:], size, strict=True)]
+        part = np.ascontiguousarray(scene[:, cut[0], cut[1]])
+        rng = np.random.default_rng([self.number, number])
+        taken = photograph(part, self.lens, self.settings, self.camera, rng)
+        write_photo(path, taken)
+        return taken.sharp
+
+    def shown(self, planes: Planes) -> NDArray[np.float64]:
+        """As a picture shows it, `(row, col, 3)`."""
+        balance = np.asarray(self.camera.white_balance, dtype=np.float32)[:, None, None]
+        return np.moveaxis(to_srgb(planes * balance), 0, -1)
+
+    def psf_errors(self, model: LensModel) -> tuple[float, float]:
+        """Median relative L2 error of green, true and expected."""
+        truth, asked = self.lens.field(self.settings), self.settings.with_channel("g")
+        answers = [model.query(place, asked, 55) for place in PLACES]
+        true = [
+            distance(answer.kernel, truth.kernel_at(place, "g", 55)).rel_l2
+            for place, answer in zip(PLACES, answers, strict=True)
+        ]
+        return float(np.median(true)), float(np.median([answer.predicted_error for answer in answers]))
+
+
+def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[str]]:
+    """Learn a lens from some photos and correct another one: a row for each number of photos."""
+    samples: list[list[PsfSample]] = []
+    for number in range(max(counts)):
+        path = folder / f"{lens.number}-{number}.dng"
+        lens.shot(number, path)
+        try:
+            samples.append(pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1))
+        except NotEnoughEvidenceError:
+            samples.append([])
+    truth = lens.shot(max(counts), folder / "last.dng")
+    developed = photo.develop(folder / "last.dng")
+    for count in counts:
+        known = [sample for own in samples[:count] for sample in own]
+        if not known:
+            yield [lens.name, str(count), "its photos show too little"]
+            continue
+        model = LensModel.fit(known)
+        lateral = pipeline.lateral_of(developed)
+        made = pipeline.correct_photo(developed, model, lens.settings, lateral=lateral)
+        found = gains(*map(lens.shown, (developed.planes, made.planes, truth)))
+        assert found is not None, "a frame of the camera holds many blocks"
+        expected = {zone: report.expected_gain_db for zone, report in made.zones.items()}
+        error, told = lens.psf_errors(model)
+        yield [
+            lens.name,
+            str(count),
+            " / ".join(f"{found.zones[zone]:+.2f}" for zone in ZONES),
+            " / ".join("?" if (db := expected.get(zone)) is None else f"{db:+.1f}" for zone in ZONES),
+            f"{error:.2f} ({told:.2f})",
+            f"{found.loss_share:.1%}",
+            f"{found.worst_db:+.2f}",
+        ]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", default="", help="first:last, the last excluded")
+    parser.add_argument("--grids", type=Path, nargs="*", default=[])
+    parser.add_argument("--photos", type=int, nargs="+", default=[1])
+    parser.add_argument("--electrons", type=float, default=CAMERA.full_well_electrons)
+    wanted = parser.parse_args()
+    camera = replace(CAMERA, full_well_electrons=wanted.electrons)
+    seeds = range(*map(int, wanted.seeds.split(":"))) if wanted.seeds else ()
+    lenses = [KnownLens(str(seed), draw_lens(seed), seed, camera) for seed in seeds]
+    lenses += [KnownLens(p.stem, GridLens.read(p), 2000 + i, camera) for i, p in enumerate(wanted.grids)]
+    print("| lens | n | gain center / mid / corner, dB | expected | PSF error (expected) | lost | worst |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as name:
+        for lens in lenses:
+            for row in rows(lens, wanted.photos, Path(name)):
+                print("| " + " | ".join(row) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

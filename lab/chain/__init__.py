@@ -1,1 +1,0 @@
-"""The whole chain: photos in, corrected photos out, against the truth."""

@@ -147,7 +147,9 @@ class _Steps:
             keep_thumbnail(self._context, self._photo, info, path, self._wanted)
         self._record(info)
         self._photo = _row(self._store, self._photo.public_id)
-        return self._identify()
+        goes_on = self._identify()
+        self._photo = _row(self._store, self._photo.public_id)  # the way of its lens decides what follows
+        return goes_on
 
     def _record(self, info: dict[str, Any]) -> None:
         metadata, lens = info["metadata"], info["metadata"]["lens"]

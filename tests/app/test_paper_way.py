@@ -36,7 +36,8 @@ def test_a_lens_goes_the_papers_way_and_back(tmp_path: Path) -> None:
         size = np.array(answer["psf"]["data"]).shape
 
         assert service.http.patch(lens, json={"model": "default"}).status_code == 200
-        service.job(counted["id"])
+        again = service.job(counted["id"])
+        assert again["state"] == "succeeded", again
         back = service.get(f"{lens}/psf", params={"r": 0.4, "aperture": 2.8, "size": 55})
         history = service.get(f"{lens}/calibrations")["items"]
 

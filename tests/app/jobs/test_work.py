@@ -651,9 +651,23 @@ def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
     for photo in (received(context, steps), received(context, steps, model="paper", lens_serial="other")):
         work.photo(photo.public_id, 1)
         assert steps.fresh(photo).state == "counted"
-        used.append((sandbox.seen["estimate"]["estimator"], sandbox.seen["estimate"]["size"]))
+        chosen, estimated = sandbox.seen["select"], sandbox.seen["estimate"]
+        used.append((chosen["estimator"], chosen["count"], estimated["estimator"], estimated["size"]))
 
-    assert used == [("default", 55), ("michaeli-irani", 55)]
+    assert [one[0] for one in used] == [one[2] for one in used] == ["default", "michaeli-irani"]
+    assert [one[3] for one in used] == [55, 55]
+
+
+def test_a_photo_that_is_learned_anew_is_chosen_from_and_estimated_in_the_new_way(
+    work: PhotoWork, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+    context.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
+
+    work.photo(photo.public_id, 2)
+
+    used = [sandbox.seen[task]["estimator"] for task in ("select", "estimate")]
+    assert used == ["michaeli-irani"] * 2
 
 
 def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(

@@ -91,7 +91,10 @@ class LensCalls(Connection):
         return self._save(f"/v1/lenses/{lens_id}/profile", Path(path))
 
     def add_profile(self, lens_id: str, path: str | Path) -> s.LensOut:
-        """Let what a `.lensprofile` knows join a lens; the same file a second time changes nothing."""
+        """Let what a `.lensprofile` knows join a lens; the same file a second time changes nothing.
+
+        Returns the lens as it is before where a worker has yet to read the file.
+        """
         headers = {"Content-Type": "application/zip"}
         address = f"/v1/lenses/{lens_id}/profile"
         return read(s.LensOut, self._http.put(address, content=Path(path).read_bytes(), headers=headers))

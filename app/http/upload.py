@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import unicodedata
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,6 +20,7 @@ from starlette.requests import ClientDisconnect
 from app.blobs.storage import AsyncBlobWriter, Storage
 from app.errors import MalformedUploadError, TooLargeError
 from app.schemas import UploadFields
+from app.store.tables import PROFILE_FILE
 from lensmodel import photo
 
 SNIFF_BYTES: Final = photo.HEAD_BYTES
@@ -61,8 +62,8 @@ def safe_name(name: str | None) -> str:
 class _Sink:
     """Stores the bytes of the photo, counts and hashes them, and determines the type by the first."""
 
-    def __init__(self, blob: AsyncBlobWriter, limit: int) -> None:
-        self._blob, self._limit = blob, limit
+    def __init__(self, blob: AsyncBlobWriter, limit: int, sniff: Callable[[bytes], str]) -> None:
+        self._blob, self._limit, self._sniff = blob, limit, sniff
         self._hash = hashlib.sha256()
         self._head = b""
         self.size = 0
@@ -75,7 +76,7 @@ class _Sink:
         if self.kind is None:
             self._head += data
             if len(self._head) >= SNIFF_BYTES:
-                self.kind = photo.sniff(self._head)
+                self.kind = self._sniff(self._head)
         self._hash.update(data)
         await self._blob.write(data)
 
@@ -83,13 +84,13 @@ class _Sink:
         """Return hash and kind once the photo is complete."""
         if self.size == 0:
             raise MalformedUploadError(f"the photo is empty: {REMEDY}")
-        return self._hash.hexdigest(), self.kind or photo.sniff(self._head)
+        return self._hash.hexdigest(), self.kind or self._sniff(self._head)
 
 
 def too_large(limit: int) -> TooLargeError:
     """Return the error for an upload that is too large."""
     return TooLargeError(
-        f"the photo is larger than {limit} bytes: send a smaller one, "
+        f"the file is larger than {limit} bytes: send a smaller one, "
         "or raise LENS_MAX_UPLOAD_MB where you run the service"
     )
 
@@ -207,7 +208,7 @@ async def receive(
         raise too_large(limit)
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     async with storage.writer(key) as blob:
-        sink = _Sink(blob, limit)
+        sink = _Sink(blob, limit, photo.sniff)
         if media_type == b"multipart/form-data":
             form = await _receive_form(request, options.get(b"boundary", b""), sink)
             name, fields = form.filename, form.fields
@@ -220,6 +221,21 @@ async def receive(
         sha256, kind = sink.finish()
         checked = UploadFields.model_validate({**query, **fields})
     return Uploaded(sha256, sink.size, kind, safe_name(name), checked)
+
+
+async def receive_profile(request: Request, storage: Storage, key: str, *, limit: int) -> tuple[str, int]:
+    """Stream a lens profile into the blob `key`; return its SHA-256 and size. A worker reads it."""
+    async with storage.writer(key) as blob:
+        sink = _Sink(blob, limit, _sniff_profile)
+        async for piece in _body(request):
+            await sink.write(piece)
+        return sink.finish()[0], sink.size
+
+
+def _sniff_profile(head: bytes) -> str:
+    if not head.startswith(b"PK"):
+        raise MalformedUploadError("this is no lens profile: send one that ends in .lensprofile")
+    return PROFILE_FILE
 
 
 def declared_length(request: Request) -> int:

@@ -176,6 +176,14 @@ class Measured(Answer):
     coverage: dict[Zone, Count] | None
 
 
+class ReadProfile(Answer):
+    """Answer of `profile`."""
+
+    mode: Annotated[str, Field(max_length=20)]
+    samples: Annotated[int, Field(ge=1, le=200_000)]
+    photos: Annotated[dict[Text, Text], Field(max_length=100_000)]
+
+
 def checked(kind: type[A], answer: Any) -> dict[str, Any]:  # noqa: ANN401 - a child's JSON
     """Return the answer of a task as JSON of this kind.
 

@@ -21,6 +21,7 @@ from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedErro
 from app.jobs.location_work import remove_location
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
+from app.jobs.profile_work import read_in
 from app.jobs.queue import Job, JobEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.jobs.thumbnail_work import keep_thumbnail
@@ -28,7 +29,7 @@ from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
 from app.store.access.owners import ANY_OWNER
 from app.store.photo_steps import stored_settings
-from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
+from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, PhotoRow
 from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
@@ -57,6 +58,9 @@ class PhotoWork:
             return
         try:
             photo = _begun(self._store, photo_id, epoch)
+            if photo.kind == PROFILE_FILE:
+                read_in(self._context, photo)
+                return
             steps = _Measured if photo.given.get("kind") else _Steps
             pipeline.take(steps(self._context, self._engine, photo))
         except NotWantedError:

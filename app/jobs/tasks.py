@@ -13,6 +13,7 @@ import logging
 import math
 import mmap
 import shutil
+import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -38,13 +39,14 @@ from app.sandbox.child import ProgressHook, Task
 from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel.core import codec
-from lensmodel.core.errors import LensModelError
+from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.estimation import estimators
 from lensmodel.estimation import measure as lens_measure
 from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.tags.location import find_location
@@ -287,6 +289,23 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
     ]
 
 
+def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    """Read the lens profile at `path`; its samples go to the folder."""
+    del progress
+    path, most = Path(arguments["path"]), arguments["max_unpacked"]
+    with contextlib.suppress(zipfile.BadZipFile, ValueError), zipfile.ZipFile(path) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > most:
+            raise ImageTooLargeError(
+                f"the profile unpacks to {unpacked >> 20} MiB, {most >> 20} MiB may be: send less"
+            )
+    with path.open("rb") as file:
+        read = read_profile(file, "This file")
+    samples = read.model.samples
+    write_samples(folder, samples)
+    return {"mode": read.model.settings.mode, "samples": len(samples), "photos": read.photos}
+
+
 TASKS: Final[Mapping[str, Task]] = {
     "location": location,
     "inspect": inspect,
@@ -298,6 +317,7 @@ TASKS: Final[Mapping[str, Task]] = {
     "measure": measure,
     "report": report,
     "measure-lens": measure_lens,
+    "profile": profile,
 }
 
 for _registry in (estimators, selectors, correction.deconvolvers):

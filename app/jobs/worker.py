@@ -356,6 +356,8 @@ class Worker:
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
             self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, PREVIEW, R_MAP, SHOWN)))
+        for photo_id in self._store.photos.read_profiles():
+            self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))
         for photo in self._store.photos.unsearched():
             self._do(partial(self._search, photo))
         expired = datetime.now(UTC) - timedelta(days=self._settings.keep_results_days)

@@ -2,38 +2,45 @@
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
 import io
 import re
-import zipfile
+import time
+from collections.abc import Mapping
 from typing import Final
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import BusyError, ConflictError, MalformedUploadError, TooLargeError, UnknownLensError
-from app.http.bodies import CLOSE, within
+from app.errors import ConflictError, MalformedUploadError, ServiceError, TooLargeError, UnknownLensError
+from app.http import upload
 from app.http.dependencies import Call, CallDep
+from app.http.views import V1
 from app.routes.common import problems
+from app.routes.jobs import LOOK_S
 from app.routes.lenses import find_lens, read_lens
+from app.routes.photos import delete_photo, receiving, recorded
 from app.schemas import LensOut
-from app.store.profile_intake import take_in
-from app.ways import configured_way
-from lensmodel.core.errors import InvalidInputError
-from lensmodel.model.answer import PAPER
-from lensmodel.model.profile import LensProfile, read_profile, write_profile
+from app.store.tables import PHOTO_FINAL, PROFILE_FILE, PhotoRow
+from lensmodel.model.profile import LensProfile, write_profile
 
 router = APIRouter(tags=["lenses"])
 
 MAX_BYTES: Final = 64 << 20
 """Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
 
-MAX_UNPACKED: Final = 256 << 20
-"""Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has."""
-
 _PAGE: Final = 200
 """Photos that are read at once (chosen): bounds the memory that a large lens takes."""
 
 _FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
+_REFUSALS: Final[Mapping[str, type[ServiceError]]] = {
+    "malformed_upload": MalformedUploadError,
+    "image_too_large": TooLargeError,
+    "memory_limit": TooLargeError,
+    "unknown_lens": UnknownLensError,
+}
+"""Responses by the code with which the reading of a profile failed; all others are conflicts."""
 
 
 @router.get(
@@ -67,70 +74,51 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
 @router.put(
     "/lenses/{lens_id}/profile",
     operation_id="addLensProfile",
-    responses=problems(400, 404, 408, 409, 413, 422),
+    responses=problems(
+        *(400, 404, 408, 409, 413, 422, 429, 507),
+        also={202: {"model": LensOut, "description": "Still being read: `Location` is its job"}},
+    ),
     openapi_extra={"requestBody": {"required": True, "content": _FILE}},
 )
 async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     """Let what a profile knows join a lens; each of its photos counts as one, without its file.
 
+    A worker reads it: the answer is the lens with it, or 202 where that takes longer than a long poll.
     The same profile a second time changes nothing. It must have been learned with the model of the lens.
     """
     await run_in_threadpool(find_lens, call, lens_id)
-    many = BusyError("too many files are being received: try again in a few seconds", headers=CLOSE)
-    with call.services.uploads.take(many):
-        async with within(call.settings.upload_seconds):
-            data = await _received(call)
-        return await run_in_threadpool(_add, lens_id, data, call)
+    async with receiving(call) as (public_id, key):
+        digest, size = await upload.receive_profile(call.request, call.storage, key, limit=MAX_BYTES)
+    file = await run_in_threadpool(_record, call, lens_id, public_id, key, digest, size)
+    end = time.monotonic() + call.settings.long_poll_seconds
+    while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
+        await asyncio.sleep(LOOK_S)
+        file = await run_in_threadpool(call.store.photos.get, file.public_id, call.owner)
+    if file is not None and file.state in {"failed", "cancelled"}:
+        await run_in_threadpool(delete_photo, file.public_id, call)
+        refusal = _REFUSALS.get(file.error_code or "", ConflictError)
+        raise refusal(file.error_detail or "the reading of the profile was cancelled: send it again")
+    if file is not None and file.state not in PHOTO_FINAL:
+        call.response.status_code = status.HTTP_202_ACCEPTED
+        call.response.headers["Location"] = f"{V1}/jobs/{file.public_id}"
+    return await run_in_threadpool(read_lens, lens_id, call)
 
 
-async def _received(call: Call) -> bytes:
-    """Return the body, if it is not too long."""
-    data, more = bytearray(), True
-    while more:
-        message = await call.request.receive()
-        if message["type"] == "http.disconnect":
-            raise MalformedUploadError("the profile ended too early: send it again")
-        data += message.get("body", b"")
-        more = message.get("more_body", False)
-        if len(data) > MAX_BYTES:
-            raise TooLargeError(f"the profile is larger than {MAX_BYTES >> 20} MiB: send a smaller one")
-    return bytes(data)
-
-
-def _check_unpacked(data: bytes) -> None:
-    """Refuse a profile that unpacks to more than a lens can need, before anything of it is unpacked."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-    except (zipfile.BadZipFile, ValueError, OSError) as error:
-        raise MalformedUploadError("this is no lens profile: send one that ends in .lensprofile") from error
-    if unpacked > MAX_UNPACKED:
-        raise TooLargeError(
-            f"the profile unpacks to {unpacked >> 20} MiB, {MAX_UNPACKED >> 20} MiB may be: send less"
-        )
-
-
-def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
-    _check_unpacked(data)
-    try:
-        profile = read_profile(io.BytesIO(data), "This file")
-    except InvalidInputError as error:
-        raise MalformedUploadError(str(error)) from error
-    lens = find_lens(call, lens_id)
-    paper_lens, paper_profile = (
-        mode == PAPER for mode in (configured_way(call.settings, lens.way).mode, profile.model.settings.mode)
-    )
-    if paper_lens != paper_profile or lens.way != lens.answering_way:
-        raise ConflictError(
-            f"the profile was learned with the model {'paper' if paper_profile else 'default'}, "
-            f"lens {lens_id} has {lens.way} and answers with {lens.answering_way}: "
-            f"PATCH /v1/lenses/{lens_id} with "
-            '{"model"}, or wait until it has changed'
-        )
-    names = {key: name for key, name in profile.photos.items() if name.isprintable()}
-    if take_in(call.store.database, lens_id, call.owner, profile.model.samples, names) is None:
-        raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
-    return read_lens(lens_id, call)
+def _record(call: Call, lens_id: str, public_id: str, key: str, digest: str, size: int) -> PhotoRow | None:
+    """Store the file of a profile like that of a photo; another lens may be sent the same."""
+    name = f"{lens_id}.lensprofile"
+    same = hashlib.sha256(f"{name}|{digest}".encode()).hexdigest()
+    return recorded(
+        call,
+        public_id,
+        key,
+        sha256=same,
+        filename=name,
+        kind=PROFILE_FILE,
+        byte_size=size,
+        calibrate=True,
+        given={"lens_id": lens_id},
+    ).photo
 
 
 def _photos(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import timedelta
 from functools import partial
@@ -32,6 +34,7 @@ from app.store import LensName
 from app.store.access.accounts import Quota
 from app.store.ids import new_id
 from app.store.photo_steps import GIVEN_SETTINGS, photo_folder
+from app.store.photos import Received
 from app.store.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
@@ -113,11 +116,12 @@ async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
     return await _received(call, lens_id)
 
 
-async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
-    """Receive an upload; with a lens, it must be a measurement of that lens."""
+@asynccontextmanager
+async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
+    """Admit an upload, whose body comes in the block; give the id of its row and the key of its blob."""
     limits = call.settings
     many = BusyError(
-        f"{limits.max_uploads} photos are being received, more may not be: try again in a few seconds",
+        f"{limits.max_uploads} files are being received, more may not be: try again in a few seconds",
         headers={"Retry-After": "5", **CLOSE},
     )
     with call.services.uploads.take(many):
@@ -125,25 +129,31 @@ async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
         prefix = f"photos/{public_id}/"
-        key = f"{prefix}original"
         span = timedelta(seconds=limits.upload_seconds)
         await run_in_threadpool(partial(call.store.photos.expect, prefix, within=span))
         async with bodies.within(limits.upload_seconds):
-            uploaded = await upload.receive(call.request, call.storage, key, limit=limits.max_upload_bytes)
+            yield public_id, f"{prefix}original"
+
+
+async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
+    """Receive a photo; with a lens, it must be a measurement of that lens."""
+    async with receiving(call) as (public_id, key):
+        limit = call.settings.max_upload_bytes
+        uploaded = await upload.receive(call.request, call.storage, key, limit=limit)
     if lens_id is not None:
         fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
         uploaded = replace(uploaded, fields=fields)
-    return await run_in_threadpool(_take, call, public_id, uploaded, prefix, lens_id is not None)
+    return await run_in_threadpool(_take, call, public_id, uploaded, key, lens_id is not None)
 
 
-def _take(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str, measured: bool) -> PhotoOut:
+def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measured: bool) -> PhotoOut:
     """Create a photo from an upload."""
     try:
         _check_kind(call, uploaded.fields, measured=measured)
         check_selector(uploaded.fields)
-        photo, fresh = _record(call, public_id, uploaded, prefix)
+        photo, fresh = _record(call, public_id, uploaded, key)
     except ServiceError:
-        call.storage.delete(prefix)  # refused before a photo was created; afterwards nothing is refused
+        call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
         raise
     call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
     call.response.headers["Location"] = photo.links.self
@@ -209,34 +219,45 @@ def most(settings: Settings, quota: Quota) -> tuple[int, int]:
     )
 
 
-def _record(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str) -> tuple[PhotoOut, bool]:
+def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> tuple[PhotoOut, bool]:
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None:
         check_model(fields, named_lens(call, fields.lens_id))
-    received = call.store.photos.receive(
-        call.owner,
-        public_id=public_id,
+    received = recorded(
+        call,
+        public_id,
+        key,
         sha256=uploaded.sha256,
         filename=uploaded.filename,
         kind=uploaded.kind,
         byte_size=uploaded.size,
-        blob_key=f"{prefix}original",
         calibrate=fields.calibrate,
         given=given,
-        may_be_new=call.who.key_id is None,
+    )
+    if received.photo.public_id != public_id and not received.fresh:
+        check_model(fields, call.store.photos.lens_of(received.photo))
+    return described_photo(call, received.photo), received.fresh
+
+
+def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  # noqa: ANN401 - of `receive`
+    """Create the row of an upload, or find that of the same bytes; return it as it is then."""
+    received = call.store.photos.receive(
+        call.owner, public_id=public_id, blob_key=key, may_be_new=call.who.key_id is None, **fields
     )
     if received.photo.public_id != public_id:
-        if not received.fresh:
-            check_model(fields, call.store.photos.lens_of(received.photo))
         if received.wants_file:  # its file was given up: this is the same one
-            key = f"{photo_folder(received.photo)}original-{public_id}"
-            call.storage.rename(f"{prefix}original", key)
-            call.store.photos.restore_file(received.photo.public_id, key, again=received.fresh)
-        call.storage.delete(prefix)  # the same bytes are stored already
+            kept = f"{photo_folder(received.photo)}original-{public_id}"
+            call.storage.rename(key, kept)
+            call.store.photos.restore_file(received.photo.public_id, kept, again=received.fresh)
+        call.storage.delete(_folder(key))  # the same bytes are stored already
     # another request may have deleted it meanwhile: then it is told as it was received
     photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo
-    return described_photo(call, photo), received.fresh
+    return replace(received, photo=photo)
+
+
+def _folder(key: str) -> str:
+    return f"{key.rpartition('/')[0]}/"
 
 
 def described_photo(call: Call, photo: PhotoRow) -> PhotoOut:

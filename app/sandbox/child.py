@@ -130,7 +130,8 @@ def _confine(folder: Path, order: dict[str, Any]) -> None:
     account = SystemAccount(*order["account"]) if order["account"] else None
     if account is not None:
         os.umask(0o007)  # the worker reads its files as a member of its group
-    confine.confine(writes, map(Path, order["reads"]), account)
+    # caches of compiled code are replaced; who decodes files has none, and may hide none of its own
+    confine.confine(writes, map(Path, order["reads"]), account, removes=bool(order["cache"]))
     _die_with_parent()  # again: the kernel clears it when credentials change
 
 

@@ -21,7 +21,7 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -71,7 +71,11 @@ class _Beneath(ctypes.Structure):
 
 
 def confine(
-    writes: Sequence[Path], reads: Iterable[Path] = (), account: SystemAccount | None = None
+    writes: Sequence[Path],
+    reads: Iterable[Path] = (),
+    account: SystemAccount | None = None,
+    *,
+    removes: bool = False,
 ) -> list[str]:
     """Give up access to all but the program itself, `reads`, and `writes`; return the measures in force.
 
@@ -85,6 +89,8 @@ def confine(
         Files and folders that may be read besides the libraries.
     account : SystemAccount, optional
         Account to change to; OSError if that is refused.
+    removes : bool
+        Whether files may be removed and replaced; else all that it ever wrote lies in `writes`.
     """
     in_force = []
     if account is not None:
@@ -92,11 +98,11 @@ def confine(
         in_force.append("account")
     if sys.platform != "linux":
         return in_force
-    tried = {
+    tried: dict[str, Callable[[], object]] = {
         "no_new_privs": lambda: _prctl(_PR_SET_NO_NEW_PRIVS, 1),
         "namespaces": _separate,
         "files": lambda: _restrict_files(writes, reads),
-        "system_calls": seccomp.refuse,
+        "system_calls": lambda: seccomp.refuse(removes=removes),
     }
     for name, measure in tried.items():
         with contextlib.suppress(OSError):

@@ -53,12 +53,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class _Watched:
-    """One running child: its process, the connections to it, its folder, its deadline, its last message."""
+    """One running child: its process, the connections to it, where it writes, its deadline, its last word."""
 
     process: ForkServerProcess
     line: Connection
     said: Connection
-    folder: Path
+    folders: tuple[Path, ...]
     deadline: float
     ended: dict[str, Any] | None = None
     text: bytes = b""
@@ -228,7 +228,8 @@ class Sandbox:
                 self._open_to_child(folder, reads)
                 process = self._start(order, far_end, far_said)
                 try:
-                    watched = _Watched(process, line, said, folder, time.monotonic() + limits.wall_s)
+                    folders = (folder, *([Path(order["cache"])] if order["cache"] else []))
+                    watched = _Watched(process, line, said, folders, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
                     status = 0 if cut else self._exit_status(process)
                 finally:
@@ -299,7 +300,7 @@ class Sandbox:
                 last_check = time.monotonic()
                 if not wanted():
                     return cancelled()
-                if _overflows(watched.folder, limits):
+                if _overflows(watched.folders, limits):
                     text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
                     return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
             if time.monotonic() > watched.deadline:
@@ -328,17 +329,19 @@ def _number(value: object) -> int:
     return min(max(value, 0), MAX_NUMBER) if isinstance(value, int) else 0
 
 
-def _overflows(folder: Path, limits: TaskLimits) -> bool:
-    """Say whether a task has written more to its folder than it may."""
+def _overflows(written: Sequence[Path], limits: TaskLimits) -> bool:
+    """Say whether a task has written more to its folders than it may, or hides what it wrote."""
     files = blocks = 0
-    for place, folders, names in os.walk(folder):
-        for name in [*folders, *names]:
-            with contextlib.suppress(OSError):  # gone meanwhile
-                blocks += Path(place, name).lstat().st_blocks
-            files += 1
-            if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
-                return True
-    return False
+    hidden: list[OSError] = []
+    for top in written:
+        for place, folders, names in os.walk(top, onerror=hidden.append):
+            for name in [*folders, *names]:
+                with contextlib.suppress(OSError):  # gone meanwhile
+                    blocks += Path(place, name).lstat().st_blocks
+                files += 1
+                if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
+                    return True
+    return any(isinstance(error, PermissionError) for error in hidden)
 
 
 def _leave_plain_files(folder: Path) -> None:

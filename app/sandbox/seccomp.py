@@ -39,10 +39,18 @@ REFUSED: Final = (
     *("init_module", "finit_module", "delete_module", "kexec_load", "kexec_file_load", "reboot"),
     *("swapon", "swapoff", "settimeofday", "clock_settime", "sethostname", "setdomainname", "acct"),
     *("fanotify_init", "shmget", "msgget", "semget", "mq_open", "personality", "syslog"),
-    *("tkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo", "pidfd_send_signal"),
+    *("tkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo", "pidfd_send_signal", "memfd_create"),
 )
 """Calls that a task does not need; all fail with "not permitted"."""
 
+REMOVING: Final = ("unlink", "unlinkat", "rename", "renameat", "renameat2", "openat2")
+"""Calls by which a file that is open loses its name, and `openat2`, whose flags no filter can read."""
+
+_UNNAMED: Final = {"open": 1, "openat": 2}
+"""Calls that open files without a name, with the position of the argument that says so."""
+
+_TMPFILE: Final = 0o20000000
+"""__O_TMPFILE of asm-generic/fcntl.h, the same on both processors."""
 
 OWN: Final = ("kill", "tgkill", "prlimit64")
 """Calls that name a process, which must be the task itself: it may abort, and lower its own limits."""
@@ -62,7 +70,7 @@ def _table(text: str) -> dict[str, int]:
 _CLONE3: Final = 435  # the same on both processors
 _COMMON: Final = _table(
     "pidfd_open=434 pidfd_getfd=438 io_uring_setup=425 io_uring_enter=426 io_uring_register=427 "
-    "open_tree=428 move_mount=429 fsopen=430 pidfd_send_signal=424"
+    "open_tree=428 move_mount=429 fsopen=430 pidfd_send_signal=424 openat2=437"
 )
 _PROCESSORS: Final = {
     "x86_64": _Processor(
@@ -78,7 +86,8 @@ _PROCESSORS: Final = {
             "finit_module=313 delete_module=176 kexec_load=246 kexec_file_load=320 reboot=169 swapon=167 "
             "swapoff=168 settimeofday=164 clock_settime=227 sethostname=170 setdomainname=171 acct=163 "
             "fanotify_init=300 shmget=29 msgget=68 semget=64 mq_open=240 personality=135 syslog=103 kill=62 "
-            "tkill=200 tgkill=234 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 prlimit64=302"
+            "tkill=200 tgkill=234 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 prlimit64=302 memfd_create=319 "
+            "unlink=87 unlinkat=263 rename=82 renameat=264 renameat2=316 open=2 openat=257"
         ),
     ),
     "aarch64": _Processor(
@@ -94,7 +103,8 @@ _PROCESSORS: Final = {
             "delete_module=106 kexec_load=104 kexec_file_load=294 reboot=142 swapon=224 swapoff=225 "
             "settimeofday=170 clock_settime=112 sethostname=161 setdomainname=162 acct=89 "
             "fanotify_init=262 shmget=194 msgget=186 semget=190 mq_open=180 personality=92 syslog=116 "
-            "kill=129 tkill=130 tgkill=131 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 prlimit64=261"
+            "kill=129 tkill=130 tgkill=131 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 prlimit64=261 "
+            "memfd_create=279 unlinkat=35 renameat=38 renameat2=276 openat=56"
         ),
     ),
 }
@@ -114,12 +124,15 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_uint16), ("first", ctypes.POINTER(_Instruction)))
 
 
-def refuse() -> None:
-    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set."""
+def refuse(*, removes: bool) -> None:
+    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set.
+
+    Without `removes` every file that a task makes keeps its name, so that whoever counts its folder sees it.
+    """
     processor = _PROCESSORS.get(platform.machine())
     if processor is None:
         raise OSError(errno.ENOSYS, f"no filter was written for {platform.machine()}")
-    steps = _steps(processor)
+    steps = _steps(processor, removes=removes)
     listed = (_Instruction * len(steps))(*(_Instruction(*step) for step in steps))
     program = _Program(len(steps), listed)
     libc = ctypes.CDLL(None, use_errno=True)
@@ -128,7 +141,7 @@ def refuse() -> None:
         raise OSError(number, os.strerror(number))
 
 
-def _steps(processor: _Processor) -> list[tuple[int, int, int, int]]:
+def _steps(processor: _Processor, *, removes: bool) -> list[tuple[int, int, int, int]]:
     """Return the filter: `(code, jump if so, jump if not, value)`."""
     no, gone = _REFUSE | errno.EPERM, _REFUSE | errno.ENOSYS
     steps = [
@@ -141,9 +154,18 @@ def _steps(processor: _Processor) -> list[tuple[int, int, int, int]]:
         (_EQUAL, 0, 1, _CLONE3),
         (_RETURN, 0, 0, gone),  # the C library then falls back to clone, whose flags can be read
     ]
-    for name in REFUSED:
+    for name in (*REFUSED, *(() if removes else REMOVING)):
         if name in processor.numbers:
             steps += [(_EQUAL, 0, 1, processor.numbers[name]), (_RETURN, 0, 0, no)]
+    for name, position in () if removes else _UNNAMED.items():
+        if name in processor.numbers:
+            steps += [
+                (_EQUAL, 0, 4, processor.numbers[name]),
+                (_LOAD, 0, 0, _FIRST_ARGUMENT + 8 * position),
+                (_ANY_OF, 0, 1, _TMPFILE),
+                (_RETURN, 0, 0, no),
+                (_RETURN, 0, 0, _ALLOW),
+            ]
     for name in OWN:
         itself = 0 if name == "prlimit64" else os.getpid()
         steps += [

@@ -13,7 +13,7 @@ from app.errors import BusyError
 from app.store.access.owners import ANY_OWNER, LATE, Owner, find_owned, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
-from app.store.kinds import identity_key, kind_key
+from app.store.kinds import identity_key
 from app.store.tables import PHOTO_RUNNING, CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
 
 TEACHES: Final = and_(
@@ -92,7 +92,6 @@ def _new_lens(
         "identity_key": key,
         "maker": maker,
         "model": model,
-        "kind_key": kind_key(maker, model),
         "serial": serial,
         "serial_source": source if serial else "none",
         "way": way or "default",

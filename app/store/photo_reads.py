@@ -11,7 +11,15 @@ from sqlalchemy import func, select
 from app.store.access.owners import Owner, find_owned, now, owned
 from app.store.database import Database
 from app.store.photo_steps import WORKED_ON
-from app.store.tables import PHOTO_FINAL, PHOTO_RUNNING, CorrectionRow, LensRow, OwnerRow, PhotoRow
+from app.store.tables import (
+    PHOTO_FINAL,
+    PHOTO_RUNNING,
+    PROFILE_FILE,
+    CorrectionRow,
+    LensRow,
+    OwnerRow,
+    PhotoRow,
+)
 
 FILE_KEPT: Final = timedelta(days=1)
 """How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen):
@@ -58,7 +66,8 @@ class PhotoReads:
         state: str | None = None,
     ) -> list[PhotoRow]:
         """Return photos, newest first, that came before the photo `before`."""
-        query = owned(PhotoRow, owner).order_by(PhotoRow.public_id.desc()).limit(limit)
+        query = owned(PhotoRow, owner).where(PhotoRow.kind != PROFILE_FILE)
+        query = query.order_by(PhotoRow.public_id.desc()).limit(limit)
         if before is not None:
             query = query.where(PhotoRow.public_id < before)
         if lens_id is not None:
@@ -139,6 +148,16 @@ class PhotoReads:
         with self._db.reading() as session:
             return list(session.scalars(query))
 
+    def read_profiles(self, limit: int = 100) -> list[str]:
+        """Return the files of samples that were read, or refused, a day ago."""
+        query = select(PhotoRow.public_id).where(
+            PhotoRow.kind == PROFILE_FILE,
+            PhotoRow.deleted_at.is_(None),
+            PhotoRow.finished_at < now() - FILE_KEPT,
+        )
+        with self._db.reading() as session:
+            return list(session.scalars(query.limit(limit)))
+
     def unsearched(self, limit: int = 100) -> list[PhotoRow]:
         """Return photos nobody works on whose file may still say where they were taken.
 
@@ -151,6 +170,7 @@ class PhotoReads:
                     PhotoRow.deleted_at.is_(None),
                     PhotoRow.file_gone_at.is_(None),
                     PhotoRow.location.is_(None),
+                    PhotoRow.kind != PROFILE_FILE,
                 ),
                 PhotoRow.state.not_in(WORKED_ON),
             )

@@ -33,6 +33,7 @@ from app.store.photo_steps import (
 from app.store.removal import forget_if_empty
 from app.store.tables import (
     PHOTO_RUNNING,
+    PROFILE_FILE,
     CorrectionRow,
     GarbageRow,
     LensRow,
@@ -122,6 +123,7 @@ class PhotoStore(PhotoReads):
                 known.state in {"failed", "cancelled"}
                 or (calibrate and not known.calibrate)
                 or (known.state == "needs_lens" and merged != known.given)
+                or (known.kind == PROFILE_FILE and known.state == "stored")
             )
             if again:
                 known.calibrate = calibrate
@@ -373,7 +375,7 @@ class PhotoStore(PhotoReads):
                 return None
             return lens_ways.join(session, photo, "photo_added")
 
-    def delete(self, photo_id: str, owner: str) -> str | None:
+    def delete(self, photo_id: str, owner: Owner) -> str | None:
         """Forget a photo, its patches and samples; return the prefix of its blobs.
 
         The row stays, emptied, because the lens's history refers to it.

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.schemas import distances
-from app.store.access.owners import find_to_change, now
+from app.store.access.owners import ANY_OWNER, LATE, find_to_change, now
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
+from app.store.photo_steps import change_state
 from app.store.sample_rows import columns_of
-from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import GarbageRow, LensRow, PatchRow, PhotoRow, SampleRow
 from app.store.versions import new_version, record_event, take_samples
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
@@ -24,20 +25,25 @@ KIND = "profile"
 
 
 def take_in(
-    database: Database, lens_id: str, owner: str, samples: Sequence[PsfSample], names: dict[str, str]
+    database: Database, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
 ) -> int | None:
-    """Let the samples of a profile join a lens; return the number of their photos, None without a lens.
+    """Let the samples of a profile join its lens; return the number of their photos.
 
-    Each photo of the profile becomes a counted photo without a file, which can be excluded or deleted as
-    any other. What was imported before is not imported again.
+    None where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of the
+    profile becomes a counted photo without a file, which can be excluded or deleted as any other. What was
+    imported before is not imported again.
     """
     groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
     for sample in samples:
         groups[sample.photo, sample.settings.with_channel("g")].append(sample)
     with database.writing(durable=True) as session:
-        lens = find_to_change(session, LensRow, lens_id, owner)
-        if lens is None:
+        lens = find_to_change(session, LensRow, file.given["lens_id"], ANY_OWNER)
+        ended = {"finished_at": now(), "file_gone_at": now()}
+        if lens is None or not change_state(
+            session, file.public_id, ("inspecting",), "stored", epoch=file.epoch, **ended
+        ):
             return None
+        insert_new(session, GarbageRow, [{"prefix": file.blob_key, "not_before": now() + LATE}])
         imported = 0
         for (photo, settings), of_photo in groups.items():
             row = _photo(session, lens, photo, settings, of_photo[0], names.get(photo, photo or "profile"))

@@ -29,10 +29,12 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from app.schemas import CorrectionState, PhotoState
 from app.store.columns import BigKey, UtcTime
-from app.store.kinds import kind_key
 
 PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
+PROFILE_FILE: Final = "lensprofile"
+"""Kind of a photo that is none: a file of samples for a lens, which a worker reads like a photo."""
+
 PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
 PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
@@ -92,7 +94,6 @@ class LensRow(Base):
             sqlite_where=text("deleted_at IS NULL"),
             postgresql_where=text("deleted_at IS NULL"),
         ),
-        Index("ix_lens_kind", "owner_id", "kind_key", "public_id"),
         Index("ix_lens_page", "owner_id", "public_id"),
     )
 
@@ -101,7 +102,6 @@ class LensRow(Base):
     owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
     maker: Mapped[str | None]
     model: Mapped[str | None]
-    kind_key: Mapped[str | None]
     serial: Mapped[str | None]
     serial_source: Mapped[str] = mapped_column(String(20))
     identity_key: Mapped[str]
@@ -122,7 +122,6 @@ class LensRow(Base):
     def complete(self, maker: str | None, model: str | None) -> None:
         """Fill in the maker and the model where they are not known yet."""
         self.maker, self.model = self.maker or maker, self.model or model
-        self.kind_key = kind_key(self.maker, self.model)
 
 
 class PhotoRow(Base):

@@ -11,7 +11,7 @@ import numpy as np
 
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError
-from lensmodel.core.files import atomic, save_array
+from lensmodel.core.files import save_array
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import LinearPhoto, PhotoMetadata
 
@@ -19,14 +19,14 @@ from lensmodel.photo import LinearPhoto, PhotoMetadata
 def save_developed(developed: LinearPhoto, folder: Path) -> None:
     """Keep a developed photo so that other processes can map it: planes.npy and photo.json.
 
-    The planes are written last: a folder that has them is complete.
+    Neither is renamed, which a confined process may not do: the folder is of no use to others before the end.
     """
     folder.mkdir(parents=True, exist_ok=True)
     fields = {
         f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
     }
     (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
-    with atomic(folder / "planes.npy") as file:
+    with (folder / "planes.npy").open("wb") as file:
         save_array(file, developed.planes)
 
 

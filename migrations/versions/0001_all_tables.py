@@ -76,7 +76,6 @@ def upgrade() -> None:
         sa.Column("owner_id", sa.Integer(), nullable=False),
         sa.Column("maker", sa.Text(), nullable=True),
         sa.Column("model", sa.Text(), nullable=True),
-        sa.Column("kind_key", sa.Text(), nullable=True),
         sa.Column("serial", sa.Text(), nullable=True),
         sa.Column("serial_source", sa.String(length=20), nullable=False),
         sa.Column("identity_key", sa.Text(), nullable=False),
@@ -94,7 +93,6 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_lens")),
         sa.UniqueConstraint("public_id", name=op.f("uq_lens_public_id")),
     )
-    op.create_index("ix_lens_kind", "lens", ["owner_id", "kind_key", "public_id"], unique=False)
     op.create_index("ix_lens_page", "lens", ["owner_id", "public_id"], unique=False)
     op.create_index(
         "uq_lens_identity",

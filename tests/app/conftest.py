@@ -5,7 +5,10 @@ from __future__ import annotations
 import itertools
 import os
 import shutil
+import tempfile
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -18,14 +21,17 @@ from starlette.testclient import TestClient
 from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
+from app.sandbox.budget import Budget
+from app.sandbox.outcome import Outcome
 from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.access.owners import ANY_OWNER
 from app.store.database import Database
 from app.store.ids import new_id
 from app.store.tables import PhotoRow
 from app.store.upkeep.migrate import downgrade, upgrade
+from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, gaussian
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
@@ -203,6 +209,52 @@ def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
 @pytest.fixture
 def steps(store: Store) -> Steps:
     return Steps(store)
+
+
+class TasksHere:
+    """A sandbox without children: runs tasks in this process."""
+
+    account = None
+    stopping = False
+
+    def __init__(self, scratch: Path) -> None:
+        self.scratch, self.budget = scratch, Budget(1, 4096)
+
+    @contextmanager
+    def folder(self) -> Iterator[Path]:
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self.scratch) as path:
+            yield Path(path)
+
+    def run(self, task: str, arguments: Any, *, folder: Path, **_: Any) -> Outcome:
+        from app.jobs.tasks import TASKS  # noqa: PLC0415 - slow to import, and few tests need it
+
+        try:
+            return Outcome("ok", value=TASKS[task](dict(arguments), folder, ignore_step))
+        except LensModelError as error:
+            return Outcome("error", code=error.code, detail=str(error))
+
+
+@pytest.fixture
+def reading(settings: Settings, store: Store) -> Iterator[None]:
+    """Read the profiles that are sent meanwhile, as a worker does."""
+    from app.jobs.context import JobContext  # noqa: PLC0415 - as above
+    from app.jobs.photo_work import PhotoWork  # noqa: PLC0415 - as above
+
+    sandbox: Any = TasksHere(settings.data_dir / "scratch")
+    work = PhotoWork(JobContext(settings, store, Storage(settings.storage, create=False), sandbox), None)  # type: ignore[arg-type]  # no cells
+    ended = threading.Event()
+
+    def read() -> None:
+        while not ended.wait(0.02):
+            for photo_id, epoch, _ in store.photos.to_do():
+                work.photo(photo_id, epoch)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    yield
+    ended.set()
+    thread.join()
 
 
 @pytest.fixture

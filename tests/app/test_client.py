@@ -171,6 +171,7 @@ def test_lenses_are_named_merged_and_set_back(api: Client, steps: Steps) -> None
     assert api.go_back(second, 1).photos == 1
 
 
+@pytest.mark.usefixtures("reading")
 def test_a_profile_is_saved_and_added(api: Client, steps: Steps, tmp_path: Path) -> None:
     one, other = (steps.lens_id(steps.counted(serial=serial)) for serial in "12")
 
@@ -179,6 +180,9 @@ def test_a_profile_is_saved_and_added(api: Client, steps: Steps, tmp_path: Path)
 
     assert added.photos == 2
     assert added.samples == 2 * api.lens(one).samples
+    imported = next(photo for photo in api.photos(lens_id=other) if photo.sha256 and not photo.width)
+    api.delete_photo(imported.id)
+    assert api.add_profile(other, path).photos == 2
 
 
 def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(

@@ -107,7 +107,7 @@ def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> I
         head("POST", "/v1/corrections", 100) + b'{"photo_id":',
         head("POST", "/v1/photos", 9004, "application/octet-stream") + TIFF[:500],
         head("POST", "/v1/photos", 9004, "multipart/form-data; boundary=b") + b"--b\r\n",
-        head("PUT", "/v1/lenses/LENS/profile", 9004, "application/octet-stream") + TIFF[:500],
+        head("PUT", "/v1/lenses/LENS/profile", 9004, "application/octet-stream") + b"PK" + TIFF[:500],
     ],
 )
 def test_a_body_that_does_not_come_in_time_is_answered_and_the_connection_closed(

@@ -11,7 +11,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
-from app.routes import lens_profiles
 from app.runtime.settings import Settings
 from app.store import LensName, Store
 from app.store.access.owners import ANY_OWNER
@@ -83,6 +82,7 @@ def test_going_back_leaves_out_what_joined_later(client: TestClient, steps: Step
     assert again.json()["state"] == "counted"
 
 
+@pytest.mark.usefixtures("reading")
 def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, store: Store) -> None:
     lens = steps.lens_id(steps.counted(patches=4))
     other = steps.named(LensName(None, None, None, label="Another"))
@@ -106,6 +106,37 @@ def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, sto
     bad = client.put(f"/v1/lenses/{other}/profile", content=b"no profile")
     assert (bad.status_code, bad.json()["code"]) == (400, "malformed_upload")
     assert client.put("/v1/lenses/gone/profile", content=sent.content).status_code == 404
+    listed = client.get("/v1/photos").json()["items"]
+    assert {entry["kind"] for entry in listed} == {None}  # photos, and no files of profiles
+
+
+def test_a_profile_is_not_read_beside_the_keys_of_the_database(
+    client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = steps.lens_id(steps.counted(patches=4))
+    sent = client.get(f"/v1/lenses/{lens}/profile").content
+    other = steps.named(LensName(None, None, None, label="Another"))
+    read: list[object] = []
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: read.append("read"))
+
+    answer = client.put(f"/v1/lenses/{other}/profile", content=sent)
+
+    assert (answer.status_code, answer.json()["photos"], read) == (202, 0, [])
+    job = client.get(answer.headers["location"]).json()
+    assert (job["state"], job["id"]) == ("queued", store.photos.to_do()[-1][0])
+    assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202
+
+
+@pytest.mark.usefixtures("reading")
+def test_a_profile_of_another_model_is_refused(client: TestClient, steps: Steps) -> None:
+    lens = steps.lens_id(steps.counted(patches=4))
+    sent = client.get(f"/v1/lenses/{lens}/profile").content
+    paper = steps.receive(model="paper")
+    steps.inspect(paper, serial="7")
+
+    answer = client.put(f"/v1/lenses/{steps.lens_id(paper)}/profile", content=sent)
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
 
 
 @pytest.fixture
@@ -176,15 +207,17 @@ def test_photos_that_cannot_all_change_stay_as_they_are(client: TestClient, stor
     assert steps.lens_id(before) == steps.lens_id(gone) != lens
 
 
+@pytest.mark.usefixtures("reading")
 def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
     client: TestClient, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lens = steps.lens_id(steps.counted())
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("profile.json", bytes(lens_profiles.MAX_UNPACKED + 1))
+        archive.writestr("profile.json", bytes(1 << 20))
+    monkeypatch.setattr("app.jobs.profile_work.MAX_UNPACKED", (1 << 20) - 1)
     read: list[str] = []
-    monkeypatch.setattr(lens_profiles, "read_profile", lambda *_: read.append("read"))
+    monkeypatch.setattr("app.jobs.tasks.read_profile", lambda *_: read.append("read"))
 
     answer = client.put(f"/v1/lenses/{lens}/profile", content=bomb.getvalue())
 

@@ -14,7 +14,11 @@ __all__ = ["TASKS"]
 
 
 def _only_account(
-    writes: Sequence[Path], reads: Iterable[Path] = (), account: SystemAccount | None = None
+    writes: Sequence[Path],
+    reads: Iterable[Path] = (),
+    account: SystemAccount | None = None,
+    *,
+    removes: bool = False,
 ) -> list[str]:
     assert account is not None
     account.become()

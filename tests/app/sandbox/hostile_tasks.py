@@ -196,8 +196,54 @@ def abort(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
 
 def litter(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     for number in range(arguments["files"]):
-        (folder / str(number)).write_bytes(bytes(arguments["bytes"]))
+        Path(arguments.get("into", folder), str(number)).write_bytes(bytes(arguments["bytes"]))
     time.sleep(60)
+
+
+def hoard(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[str]:
+    """Fill the disk by files that no folder names; say how far each way came."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    held = []
+
+    def without(remove: Callable[[Path], object]) -> Callable[[], None]:
+        def fill() -> None:
+            path = folder / "hoarded"
+            with path.open("wb") as file:
+                remove(path)
+                path.with_suffix(".seen").touch()
+                file.write(bytes(arguments["bytes"]))
+                file.flush()
+                held.append(os.dup(file.fileno()))
+
+        return fill
+
+    def replaced(path: Path) -> None:
+        (folder / "other").touch()
+        (folder / "other").rename(path)
+
+    def unnamed() -> None:
+        held.append(os.open(folder, os.O_TMPFILE | os.O_RDWR))
+        os.write(held[-1], bytes(arguments["bytes"]))
+
+    def in_memory() -> None:
+        held.append(libc.memfd_create(b"", 0))
+        if held[-1] < 0:
+            raise OSError(ctypes.get_errno(), "memfd_create")
+
+    ways = {
+        "removed": without(Path.unlink),
+        "replaced": without(replaced),
+        "unnamed": unnamed,
+        "in memory": in_memory,
+    }
+    done = []
+    for name, way in ways.items():
+        try:
+            way()
+            done.append(name)
+        except OSError:
+            continue
+    return done
 
 
 def forge(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
@@ -251,6 +297,7 @@ TASKS = {
         sabotage,
         abort,
         litter,
+        hoard,
         forge,
         compile_one,
     )

@@ -530,6 +530,25 @@ def test_a_task_that_fills_its_folder_is_killed(run: Run, files: int, size: int)
     assert "2 MiB or 40 files" in outcome.detail
 
 
+def test_no_file_of_a_task_that_decodes_escapes_the_count_of_its_folder(run: Run) -> None:
+    in_force("system_calls")
+
+    assert run("hoard", arguments={"bytes": 1 << 20}).value == []
+
+
+def test_a_task_that_compiles_may_replace_files_in_its_cache(run: Run) -> None:
+    assert "replaced" in run("hoard", arguments={"bytes": 1}, compiles="1").value
+
+
+def test_a_cache_counts_with_the_folder_of_the_task_that_fills_it(run: Run, tmp_path: Path) -> None:
+    limits = TaskLimits(memory_mb=512, wall_s=stretched(30), scratch_mb=2, files=40)
+    arguments = {"files": 3, "bytes": 1 << 20, "into": str(tmp_path / "shared" / "1")}
+
+    outcome = run("litter", arguments=arguments, limits=limits, compiles="1")
+
+    assert (outcome.ending, outcome.code) == ("error", "memory_limit")
+
+
 def test_what_a_task_prints_is_logged_and_looks_like_no_record_of_ours(
     run: Run,
     caplog: pytest.LogCaptureFixture,

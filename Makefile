@@ -34,8 +34,8 @@ demo: install ## photos in, lens calibrated, corrected photo out: see demo-outpu
 test: install ## the tests that need nothing but this repository: minutes
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow and not tools"
 
-test-slow: install ## the slow ones of those
-	@$(BIN)/python -m pytest -q -n 2 -m "slow and not tools"
+test-slow: install ## the slow ones of those: ten minutes
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "slow and not tools"
 
 test-tools: install ## those with servers, a browser, programs and data beyond the repository
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m tools

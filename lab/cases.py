@@ -1,9 +1,8 @@
-"""The benchmark's cases: which photo, which PSF, which window, what the camera makes of it."""
+"""The benchmark's cases: which photo, which PSF, which window, and its noise."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,33 +12,25 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import signal
 
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
 from lensmodel.estimation.patches import Patch, select
-from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE, measure_blocks
-from lensmodel.estimation.patches.select import edge_score, first_reasons
-from lensmodel.estimation.patches.windows import windows_of
-from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene, srgb_to_linear
+from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 
 Half: TypeAlias = Literal["dev", "test", "all"]
-Variant: TypeAlias = Literal["gaussian", "bayer", "jpeg"]
-Choice: TypeAlias = Literal["random", "r-map", "good-regions"]
+Choice: TypeAlias = Literal["r-map", "good-regions"]
 HALVES: Final = ("dev", "test", "all")
-VARIANTS: Final = ("gaussian", "bayer", "jpeg")
-CHOICES: Final = ("random", "r-map", "good-regions")
+CHOICES: Final = ("r-map", "good-regions")
 
 DATA: Final = Path(__file__).parent / "data"
 WHITE: Final = 0.9
 """Level of a scene's 99.5 percentile."""
 
-JPEG_QUALITY: Final = 90  # of the camera (chosen)
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
-_CHOICE_SIGMA = 0.01  # noise by which windows are ranked: that of most cases (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,58 +39,41 @@ class BlindCase:
 
     Parameters
     ----------
-    photos : tuple of Path
-        One window comes from each; the first is the one that is deblurred, the others are pooled.
+    photo : Path
     psf_number : int
         Row of the PSF file.
     noise : float
         Standard deviation as a share of full range.
     patch : int
         Side of a window in pixels.
-    variant : {"gaussian", "bayer", "jpeg"}
-        What the camera does: nothing but noise; a Bayer mosaic, interpolated; sRGB and JPEG.
     seed : int
-        For the choice of windows and the noise.
-    choice : {"random", "r-map", "good-regions"}
-        Who chooses the windows: chance, from the better half of them by the sharp scene; or a selector of
-        `lensmodel.estimation.patches`, which sees the blurred and noisy photograph only.
+        For the noise.
+    choice : {"r-map", "good-regions"}
+        Selector of `lensmodel.estimation.patches`, which sees the blurred and noisy photograph only.
     window : int
-        Which window of each photograph: 0 is the best one that a selector finds, 1 the next beside it.
+        Which window of the photograph: 0 is the best one that the selector finds, 1 the next beside it.
     """
 
-    photos: tuple[Path, ...]
+    photo: Path
     psf_number: int
     noise: float
     patch: int
-    variant: Variant
     seed: int
-    choice: Choice = "random"
+    choice: Choice = "r-map"
     window: int = 0
 
     @property
     def name(self) -> str:
         """Short name of photo, window and PSF."""
         which = f"+{self.window}" if self.window else ""
-        return f"{self.photos[0].stem}{which}/psf{self.psf_number:02d}"
+        return f"{self.photo.stem}{which}/psf{self.psf_number:02d}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What an estimator is shown, and what the judge knows.
+    """What an estimator is shown, and what the judge knows: a blurred, noisy window and its truth."""
 
-    Parameters
-    ----------
-    patches : tuple of Plane
-        Blurred and noisy windows, each `(P, P)`.
-    noise : NoiseModel
-        Of every patch.
-    sharp : Plane, shape (P, P)
-        The truth behind the first patch.
-    kernel : Kernel
-        The true PSF.
-    """
-
-    patches: tuple[Plane, ...]
+    patch: Plane
     noise: NoiseModel
     sharp: Plane
     kernel: Kernel
@@ -173,17 +147,14 @@ def make_cases(
     half: Half,
     noise: float,
     patch: int,
-    variant: Variant,
-    pool: int,
     seed: int,
     limit: int | None,
-    choice: Choice = "random",
+    choice: Choice = "r-map",
     scenes: int | None = None,
 ) -> tuple[BlindCase, ...]:
     """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
 
-    A scene is a window of a photo: one of each, or `scenes` of all in turn. With `pool` > 1 the further
-    windows come from the other photos of the half, in turn: photos by the same lens, of other scenes.
+    A scene is a window of a photo: one of each, or `scenes` of all in turn.
 
     Raises
     ------
@@ -202,11 +173,7 @@ def make_cases(
     order = np.random.default_rng(seed).permutation(len(pairs))
     chosen = order if limit is None else _spread(pairs, order, limit)
     return tuple(
-        BlindCase(
-            tuple(own[(i + k) % len(own)] for k in range(pool)),
-            *(n, noise, patch, variant, seed, choice),
-            window=i // len(own),
-        )
+        BlindCase(own[i % len(own)], n, noise, patch, seed, choice, window=i // len(own))
         for i, n in (pairs[int(at)] for at in np.sort(chosen))
     )
 
@@ -235,78 +202,30 @@ def scene_of(photo: Path) -> Planes:
     return scene
 
 
-@lru_cache(maxsize=64)
-def good_corners(photo: Path, patch: int, margin: int) -> tuple[tuple[int, int], ...]:
-    """Corners of the windows with the better half of the edge scores, best first.
-
-    The choice looks at the sharp scene only, so that it cannot favour a method.
-    """
-    green = scene_of(photo)[1]
-    noise = NoiseModel.white(_CHOICE_SIGMA)
-    inner = np.ascontiguousarray(green[margin:-margin, margin:-margin])
-    if min(inner.shape) < patch:
-        raise InvalidInputError(f"{photo.name} is too small for a patch of {patch} px and a PSF around it")
-    blocks = measure_blocks(inner, noise, patch // BLOCKS_A_SIDE, 1.0, ignore_step)
-    windows = windows_of(blocks, Frame(*inner.shape), noise)
-    score = edge_score(windows)
-    fine = first_reasons(windows, np.zeros(len(windows))) == ""
-    order = [int(i) for i in np.lexsort((windows.cols, windows.rows, -score)) if fine[i] or not fine.any()]
-    return tuple(
-        (int(windows.rows[i]) + margin, int(windows.cols[i]) + margin) for i in order[: -(-len(order) // 2)]
-    )
-
-
 def observe(case: BlindCase, kernel: Kernel) -> Observation:
-    """Make what the camera sees: blur by valid convolution, then noise, then the variant's camera."""
-    patches = []
-    sharp: Plane | None = None
-    for turn, photo in enumerate(case.photos):
-        again = [case.window] if case.window else []
-        rng = np.random.default_rng([case.seed, case.psf_number, turn, _number(photo.stem), *again])
-        scene, patch = (_drawn if case.choice == "random" else _chosen)(photo, kernel, case, rng)
-        if turn == 0:
-            sharp = np.ascontiguousarray(scene)
-        patches.append(patch)
-    assert sharp is not None
-    return Observation(tuple(patches), NoiseModel.white(case.noise), sharp, kernel)
-
-
-def _drawn(photo: Path, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> tuple[Plane, Plane]:
-    """Sharp and photographed window, drawn by chance."""
-    size, margin = case.patch, kernel.shape[0] // 2
-    corners = good_corners(photo, size, margin)
-    row, col = corners[int(rng.integers(len(corners)))]
-    scene = scene_of(photo)[:, row - margin : row + size + margin, col - margin : col + size + margin]
-    return scene[1, margin : margin + size, margin : margin + size], _photographed(scene, kernel, case, rng)
-
-
-def _chosen(photo: Path, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> tuple[Plane, Plane]:
-    """Sharp and photographed window, the best that a selector finds in the whole blurred photograph.
+    """Blur the photograph by valid convolution, add noise, and take the best window that a selector finds.
 
     The next ones are the best that overlap none before them; where all others do, the best of those.
     Selectors take smaller windows where the frame has not four of them on its shorter side. Where nothing is
     usable the middle of the frame is taken, lest a method profits from the refusal.
     """
     size, margin = case.patch, kernel.shape[0] // 2
-    scene = scene_of(photo)
-    plane = _photographed(scene, kernel, case, rng)
-    height, width = plane.shape
+    again = [case.window] if case.window else []
+    rng = np.random.default_rng([case.seed, case.psf_number, 0, _number(case.photo.stem), *again])
+    green = scene_of(case.photo)[1]
+    blurred = signal.fftconvolve(green.astype(np.float64), kernel, mode="valid")
+    plane = (blurred + rng.normal(0.0, case.noise, blurred.shape)).astype(np.float32)
+    noise, (height, width) = NoiseModel.white(case.noise), plane.shape
     try:
-        found = select(
-            plane,
-            NoiseModel.white(case.noise),
-            Frame(height, width),
-            size=size,
-            selector=case.choice,
-            jpeg=case.variant == "jpeg",
-        )
+        found = select(plane, noise, Frame(height, width), size=size, selector=case.choice)
     except NoUsablePatchesError:
         row, col = (height - size) // 2, (width - size) // 2
     else:
         best = _apart(sorted(found.patches, key=lambda patch: -patch.score), case.window)
         row, col, size = best.row, best.col, best.size
-    sharp = scene[1, margin + row : margin + row + size, margin + col : margin + col + size]
-    return sharp, np.ascontiguousarray(plane[row : row + size, col : col + size])
+    sharp = green[margin + row : margin + row + size, margin + col : margin + col + size]
+    patch = np.ascontiguousarray(plane[row : row + size, col : col + size])
+    return Observation(patch, noise, np.ascontiguousarray(sharp), kernel)
 
 
 def _apart(patches: Sequence[Patch], number: int) -> Patch:
@@ -318,43 +237,6 @@ def _apart(patches: Sequence[Patch], number: int) -> Patch:
             apart.append(patch)
     rest = [patch for patch in patches if patch not in apart]
     return [*apart, *rest][number % len(patches)]
-
-
-def _photographed(scene: Planes, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> Plane:
-    def blurred(plane: Plane) -> NDArray[np.float64]:
-        sharp = plane.astype(np.float64)
-        return np.asarray(signal.fftconvolve(sharp, kernel, mode="valid"))
-
-    if case.variant == "gaussian":
-        green = blurred(scene[1])
-        return (green + rng.normal(0.0, case.noise, green.shape)).astype(np.float32)
-    light = np.stack([blurred(plane) for plane in scene])
-    light = np.clip(light + rng.normal(0.0, case.noise, light.shape), 0.0, 1.0)
-    if case.variant == "bayer":
-        return _interpolated_green(light[1])
-    return _through_jpeg(light)
-
-
-def _interpolated_green(green: NDArray[np.float64]) -> Plane:
-    """Keep green on the checkerboard of a Bayer mosaic and interpolate the rest bilinearly.
-
-    The plainest demosaicing: what its low-pass does to the PSF is part of the question.
-    """
-    rows, cols = np.indices(green.shape)
-    site = (rows + cols) % 2 == 1
-    padded = np.pad(green, 1, mode="reflect")
-    mean = (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) / 4.0
-    return np.where(site, green, mean).astype(np.float32)
-
-
-def _through_jpeg(light: NDArray[np.float64]) -> Plane:
-    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    pixels = np.rint(np.clip(coded, 0.0, 1.0) * 255.0).astype(np.uint8).transpose(1, 2, 0)
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-    with Image.open(buffer) as image:
-        decoded = np.asarray(image.convert("RGB"))[..., 1]
-    return srgb_to_linear(decoded.astype(np.float32) / np.float32(255.0))
 
 
 def _number(text: str) -> int:

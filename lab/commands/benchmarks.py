@@ -24,7 +24,7 @@ from lensmodel.core.files import write_atomically
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lab.blind.results import BlindBenchmark, BlindReport
+    from lab.blind.benchmark import BlindBenchmark, BlindReport
 
 NOISE: Final = "0.01,0.003"
 ESTIMATORS: Final = "default,michaeli-irani"
@@ -75,8 +75,7 @@ def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     context.obj = shown
     if context.invoked_subcommand is None:
-        from lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
-        from lab.blind.tables import markdown_table  # noqa: PLC0415 - same
+        from lab.blind.benchmark import BlindBenchmark, markdown_table  # noqa: PLC0415 - see the top
         from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - same
         from lab.model.model_benchmark import table  # noqa: PLC0415 - same
 
@@ -93,7 +92,7 @@ def blind(
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
     methods: Annotated[
-        str, typer.Option(help="Estimators, comma separated; also cho-lee, edges, sun, xu-jia and zhang.")
+        str, typer.Option(help="Estimators, comma separated; also cho-lee, sun, xu-jia and zhang.")
     ] = ESTIMATORS,
     patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
@@ -101,13 +100,9 @@ def blind(
         int | None,
         typer.Option(min=1, help="So many windows of the photographs in turn. Default: one of each."),
     ] = None,
-    pool: Annotated[int, typer.Option(help="Patches that share one kernel.")] = 1,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
-    variant: Annotated[str, typer.Option(help="gaussian, bayer or jpeg.")] = "gaussian",
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
-    selection: Annotated[
-        str, typer.Option(help="Who chooses the patches: random, r-map or good-regions.")
-    ] = "r-map",
+    selection: Annotated[str, typer.Option(help="Who chooses the patches: r-map or good-regions.")] = "r-map",
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
@@ -133,8 +128,11 @@ def blind(
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    from lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
-    from lab.blind.tables import markdown_table, write_report  # noqa: PLC0415 - same
+    from lab.blind.benchmark import (  # noqa: PLC0415 - same
+        BlindBenchmark,
+        markdown_table,
+        write_report,
+    )
 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
@@ -147,8 +145,6 @@ def blind(
             half=half,  # type: ignore[arg-type]  # checked by the benchmark
             cases=cases,
             patch=patch,
-            pool=pool,
-            variant=variant,  # type: ignore[arg-type]  # checked by the benchmark
             judge=judge,
             seed=seed,
             selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
@@ -161,7 +157,7 @@ def blind(
 
 
 def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
-    from lab.blind.blind_benchmark import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
+    from lab.blind.benchmark import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
 
     with as_usage(), shown.progress() as bars:
         task = bars.add_task("cases", total=None)
@@ -183,10 +179,6 @@ def model(
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
     psf_field: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs.")
-    ] = None,
-    photographs: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Sharp photographs: estimate patches of those blindly."),
     ] = None,
     json_output: JsonFile = None,
     force: Force = False,
@@ -220,7 +212,6 @@ def model(
         photos=counts,
         methods=None if methods is None else _names(methods),
         psf_field=psf_field,
-        photographs=photographs,
     )
     _tell(shown, json_output, result, table(result))
 
@@ -232,7 +223,6 @@ def _model(
     photos: Sequence[int],
     methods: Sequence[str] | None = None,
     psf_field: Path | None = None,
-    photographs: Path | None = None,
 ) -> dict[str, Any]:
     from lab.model.model_benchmark import run_model_benchmark  # noqa: PLC0415 - see the top of the module
 
@@ -243,7 +233,6 @@ def _model(
             photos=photos,
             methods=methods,
             psf_field=psf_field,
-            photographs=photographs,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
 

@@ -1,11 +1,9 @@
 """How well regressions predict the PSF where no sample was: simulated lenses, or measured fields.
 
-Three kinds of input:
+Two kinds of input:
 
 * lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
   n photos and asked at places in between and beyond;
-* the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
-  ways to answer can be compared;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
   aperture and group): groups are held out in turn.
 
@@ -15,10 +13,7 @@ what efficient filter flow does, and a polynomial of the place for each pixel, a
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,25 +23,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.ndimage import gaussian_filter
-from scipy.signal import fftconvolve
 
-from lab.cases import list_photos, photo_half
-from lab.model.estimated import estimated_samples
+from lab import page
 from lab.model.exact import PaperModel
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfSample, as_kernel, centred, distance, gaussian
+from lensmodel.core.psf import PsfSample, as_kernel, centred, distance
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
 from lensmodel.model import LensModel, ModelSettings, smoothers
-from lensmodel.model.answer import MODES
 from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)
 PATCHES = (4, 6)  # rows and columns: 24 patches, as a calibration has in one photo
 SIZE = 31  # pixels: that of an estimate
 MARGIN_PX = 96  # half a window of a calibration: patches lie within the frame
-_SOFT_PX, _GRAIN = 1.1, 0.4  # at level 1: by them `level` is about the relative L2, see below
 
 Predictor = Callable[[FieldPosition], Kernel]
 Fit = Callable[[Sequence[PsfSample]], Predictor]
@@ -64,22 +54,6 @@ def patch_places(rng: np.random.Generator) -> list[FieldPosition]:
             col = min(max(col, MARGIN_PX), FRAME.width - 1 - MARGIN_PX)
             found.append(FRAME.position(float(row), float(col)))
     return found
-
-
-def like_estimated(kernel: Kernel, rng: np.random.Generator, level: float) -> Kernel:
-    """Spoil a kernel as blind estimation does: what the scene was soft by, and noise.
-
-    The softness is a Gaussian of random axes, different in every patch. The noise is smooth over two
-    pixels and grows with the root of the light. At `level` 0.35 the relative L2 is about 0.35 in the
-    mean of the lenses of `draw_lens`.
-    """
-    side = kernel.shape[0]
-    axes = np.linalg.qr(rng.normal(size=(2, 2)))[0] * (level * _SOFT_PX * rng.gamma(2.0, 0.5, 2))
-    soft = fftconvolve(kernel, gaussian(side, axes @ axes.T + 1e-3 * np.eye(2)), mode="same")
-    soft = np.maximum(soft, 0.0)
-    grain = gaussian_filter(rng.normal(size=kernel.shape), 0.7)
-    noisy = soft + level * _GRAIN * grain / grain.std() * np.sqrt(soft * soft.max())
-    return centred(np.maximum(noisy, 0.0))
 
 
 def asked_places() -> list[FieldPosition]:
@@ -116,8 +90,6 @@ def run_model_benchmark(
     photos: Sequence[int] = (1, 5),
     methods: Sequence[str] | None = None,
     psf_field: Path | None = None,
-    spoiled: float = 0.0,
-    photographs: Path | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
     """Compare methods of regression by the error of their predictions.
@@ -129,16 +101,9 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, "eff-linear", "polynomial", "paper", or the modes "mode-default" and
-        "mode-paper"; by default all, but modes only of `photographs`.
+        Names in `smoothers`, "eff-linear", "polynomial" or "paper"; by default all.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
-    spoiled : float
-        Relative L2 of the kernels that models are fed with, see `like_estimated`; they are asked for
-        the true ones in any case.
-    photographs : Path, optional
-        Folder of sharp photographs; models are fed with blind estimates of patches of them, those of the
-        test half, in an order drawn for each lens.
     on_step : StepHook
         Told after each fit of a method with its questions.
 
@@ -147,7 +112,7 @@ def run_model_benchmark(
     dict
         `rows` of method, photos, errors by zone, seconds; and what was asked.
     """
-    fits = _fits(methods, modes=photographs is not None)
+    fits = _fits(methods)
     if psf_field is not None:
         samples = load_field(psf_field)
         rows: list[MethodErrors] = []
@@ -163,18 +128,11 @@ def run_model_benchmark(
     for seed in seeds:
         lens = draw_lens(seed)
         rng = np.random.default_rng(seed)
-        samples = (
-            [
-                PsfSample(lens.kernel(place, None, SIZE), place, photo=f"photo{i}")
-                for i in range(max(photos))
-                for place in patch_places(rng)
-            ]
-            if photographs is None
-            else estimated_samples(lens, _drawn(photographs, seed, max(photos)), seed)
-        )
-        if spoiled > 0:
-            spoil = np.random.default_rng([seed, 1])
-            samples = [replace(s, kernel=like_estimated(s.kernel, spoil, spoiled)) for s in samples]
+        samples = [
+            PsfSample(lens.kernel(place, None, SIZE), place, photo=f"photo{i}")
+            for i in range(max(photos))
+            for place in patch_places(rng)
+        ]
         truth = [(place, lens.kernel(place, None, SIZE)) for place in asked_places()]
         for count in photos:
             names = {f"photo{i}" for i in range(count)}
@@ -188,8 +146,7 @@ def run_model_benchmark(
                 done += 1
                 on_step(done, total)
     rows = [_over_lenses(*key, lenses, seconds[key]) for key, lenses in collected.items()]
-    conditions = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
-    return {**conditions, "rows": [_plain(row) for row in rows]}
+    return {"seeds": list(seeds), "rows": [_plain(row) for row in rows]}
 
 
 def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
@@ -233,29 +190,17 @@ def load_field(path: Path) -> list[PsfSample]:
     ]
 
 
-def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
-    """Photographs of the test half that a lens is used for."""
-    files = [p for p in list_photos(folder) if photo_half(p.stem) == "test"]
-    if len(files) < count:
-        raise InvalidInputError(
-            f"{folder} holds {len(files)} photographs of the test half; {count} are needed"
-        )
-    return [files[i] for i in np.random.default_rng(seed).permutation(len(files))[:count]]
-
-
-def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fit]:
+def _fits(methods: Sequence[str] | None) -> dict[str, Fit]:
     known: dict[str, Fit] = {
         "eff-linear": _linear,
         "polynomial": _polynomial,
         "paper": _paper,
         **{name: _regression(ModelSettings(method=name)) for name in smoothers},
-        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
     }
     unknown = [name for name in methods or () if name not in known]
     if unknown:
         raise InvalidInputError(f"no method {unknown[0]!r}; known: {', '.join(sorted(known))}")
-    usual = [name for name in known if modes or not name.startswith("mode-")]
-    return {name: known[name] for name in methods or usual}
+    return {name: known[name] for name in methods or known}
 
 
 def _regression(chosen: ModelSettings) -> Fit:
@@ -336,7 +281,6 @@ def _plain(row: MethodErrors) -> dict[str, Any]:
         "method": row.method,
         "photos": row.photos,
         "errors": dict(row.errors),
-        "rel_l2": dict(row.errors),  # the same by the name of the measure
         "seconds": round(row.seconds, 2),
         **({} if row.net is None else {"net": dict(row.net)}),
         **({} if row.worst is None else {"worst": dict(row.worst)}),
@@ -347,39 +291,9 @@ def table(result: Mapping[str, Any]) -> str:
     """Write the rows of a result as a Markdown table."""
     net = any("net" in row for row in result["rows"])
     more = [f"{zone}, net of noise" for zone in ZONES] if net else []
-    titles = ["method", "photos", *ZONES, *more, "CPU s"]
-    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    rows = []
     for row in sorted(result["rows"], key=lambda r: (r["photos"], r["errors"].get("corner", 0.0))):
         kinds = [row["errors"], row["net"]] if net else [row["errors"]]
         cells = [f"{kind[zone]:.3f}" if zone in kind else "-" for kind in kinds for zone in ZONES]
-        lines.append(f"| {row['method']} | {row['photos']} | {' | '.join(cells)} | {row['seconds']:.1f} |")
-    return "\n".join(lines)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run from the command line: `python -m lab.model.model_benchmark --seeds 1000:1008`."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", default="1000:1004", help="first:last, the last excluded")
-    parser.add_argument("--photos", default="1,5", help="numbers of photos, with commas")
-    parser.add_argument("--methods", default=None, help="names with commas; all by default")
-    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs")
-    parser.add_argument("--spoiled", type=float, default=0.0, help="relative L2 of the kernels fed")
-    parser.add_argument("--photographs", type=Path, default=None, help="folder; estimate patches of those")
-    parser.add_argument("--json", type=Path, default=None, help="also write the result there")
-    given = parser.parse_args(arguments)
-    first, last = (int(part) for part in given.seeds.split(":"))
-    result = run_model_benchmark(
-        seeds=range(first, last),
-        photos=[int(part) for part in given.photos.split(",")],
-        methods=None if given.methods is None else given.methods.split(","),
-        psf_field=given.psf_field,
-        spoiled=given.spoiled,
-        photographs=given.photographs,
-    )
-    sys.stdout.write(table(result) + "\n")
-    if given.json is not None:
-        given.json.write_text(json.dumps(result, indent=2), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        rows.append([row["method"], str(row["photos"]), *cells, f"{row['seconds']:.1f}"])
+    return page.table(["method", "photos", *ZONES, *more, "CPU s"], rows)

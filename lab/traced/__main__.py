@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.traced.copies import another, copies
+from lab.traced.copies import copies
 from lab.traced.lens import TracedLens
 from lab.traced.make import DEFAULT_STEP, interpolation_error, make_grid
 
@@ -31,9 +31,6 @@ def main() -> int:
     )
     make.add_argument("--size", type=int, default=55, help="odd side of the kernels, pixels")
     make.add_argument("--pitch", type=float, default=4.5, help="pixel pitch, micrometres")
-    make.add_argument(
-        "--others", type=int, default=0, metavar="N", help="make N other copies of the design instead"
-    )
     make.add_argument("--check", type=int, default=0, help="compare with exact PSFs at so many places")
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -41,17 +38,12 @@ def main() -> int:
         for name, copy in copies.items():
             logger.info("%-22s %s", name, copy)
         return 0
-    wanted = [
-        (name, f"-other{i}" if i else "", another(name, i) if i else copies[name])
-        for name in asked.copy
-        for i in (range(1, asked.others + 1) if asked.others else (0,))
-    ]
-    for name, ending, copy in wanted:
+    for name in asked.copy:
         start = time.process_time()
-        lens = TracedLens(copy)
+        lens = TracedLens(copies[name])
         f_number = lens.copy.f_number * 2.0 ** (asked.stopped / 2.0)
         grid = make_grid(lens, f_number, step=asked.step, size=asked.size, pitch_um=asked.pitch)
-        path = asked.output / f"{name}-f{f_number:.2g}{ending}.npz"
+        path = asked.output / f"{name}-f{f_number:.2g}.npz"
         grid.write(path)
         spent = time.process_time() - start
         logger.info("%s: %d KB, %.0f CPU seconds", path, path.stat().st_size // 1024, spent)

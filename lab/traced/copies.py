@@ -10,11 +10,8 @@ theirs, on a larger sensor.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Final
-
-import numpy as np
 
 from lab.traced.lens import Copy
 from lab.traced.rays import Fault
@@ -82,27 +79,3 @@ copies: Final = MappingProxyType(
     }
 )
 """Copies by name."""
-
-
-def another(name: str, number: int) -> Copy:
-    """Another copy of a design, as a maker of profiles may have measured.
-
-    Its faults and the tilt of its sensor are those of the copy of this name, turned to directions of their
-    own and times 0.5 to 1.5 (chosen: copies of one factory).
-
-    Parameters
-    ----------
-    name : str
-        Key of `copies`.
-    number : int
-        From 1 on; each is another one, the same whenever it is made.
-    """
-    copy = copies[name]
-    rng = np.random.default_rng([number, *name.encode()])
-
-    def turned(pair: tuple[float, float]) -> tuple[float, float]:
-        vector = complex(*pair) * rng.uniform(0.5, 1.5) * np.exp(1j * rng.uniform(-np.pi, np.pi))
-        return float(vector.real), float(vector.imag)
-
-    faults = tuple(replace(f, shift_um=turned(f.shift_um), tilt_deg=turned(f.tilt_deg)) for f in copy.faults)
-    return replace(copy, faults=faults, sensor_tilt_um=turned(copy.sensor_tilt_um))

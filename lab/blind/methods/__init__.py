@@ -1,4 +1,4 @@
-"""The blind methods of others that the paper compares with, and one more: for benchmarks, not for users.
+"""The blind methods of others that the paper compares with: for benchmarks, not for users.
 
 `compared` knows them beside those of the product; `lensmodel bench blind --methods zhang,sun` runs them.
 """
@@ -6,7 +6,6 @@
 from typing import Final
 
 from lab.blind.methods.cho_lee import ChoLee
-from lab.blind.methods.edges import Edges
 from lab.blind.methods.sun import Sun
 from lab.blind.methods.xu_jia import XuJia
 from lab.blind.methods.zhang import Zhang
@@ -14,7 +13,7 @@ from lensmodel.core.registry import Registry
 from lensmodel.estimation import PsfEstimator, estimators
 
 compared: Final[Registry[PsfEstimator]] = estimators.extended(
-    cho_lee=ChoLee, edges=Edges, sun=Sun, xu_jia=XuJia, zhang=Zhang
+    cho_lee=ChoLee, sun=Sun, xu_jia=XuJia, zhang=Zhang
 )
 
-__all__ = ["ChoLee", "Edges", "Sun", "XuJia", "Zhang", "compared"]
+__all__ = ["ChoLee", "Sun", "XuJia", "Zhang", "compared"]

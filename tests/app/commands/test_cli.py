@@ -182,6 +182,7 @@ def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
 
 @pytest.mark.slow
 def test_calibrate_force_begins_anew(folder: Path) -> None:
+    write_photo(folder / "one.dng", 1)
     done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "default", "--force", cwd=folder)
 
     assert done.returncode == 0, done.stderr
@@ -666,7 +667,9 @@ def test_a_finished_report_is_refused_before_any_work(
 def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
     folder: Path, here: Here
 ) -> None:
-    Image.fromarray(_picture()).save(folder / "scan.tif")
+    write_photo(folder / "one.dng", 1)
+    grey = np.rint(255.0 * scene(1)).astype(np.uint8)
+    Image.fromarray(np.dstack([grey] * 3)).save(folder / "scan.tif")
     words = ("calibrate", "one.dng", "scan.tif", "-p", "new", "--any-lens", "--estimator", "default")
     done = here(*words, "--aperture", "8", "--workers", "1")
 

@@ -226,7 +226,7 @@ def test_a_lens_changes_its_model_whenever_workers_die(
         crew.hire()
     until(lambda: store.samples.state_of(lens_id).version == 3)  # type: ignore[union-attr]  # it is there
 
-    assert before == {"quick-default-31"}
+    assert {name.rpartition("-")[0] for name in before} == {"quick-default"}
     assert seen == {frozenset(before)}  # nothing else counted meanwhile
     assert counting_estimators(store) == {"quick-michaeli-irani-55"}
     lens = store.lenses.get(lens_id, ANY_OWNER)
@@ -279,11 +279,10 @@ def test_a_worker_that_slept_through_its_lease_stops_and_counts_nothing_twice(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 7])
 def test_twenty_random_deaths_lose_nothing_and_count_nothing_twice(
-    crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]], seed: int
+    crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]]
 ) -> None:
-    chance = random.Random(seed)
+    chance = random.Random(7)  # `make torture` draws others
     photos, kills = 8, 20
     send(photos)
     for _ in range(3):

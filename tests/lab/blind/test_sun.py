@@ -9,7 +9,6 @@ from scipy import signal
 
 from lab.blind.methods.sun import Sun, edge_terms, image_step
 from lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
-from lab.blind.steps.kernel_step import least_squares_kernel
 from lab.blind.steps.pyramid import View
 from lab.scenes import dead_leaves
 from lab.training import make_edge_patches
@@ -53,16 +52,6 @@ def test_the_generating_kernel_costs_least_where_the_scene_is_known() -> None:
     wrong = (delta(13), OVAL, as_kernel(np.rot90(truth)), as_kernel(truth[::-1, ::-1]), as_kernel(truth**1.5))
 
     assert all(explained(y, inner, kernel) > explained(y, inner, truth) for kernel in wrong)
-
-
-def test_the_kernel_step_recovers_the_kernel_of_a_known_scene() -> None:
-    truth, side = stroke(), 160
-    y = View(shot(truth, side=side).astype(np.float64), SIGMA)
-    terms = edge_terms(scene(side + 12)[6:-6, 6:-6], y, 13, 0.0)
-
-    found = least_squares_kernel(terms, gaussian(13, np.eye(2)), turns=4)
-
-    assert distance(as_kernel(found), truth).ncc > 0.95
 
 
 def test_the_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> None:
@@ -118,35 +107,3 @@ def test_a_stroke_is_recovered_from_one_patch() -> None:
 
     assert distance(found.kernel, stroke()).ncc > 0.85
     assert distance(delta(15), stroke()).ncc < 0.5
-
-
-def test_sharp_patches_give_a_kernel_like_a_point() -> None:
-    found = Sun(iterations=3).estimate([shot(delta(3))], [NoiseModel.white(SIGMA)], size=11)
-
-    assert found.no_blur
-
-
-def test_the_kernel_turns_with_the_patch() -> None:
-    y, method, noise = shot(OVAL, side=97), Sun(iterations=2), [NoiseModel.white(SIGMA)]
-
-    straight = method.estimate([y], noise, size=13).kernel
-    turned = method.estimate([np.ascontiguousarray(np.rot90(y))], noise, size=13).kernel
-
-    assert distance(turned, np.rot90(straight)).ncc > 0.999
-
-
-def test_patches_of_one_position_share_one_kernel() -> None:
-    method, noise = Sun(iterations=2), NoiseModel.white(SIGMA)
-    patches = [shot(stroke(), side=80, seed=seed) for seed in (0, 1, 2)]
-
-    single = [distance(method.estimate([y], [noise], size=13).kernel, stroke()).rel_l2 for y in patches]
-    pooled = distance(method.estimate(patches, [noise] * 3, size=13).kernel, stroke()).rel_l2
-
-    assert pooled < np.mean(single)
-
-
-@pytest.mark.parametrize("share", [0.01, 0.03])
-def test_the_mask_holds_at_most_its_share(share: float) -> None:
-    x = scene(96)
-
-    assert 0 < edge_mask(x, share).sum() <= share * x.size + 1

@@ -9,7 +9,7 @@ from lab.blind.methods.zhang import Zhang
 from lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lab.scenes import dead_leaves
-from lensmodel.core.psf import as_kernel, delta, distance, gaussian, rms_width
+from lensmodel.core.psf import as_kernel, delta, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
@@ -54,12 +54,6 @@ def test_the_generating_kernel_has_the_least_free_energy(truth: Kernel) -> None:
 
     for wrong in (delta(13), as_kernel(truth**1.7), spread_out(truth, 0.6), as_kernel(np.rot90(truth))):
         assert explained(y, wrong) > best
-
-
-def test_the_mirrored_kernel_has_more_free_energy() -> None:
-    y = shot(bent(), side=96)
-
-    assert explained(y, as_kernel(bent()[::-1, ::-1])) > explained(y, bent())
 
 
 def test_every_update_lowers_the_free_energy() -> None:
@@ -120,13 +114,6 @@ def test_a_bent_stroke_is_recovered_from_one_patch() -> None:
     assert distance(delta(15), bent()).ncc < 0.5
 
 
-def test_sharp_patches_give_a_kernel_like_a_point() -> None:
-    found = Zhang().estimate([shot(delta(3), side=96)], [NoiseModel.white(SIGMA)], size=11)
-
-    assert found.kernel.max() > 0.75
-    assert found.no_blur
-
-
 def test_the_kernel_turns_and_stays_as_the_patch_turns_and_shifts() -> None:
     y = shot(gaussian(13, [[2.0, 0.8], [0.8, 1.2]]), side=100)
     method, noise = Zhang(iterations=3), [NoiseModel.white(SIGMA)]
@@ -137,37 +124,3 @@ def test_the_kernel_turns_and_stays_as_the_patch_turns_and_shifts() -> None:
 
     assert np.abs(turned - np.rot90(straight)).max() < 1e-3 * straight.max()
     assert distance(shifted, straight).ncc > 0.98
-
-
-def test_patches_of_one_position_share_a_better_kernel() -> None:
-    method, noise = Zhang(iterations=6), NoiseModel.white(SIGMA)
-    patches = [shot(bent(), side=80, seed=seed) for seed in (0, 1)]
-
-    single = [distance(method.estimate([y], [noise], size=13).kernel, bent()).rel_l2 for y in patches]
-    pooled = distance(method.estimate(patches, [noise] * 2, size=13).kernel, bent()).rel_l2
-
-    assert pooled < np.mean(single)
-
-
-def test_another_channel_starts_from_the_first() -> None:
-    y, noise = shot(bent(), side=96, seed=1), [NoiseModel.white(SIGMA)]
-    method = Zhang(iterations=10)
-    green = method.estimate([y], noise, size=13)
-    red = method.estimate_channel([0.5 * y], [NoiseModel.white(0.5 * SIGMA)], green, [y], size=13)
-
-    assert distance(red.kernel, green.kernel).ncc > 0.9
-    assert red.seconds < green.seconds
-
-
-def test_a_wider_blur_gives_a_wider_kernel() -> None:
-    noise = [NoiseModel.white(SIGMA)]
-    widths = [
-        rms_width(
-            Zhang(iterations=4)
-            .estimate([shot(gaussian(15, s * s * np.eye(2)), side=80)], noise, size=15)
-            .kernel
-        )
-        for s in (0.7, 1.4, 2.2)
-    ]
-
-    assert widths == sorted(widths)

@@ -10,7 +10,6 @@ import pytest
 
 from lab.scenes import dead_leaves
 from lab.traced import GridField, GridLens, read_grid
-from lab.traced.copies import another, copies
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid, distance, gaussian
@@ -152,15 +151,3 @@ def test_lens_answers_only_for_what_it_was_traced_for() -> None:
         lens.kernel_at_field((0.0, 0.0), LensSettings(), 15, pitch_um=6.0)
     with pytest.raises(InvalidInputError, match="sorted"):
         GridLens((linear_field(5.6), linear_field(2.8)))
-
-
-def test_other_copies_of_a_design_have_other_faults_of_like_size() -> None:
-    own, first, second = copies["tronnier"], another("tronnier", 1), another("tronnier", 2)
-    assert first == another("tronnier", 1)
-    assert (first.design, first.f_number, first.corner_light) == (own.design, own.f_number, own.corner_light)
-    for fault, former in zip((*first.faults, *second.faults), (*own.faults, *own.faults), strict=True):
-        assert fault.element == former.element
-        assert fault.shift_um != former.shift_um
-        assert 0.5 <= math.hypot(*fault.shift_um) / math.hypot(*former.shift_um) <= 1.5
-    assert first.faults[0].shift_um != second.faults[0].shift_um
-    assert first.sensor_tilt_um != second.sensor_tilt_um

@@ -1,0 +1,523 @@
+"""How well blind methods find lens blur, and whether deblurring with their kernels helps.
+
+The protocol of the lens-blur benchmark in the paper (section 5.1, figure 2): sharp photographs,
+measured-like lens PSFs, 1 percent noise, and the error ratio of A. Levin et al., "Understanding
+and evaluating blind deconvolution algorithms", CVPR 2009::
+
+    ER = | x(k_estimated) - x_true |² / | x(k_true) - x_true |²
+
+where x(k) is the same non-blind deconvolution for both kernels. For mild blur the untouched image
+already has an ER of 2 to 4, so each case also tells whether the method beats doing nothing.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lab.blind.judges import Judge, judges, squared_error
+from lab.blind.methods import compared
+from lab.cases import CHOICES, HALVES, BlindCase, Choice, Half, list_photos, load_psfs, make_cases, observe
+from lab.page import table
+from lensmodel.core import psf
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import Kernel, StepHook, ignore_step
+from lensmodel.estimation import PsfEstimator
+
+logger = logging.getLogger(__name__)
+
+PROTOCOL = 2
+"""Part of every cache key; raised when cases or metrics change."""
+
+UNTOUCHED = "none"
+"""The method that does nothing: the baseline of every table."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlindBenchmark:
+    """What to run.
+
+    Parameters
+    ----------
+    photos : Path or None
+        Folder of sharp photographs; None means those of the library.
+    psfs : Path or None
+        .npz file with `psf` (n, k, k); None means the library's twelve.
+    noise : tuple of float
+        Standard deviations as shares of full range.
+    methods : tuple of str
+        Names of blind estimators; "none" is always added.
+    half : {"dev", "test", "all"}
+        Which half of photos and PSFs.
+    cases : int or None
+        At most so many, spread over photos and PSFs.
+    patch, kernel_size : int
+        Sides in pixels; the kernel's is odd.
+    judge : str
+        Non-blind deconvolution: "hyper-laplacian" or "epll".
+    seed : int
+        For noise and the choice of cases.
+    selection : {"r-map", "good-regions"}
+        Selector that chooses the windows in the blurred photograph.
+    scenes : int or None
+        So many windows of the photographs in turn; None means one of each.
+    """
+
+    photos: Path | None = None
+    psfs: Path | None = None
+    noise: tuple[float, ...] = (0.01,)
+    methods: tuple[str, ...] = ("default",)
+    half: Half = "test"
+    cases: int | None = None
+    patch: int = 256
+    kernel_size: int = 31
+    judge: str = "hyper-laplacian"
+    seed: int = 0
+    selection: Choice = "r-map"
+    scenes: int | None = None
+
+    def __post_init__(self) -> None:
+        checks = {
+            f"half must be one of {', '.join(HALVES)}, got {self.half!r}": self.half in HALVES,
+            f"selection must be one of {', '.join(CHOICES)}, got {self.selection!r}": (
+                self.selection in CHOICES
+            ),
+            f"patch must be a multiple of 4 of at least 128, got {self.patch}": self.patch >= 128
+            and self.patch % 4 == 0,
+            f"kernel size must be odd and at least 5, got {self.kernel_size}": self.kernel_size >= 5
+            and self.kernel_size % 2 == 1,
+            f"noise must lie in 0.0001..0.2, got {self.noise}": all(1e-4 <= s <= 0.2 for s in self.noise),
+        }
+        for text, holds in checks.items():
+            if not holds:
+                raise InvalidInputError(text)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """One method on one case.
+
+    Parameters
+    ----------
+    case, method : str
+    noise : float
+    error_ratio, untouched_ratio : float
+        ER with the estimated kernel, and of the blurred patch as it is.
+    ncc, rel_l2, mtf_rmse : float
+        Against the true kernel after sub-pixel alignment; see `psf.distance`.
+    width_px, true_width_px : float
+        RMS widths.
+    confidence, predicted_error : float
+        What the estimator says of itself; NaN for "none".
+    declined : bool
+        The estimator gave no answer; the patch then stays as it is.
+    seconds : float
+        Of the estimate alone.
+    """
+
+    case: str
+    method: str
+    noise: float
+    error_ratio: float
+    untouched_ratio: float
+    ncc: float
+    rel_l2: float
+    mtf_rmse: float
+    width_px: float
+    true_width_px: float
+    confidence: float
+    predicted_error: float
+    declined: bool
+    seconds: float
+
+    @property
+    def improved(self) -> bool:
+        """Whether deblurring with the estimate beats doing nothing."""
+        return self.error_ratio < self.untouched_ratio
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSummary:
+    """One method at one noise level; shares are of all cases, the rest are medians.
+
+    `moment_bias` is the median of the difference of mean second moments, estimated minus true, in
+    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` a percentile.
+    """
+
+    method: str
+    noise: float
+    cases: int
+    improved: float
+    er_lt_3: float
+    er_lt_2: float
+    er_median: float
+    er_p90: float
+    ncc: float
+    rel_l2: float
+    mtf_rmse: float
+    moment_bias: float
+    width_ratio: float
+    declined: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class BlindReport:
+    """Outcome of a run: the settings, one row a method and noise level, and every case."""
+
+    settings: BlindBenchmark
+    summary: tuple[MethodSummary, ...]
+    results: tuple[CaseResult, ...]
+
+    def to_json(self) -> dict[str, object]:
+        """Return settings, summary and cases as plain values; NaN becomes None."""
+        settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.settings).items()}
+        return {
+            "benchmark": "blind",
+            "protocol": PROTOCOL,
+            "settings": settings,
+            "summary": [plain(asdict(row)) for row in self.summary],
+            "cases": [{**plain(asdict(row)), "improved": row.improved} for row in self.results],
+        }
+
+
+def summarised(results: Sequence[CaseResult]) -> tuple[MethodSummary, ...]:
+    """One row a method and noise level, in the order of first appearance."""
+    groups: dict[tuple[float, str], list[CaseResult]] = {}
+    for result in results:
+        groups.setdefault((result.noise, result.method), []).append(result)
+    return tuple(_summary(noise, method, rows) for (noise, method), rows in groups.items())
+
+
+def _summary(noise: float, method: str, rows: Sequence[CaseResult]) -> MethodSummary:
+    def median(of: Callable[[CaseResult], float]) -> float:
+        return float(np.median([of(row) for row in rows]))
+
+    ratios = np.array([row.error_ratio for row in rows])
+    return MethodSummary(
+        method=method,
+        noise=noise,
+        cases=len(rows),
+        improved=float(np.mean([row.improved for row in rows])),
+        er_lt_3=float((ratios < 3.0).mean()),
+        er_lt_2=float((ratios < 2.0).mean()),
+        er_median=float(np.median(ratios)),
+        er_p90=float(np.percentile(ratios, 90.0)),
+        ncc=median(lambda row: row.ncc),
+        rel_l2=median(lambda row: row.rel_l2),
+        mtf_rmse=median(lambda row: row.mtf_rmse),
+        moment_bias=median(lambda row: row.width_px**2 - row.true_width_px**2),
+        width_ratio=median(lambda row: row.width_px / row.true_width_px if row.true_width_px else math.nan),
+        declined=sum(row.declined for row in rows),
+        seconds=median(lambda row: row.seconds),
+    )
+
+
+def plain(row: Mapping[str, object]) -> dict[str, object]:
+    """Return a row with None for what is no finite number, as JSON wants it."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
+class ResultStore:
+    """Finished results by the content they came from; one file of JSON lines, only ever appended."""
+
+    def __init__(
+        self, folder: Path | None, photos: Sequence[Path], settings: BlindBenchmark, judge: Judge
+    ) -> None:
+        self._content = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
+        self._settings, self._judge = settings, judge
+        self._known: dict[str, CaseResult] = {}
+        self._file: Path | None = None
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = folder / "blind.jsonl"
+            self._known = dict(_stored(self._file)) if self._file.exists() else {}
+
+    def find(
+        self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None
+    ) -> CaseResult | None:
+        """Return the stored result, or None."""
+        return self._known.get(self._key(case, kernel, name, method))
+
+    def add(self, case: BlindCase, kernel: Kernel, method: PsfEstimator | None, result: CaseResult) -> None:
+        """Keep a result, and write it out at once."""
+        key = self._key(case, kernel, result.method, method)
+        self._known[key] = result
+        if self._file is not None:
+            with self._file.open("a", encoding="utf-8") as out:
+                out.write(json.dumps({"key": key, **plain(asdict(result))}) + "\n")
+
+    def _key(self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None) -> str:
+        described = repr(method) if is_dataclass(method) else type(method).__qualname__
+        parts = (
+            PROTOCOL,
+            [self._content[case.photo]],
+            [case.photo.stem],  # of which the noise is drawn
+            hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
+            (case.psf_number, case.noise, case.patch, "gaussian", case.seed),
+            (name, getattr(method, "version", 0), described, self._settings.kernel_size),
+            repr(self._judge),
+            case.choice,
+            *((case.window,) if case.window else ()),
+        )
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+
+
+def _stored(file: Path) -> Iterator[tuple[str, CaseResult]]:
+    names = [field.name for field in fields(CaseResult)]
+    for line in file.read_text(encoding="utf-8").splitlines():
+        try:
+            row = json.loads(line)
+            values: dict[str, Any] = {name: math.nan if row[name] is None else row[name] for name in names}
+            yield row["key"], CaseResult(**values)
+        except (ValueError, KeyError, TypeError):
+            # The last line of a run that was killed while writing.
+            logger.warning("skipped a damaged line of %s", file)
+
+
+def run_blind_benchmark(
+    settings: BlindBenchmark,
+    *,
+    workers: int = 1,
+    cache: Path | None = None,
+    methods: Registry[PsfEstimator] | None = None,
+    on_step: StepHook = ignore_step,
+) -> BlindReport:
+    """Run the benchmark; what the cache folder already holds is not computed again.
+
+    Parameters
+    ----------
+    settings : BlindBenchmark
+        What to run.
+    workers : int
+        Processes; the numbers do not depend on it.
+    cache : Path or None
+        Folder for finished results, one line of JSON each, keyed by the content of photo, PSF,
+        method and settings. A run that was stopped goes on from there.
+    methods : Registry of PsfEstimator or None
+        Where the method names are looked up; None means `methods.compared`.
+    on_step : StepHook
+        Called after each case.
+
+    Raises
+    ------
+    UnknownMethodError
+        If there is no method or judge of a name.
+    InvalidInputError
+        If there are no photos or PSFs.
+    """
+    registry = compared if methods is None else methods
+    chosen = {name: registry.create(name) for name in settings.methods}
+    judge = judges.create(settings.judge)
+    photos, kernels = list_photos(settings.photos), load_psfs(settings.psfs)
+    cases = [
+        case
+        for noise in settings.noise
+        for case in make_cases(
+            photos,
+            len(kernels),
+            half=settings.half,
+            noise=noise,
+            patch=settings.patch,
+            seed=settings.seed,
+            limit=settings.cases,
+            choice=settings.selection,
+            scenes=settings.scenes,
+        )
+    ]
+    store = ResultStore(cache, photos, settings, judge)
+    jobs = []
+    for case in cases:
+        kernel = kernels[case.psf_number]
+        missing = {
+            name: method
+            for name, method in {UNTOUCHED: None, **chosen}.items()
+            if store.find(case, kernel, name, method) is None
+        }
+        if missing:
+            jobs.append(_Job(case, kernel, missing, judge, settings.kernel_size))
+    done = len(cases) - len(jobs)
+    for job, fresh in _run(jobs, workers):
+        for result in fresh:
+            store.add(job.case, job.kernel, job.methods[result.method], result)
+        done += 1
+        on_step(done, len(cases))
+    found = [
+        store.find(case, kernels[case.psf_number], name, method)
+        for case in cases
+        for name, method in {UNTOUCHED: None, **chosen}.items()
+    ]
+    results = tuple(result for result in found if result is not None)
+    return BlindReport(settings, summarised(results), results)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """One case and the methods that have no result yet; what a worker process receives."""
+
+    case: BlindCase
+    kernel: Kernel
+    methods: Mapping[str, PsfEstimator | None]
+    judge: Judge
+    kernel_size: int
+
+
+def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, list[CaseResult]]]:
+    if workers <= 1:
+        for job in jobs:
+            yield job, _run_job(job)
+        return
+    # Fresh processes: a fork would inherit locks of the numerical libraries' threads.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        pending = {pool.submit(_run_job, job): job for job in jobs}
+        for future in as_completed(pending):
+            yield pending[future], future.result()
+
+
+def _run_job(job: _Job) -> list[CaseResult]:
+    seen = observe(job.case, job.kernel)
+    sigma = job.case.noise
+    reference = job.judge.deconvolve(seen.patch, seen.kernel, sigma, (0.0, 0.0))
+    floor = max(squared_error(reference, seen.sharp), 1e-12)
+    untouched = squared_error(seen.patch, seen.sharp) / floor
+    results = []
+    for name, method in job.methods.items():
+        started = time.perf_counter()
+        estimate = None
+        if method is not None:
+            try:
+                estimate = method.estimate(
+                    [seen.patch],
+                    [seen.noise],
+                    size=job.kernel_size,
+                    rng=np.random.default_rng(job.case.seed),
+                )
+            except NotEnoughEvidenceError as error:
+                logger.info("%s declined %s: %s", name, job.case.name, error)
+        seconds = time.perf_counter() - started
+        kernel = psf.delta(3) if estimate is None else np.asarray(estimate.kernel)
+        distance = psf.distance(kernel, seen.kernel)
+        ratio = untouched
+        if estimate is not None:
+            restored = job.judge.deconvolve(seen.patch, kernel, sigma, distance.shift)
+            ratio = squared_error(restored, seen.sharp) / floor
+        results.append(
+            CaseResult(
+                case=job.case.name,
+                method=name,
+                noise=sigma,
+                error_ratio=ratio,
+                untouched_ratio=untouched,
+                ncc=distance.ncc,
+                rel_l2=distance.rel_l2,
+                mtf_rmse=distance.mtf_rmse,
+                width_px=psf.rms_width(kernel),
+                true_width_px=psf.rms_width(seen.kernel),
+                confidence=math.nan if estimate is None else float(estimate.confidence),
+                predicted_error=math.nan if estimate is None else float(estimate.predicted_error),
+                declined=method is not None and estimate is None,
+                seconds=seconds,
+            )
+        )
+    return results
+
+
+# Error ratios at the ends of the axis: 1 is the true kernel; few lie beyond 10 (chosen).
+LOWEST: Final = 1.0
+HIGHEST: Final = 10.0
+_HEADS = (
+    *("noise", "method", "cases", "better than blurry", "ER < 3", "ER < 2", "ER median (p90)"),
+    *("NCC", "rel. L2", "MTF error", "width", "seconds"),
+)
+
+
+def markdown_table(report: BlindReport) -> str:
+    """Return the summary as a Markdown table, shares in percent."""
+    rows = [
+        [
+            f"{100 * s.noise:g} %",
+            s.method,
+            str(s.cases),
+            "" if s.method == UNTOUCHED else f"{100 * s.improved:.0f} %",
+            f"{100 * s.er_lt_3:.0f} %",
+            f"{100 * s.er_lt_2:.0f} %",
+            f"{s.er_median:.2f} ({s.er_p90:.1f})",
+            f"{s.ncc:.3f}",
+            f"{s.rel_l2:.2f}",
+            f"{s.mtf_rmse:.3f}",
+            f"{s.width_ratio:.2f}",
+            f"{s.seconds:.2f}",
+        ]
+        for s in report.summary
+    ]
+    return table(_HEADS, rows) + "\n"
+
+
+def csv_table(results: Sequence[CaseResult]) -> str:
+    """Return every case as CSV with a header line."""
+    out = io.StringIO()
+    names = [*CaseResult.__dataclass_fields__, "improved"]
+    writer = csv.DictWriter(out, names, lineterminator="\n")
+    writer.writeheader()
+    for result in results:
+        writer.writerow({**asdict(result), "improved": result.improved})
+    return out.getvalue()
+
+
+def cumulative(ratios: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Percent of ratios below each threshold."""
+    return np.asarray(100.0 * (ratios[None, :] < at[:, None]).mean(axis=1))
+
+
+def curve_figure(report: BlindReport, noise: float) -> Figure:
+    """Draw the percent of cases with an error ratio below t, for t in 1..10."""
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    ax = figure.add_subplot()
+    grid = np.linspace(LOWEST, HIGHEST, 181)
+    for method in (row.method for row in report.summary if row.noise == noise):
+        ratios = np.array([r.error_ratio for r in report.results if r.method == method and r.noise == noise])
+        untouched = method == UNTOUCHED
+        (line,) = ax.plot(grid, cumulative(ratios, grid), label="no correction" if untouched else method)
+        if untouched:
+            line.set(color="grey", linestyle="--")
+    ax.set(xlabel="error ratio t", ylabel="percent of cases", xlim=(LOWEST, HIGHEST), ylim=(0.0, 100.0))
+    ax.set_title(f"Cases with an error ratio below t, {100 * noise:g} % noise", loc="left", fontsize=10)
+    ax.grid(color="#e5e5e0")
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return figure
+
+
+def write_report(report: BlindReport, folder: Path) -> tuple[Path, ...]:
+    """Write blind.json, blind.csv, blind.md and one curve a noise level as SVG and PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {
+        "blind.json": json.dumps(report.to_json(), indent=1) + "\n",
+        "blind.csv": csv_table(report.results),
+        "blind.md": markdown_table(report),
+    }
+    written = []
+    for noise in report.settings.noise:
+        for ending in ("svg", "png"):
+            path = folder / f"blind-er-{100 * noise:g}percent.{ending}"
+            curve_figure(report, noise).savefig(path, dpi=160)
+            written.append(path)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+        written.append(folder / name)
+    return tuple(sorted(written))

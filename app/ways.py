@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from app.runtime.settings import Settings
-from lensmodel.workflow.ways import KERNEL_PATCHES, WAYS, Way
+from lensmodel.workflow.sampling import KERNEL_PATCHES, WAYS, Way
 
 
 def configured_way(settings: Settings, name: str) -> Way:

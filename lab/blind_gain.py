@@ -35,7 +35,7 @@ from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
 from lensmodel.quality import to_srgb
 from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, load_scene, photograph, write_photo
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import correcting, sampling
 
 CAMERA: Final = SimulatedCamera(height=900, width=1350, full_well_electrons=20_000.0)
 MARGIN: Final = 64  # pixels of a scene beyond the frame (chosen)
@@ -96,7 +96,7 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[
         path = folder / f"{lens.number}-{number}.dng"
         lens.shot(number, path)
         try:
-            samples.append(pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1))
+            samples.append(sampling.samples_of_photo(path, sampling.Recipe(lens.settings), workers=1))
         except NotEnoughEvidenceError:
             samples.append([])
     truth = lens.shot(max(counts), folder / "last.dng")
@@ -107,8 +107,8 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[
             yield [lens.name, str(count), "its photos show too little"]
             continue
         model = LensModel.fit(known)
-        lateral = pipeline.lateral_of(developed)
-        made = pipeline.correct_photo(developed, model, lens.settings, lateral=lateral)
+        lateral = correcting.lateral_of(developed)
+        made = correcting.correct_photo(developed, model, lens.settings, lateral=lateral)
         found = gains(*map(lens.shown, (developed.planes, made.planes, truth)))
         assert found is not None, "a frame of the camera holds many blocks"
         expected = {zone: report.expected_gain_db for zone, report in made.zones.items()}

@@ -18,7 +18,7 @@ from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
-from lensmodel.estimation.patches import Patch, select
+from lensmodel.patches import Patch, select
 from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 
 Half: TypeAlias = Literal["dev", "test", "all"]
@@ -49,7 +49,7 @@ class BlindCase:
     seed : int
         For the noise.
     choice : {"r-map", "good-regions"}
-        Selector of `lensmodel.estimation.patches`, which sees the blurred and noisy photograph only.
+        Selector of `lensmodel.patches`, which sees the blurred and noisy photograph only.
     window : int
         Which window of the photograph: 0 is the best one that the selector finds, 1 the next beside it.
     """

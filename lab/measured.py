@@ -23,11 +23,11 @@ from scipy import ndimage
 from lab import targets
 from lab.scenes import dead_leaves
 from lab.traced import GridLens
+from lensmodel import measured as measure
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.psf import distance, resized
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
-from lensmodel.estimation import measure
-from lensmodel.estimation.measure.target import Target
+from lensmodel.measured.target import Target
 from lensmodel.photo import develop
 from lensmodel.simulate import (
     BlurOptions,
@@ -38,7 +38,7 @@ from lensmodel.simulate import (
     photograph,
     write_photo,
 )
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 
 KINDS: Final = ("target", "pair", "points", "edges", "blind")
 BASE_ISO_ELECTRONS: Final = 40_000.0  # full well of a pixel (chosen)
@@ -161,11 +161,11 @@ def _found(
 def _blind(path: Path, size: int) -> Iterator[Found]:
     """Blind estimates of a few patches of the same photo, green only."""
     photo = develop(path)
-    for group in pipeline.patches_by_cell(pipeline.find_patches(photo, count=_BLIND_PATCHES)):
-        cells = pipeline.estimate_cell(
+    for group in sampling.patches_by_cell(sampling.find_patches(photo, count=_BLIND_PATCHES)):
+        cells = sampling.estimate_cell(
             photo,
             group,
-            settings=pipeline.settings_of(photo),
+            settings=sampling.settings_of(photo),
             photo_id="bench",
             size=size,
             channels=("g",),

@@ -2,7 +2,7 @@
 
 Everything is drawn `FINE` times finer than pixels and brought to the pixel grid by leaving out the
 frequencies that pixels cannot hold: the kernels of simulated lenses are known on the pixel grid only.
-This shares nothing with how `lensmodel.estimation.measure` renders its references but the page itself.
+This shares nothing with how `lensmodel.measured` renders its references but the page itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.types import Planes
-from lensmodel.estimation.measure.page import TargetPage
+from lensmodel.measured.page import TargetPage
 
 FINE: Final = 3
 """Drawn samples a pixel along each axis."""

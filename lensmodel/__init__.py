@@ -23,19 +23,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from lensmodel.blind import PsfEstimate, PsfEstimator, estimators
     from lensmodel.core.errors import CancelledError, LensModelError
     from lensmodel.core.psf import PsfSample
     from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
     from lensmodel.correction import Bounds, Corrected, Deconvolver, Restored, Sensor, deconvolvers
-    from lensmodel.estimation import PsfEstimate, PsfEstimator, estimators
-    from lensmodel.estimation.patches import Selector, selectors
     from lensmodel.model import ModelSettings, PsfAnswer
+    from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.arrays import photo_from_array
     from lensmodel.workflow.api import calibrate, correct
-    from lensmodel.workflow.field_grid import field_grid
-    from lensmodel.workflow.lens import Lens
-    from lensmodel.workflow.pipeline import CalibrationEvent
+    from lensmodel.workflow.lens import Lens, field_grid
+    from lensmodel.workflow.sampling import CalibrationEvent
 
 __all__ = [
     "Bounds",
@@ -70,12 +69,11 @@ __all__ = [
 _HOMES: Final = {
     "lensmodel.workflow.api": ("calibrate", "correct"),
     "lensmodel.photo.arrays": ("photo_from_array",),
-    "lensmodel.estimation": ("PsfEstimate", "PsfEstimator", "estimators"),
-    "lensmodel.estimation.patches": ("Selector", "selectors"),
+    "lensmodel.blind": ("PsfEstimate", "PsfEstimator", "estimators"),
+    "lensmodel.patches": ("Selector", "selectors"),
     "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
     "lensmodel.core.errors": ("CancelledError", "LensModelError"),
-    "lensmodel.workflow.lens": ("Lens",),
-    "lensmodel.workflow.field_grid": ("field_grid",),
+    "lensmodel.workflow.lens": ("Lens", "field_grid"),
     "lensmodel.photo": ("LinearPhoto", "develop"),
     "lensmodel.workflow.sampling": ("CalibrationEvent",),
     "lensmodel.core.psf": ("PsfSample",),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lensmodel.estimation.patches import r_map
+from lensmodel.patches import r_map
 from lensmodel.photo import LinearPhoto, shown, upright
 
 SIDE: Final = 1600

@@ -10,11 +10,12 @@ from typing import Annotated, Final
 
 import typer
 
-from lensmodel import estimation
-from lensmodel.cli.console import display, files
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.console.method_options import Estimator
-from lensmodel.cli.console.options import Quiet, Verbose
+from lensmodel import blind
+from lensmodel.cli import files
+from lensmodel.cli.calibrate import Estimator
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import Quiet, Verbose
 from lensmodel.core.files import write_atomically
 
 MARKER: Final = ".lensmodel-demo.json"
@@ -44,9 +45,9 @@ def demo(
 
     Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 called wrongly.
     """
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     with files.as_usage():
-        estimation.estimators.create(estimator)
+        blind.estimators.create(estimator)
     _refuse_what_others_wrote(output, force=force)
     from app.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from app.commands.service import Data, settings_from
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.console.options import Json, choice
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:

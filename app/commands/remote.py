@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.progress import Progress, TaskID
 
-from lensmodel.cli import correction
-from lensmodel.cli.console import files
-from lensmodel.cli.console.display import Display
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.words import gain_words
+from lensmodel.cli import correction, files
+from lensmodel.cli.console import Display, gain_words
+from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS
 from lensmodel.workflow.api import FORMATS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 
 if TYPE_CHECKING:
     from app.runtime.settings import Settings

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from app.commands.service import Data, settings_from
-from lensmodel.cli.console import display
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.console.options import Json, Quiet
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import Json, Quiet
 
 if TYPE_CHECKING:
     from app.blobs.storage import Storage
@@ -47,7 +47,7 @@ def doctor(
     from app.runtime import doctor as examination  # noqa: PLC0415 - same
     from app.store.upkeep import transfer  # noqa: PLC0415 - same
 
-    shown = display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, verbose=0)
     settings = _existing(data)
     with _opened(settings) as (store, storage):
         transfer.check_schema(store.database)
@@ -90,7 +90,7 @@ def backup(
 
     from app.runtime import backup as copies  # noqa: PLC0415 - same
 
-    shown = display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, verbose=0)
     settings = _existing(data)
     with _opened(settings) as (store, storage), shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
@@ -126,7 +126,7 @@ def restore(
     """
     from app.runtime import backup as copies  # noqa: PLC0415 - only this command needs it
 
-    shown = display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, verbose=0)
     settings = settings_from(data)
     with _stopped(settings), _opened(settings) as (store, storage), shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
@@ -166,7 +166,7 @@ def migrate(
     from app.runtime import backup as copies  # noqa: PLC0415 - only this command needs it
     from app.store.database import Database  # noqa: PLC0415 - same
 
-    shown = display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, verbose=0)
     settings = _existing(data)
     if to == settings.database:
         raise UsageError("--to is the database that is in use already")

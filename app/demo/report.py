@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from app.demo.measure import Sharpness, improved
-from lensmodel.cli.words import mtf50_words
+from lensmodel.cli.console import mtf50_words
 from lensmodel.core.types import ZONES, Zone
 
 _JUDGED: tuple[Zone, ...] = ("center", "corner")

@@ -21,7 +21,7 @@ from app.store.access.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.workflow.ways import WAYS
+from lensmodel.workflow.sampling import WAYS
 
 log = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ from app.store.tables import LensRow
 from app.store.versions import report_key
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.correction import Bounds
-from lensmodel.workflow.ways import WAYS
+from lensmodel.workflow.sampling import WAYS
 
 log = logging.getLogger(__name__)
 

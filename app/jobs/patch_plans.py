@@ -8,7 +8,7 @@ from typing import Any
 from app.store import NewPatch
 from app.store.tables import PatchRow
 from lensmodel.core.types import FieldPosition
-from lensmodel.estimation.patches import Patch
+from lensmodel.patches import Patch
 
 
 def plan_of(selection: dict[str, Any]) -> list[NewPatch]:

@@ -1,6 +1,6 @@
 """The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
 
-The order of the steps is the library's (`lensmodel.workflow.sampling.take`). Each reads the tables first
+Each step reads the tables first
 and does only what is not done yet. So the job may be started again at any time, by any worker, and still
 every effect happens once.
 """
@@ -33,8 +33,8 @@ from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, Pho
 from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
-from lensmodel.workflow import pipeline
-from lensmodel.workflow.ways import Way
+from lensmodel.workflow import sampling
+from lensmodel.workflow.sampling import Way
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class PhotoWork:
                 read_in(self._context, photo)
                 return
             steps = _Measured if photo.given.get("kind") else _Steps
-            pipeline.take(steps(self._context, self._engine, photo))
+            steps(self._context, self._engine, photo).run()
         except NotWantedError:
             log.info("photo %s is not wanted any more", photo_id)
         except JobFailedError as error:
@@ -104,7 +104,6 @@ class PhotoWork:
             "settings": stored_settings(photo),
             "estimator": way.estimator,
             "size": way.kernel_size,
-            "seed": rows[0].idx,
         }
         limits = self._context.limits(photo, settings.patch_seconds, 24)
         with self._context.sandbox.folder() as folder:
@@ -122,7 +121,7 @@ class PhotoWork:
 
 
 class _Steps:
-    """`PhotoSteps` by rows and tasks: each reads the tables first, and does only what is not done yet."""
+    """The work on a photo by rows and tasks: each step does only what the tables do not have yet."""
 
     def __init__(self, context: JobContext, engine: JobEngine, photo: PhotoRow) -> None:
         self._context, self._engine, self._photo = context, engine, photo
@@ -135,6 +134,18 @@ class _Steps:
 
     def _wanted(self) -> bool:
         return self._store.photos.is_live(self._photo.public_id, self._photo.epoch)
+
+    def run(self) -> None:
+        """Take the photo through all steps."""
+        if not self.inspect():
+            return
+        self.enter("developing")
+        self.develop()
+        self.enter("selecting")
+        self.select()
+        self.enter("estimating")
+        self.estimate()
+        self.count()
 
     def inspect(self) -> bool:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
@@ -201,7 +212,7 @@ class _Steps:
             )
         return not missing
 
-    def enter(self, stage: pipeline.Stage) -> None:
+    def enter(self, stage: sampling.Stage) -> None:
         """Move to the next state; a photo that is already further stays there."""
         photo, before = self._photo, _BEFORE[stage]
         if not self._store.photos.set_state(photo.public_id, (before, stage), stage, epoch=photo.epoch):
@@ -284,7 +295,7 @@ class _Steps:
         done = [row for row in tried if row.state == "done"]
         if done:
             try:
-                pipeline.require_spread([patch_of(row) for row in done], count=self._way.patches)
+                sampling.require_spread([patch_of(row) for row in done], count=self._way.patches)
             except NoUsablePatchesError as error:
                 raise JobFailedError(error.code, str(error)) from error
         if len(done) < settings.min_good_patches:

@@ -20,7 +20,7 @@ from app.sandbox.outcome import MAX_RESULT
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
-from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
+from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
 
 MAX_SIDE: Final = 255
 """Pixels across a returned kernel at most (chosen): as in a profile, docs/topics/profile-format.md."""

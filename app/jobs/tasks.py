@@ -38,20 +38,20 @@ from app.jobs.task_files import (
 from app.sandbox.child import ProgressHook, Task
 from app.schemas import distances
 from lensmodel import correction, photo
+from lensmodel import measured as lens_measure
+from lensmodel.blind import estimators
 from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.correction.engine import first_use
-from lensmodel.estimation import estimators
-from lensmodel.estimation import measure as lens_measure
-from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
+from lensmodel.patches import Patch, selectors
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.tags.location import find_location
 from lensmodel.report import lens_report
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import correcting, sampling
 
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     del progress
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
-    pipeline.save_developed(developed, folder)
+    sampling.save_developed(developed, folder)
     (folder / PREVIEW).write_bytes(previews.preview(developed))
     (folder / R_MAP).write_bytes(previews.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
@@ -131,8 +131,8 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Choose the patches of the photo developed in `developed`, and measure its lateral colour."""
     del folder
-    developed = pipeline.load_developed(Path(arguments["developed"]))
-    selection = pipeline.find_patches(
+    developed = sampling.load_developed(Path(arguments["developed"]))
+    selection = sampling.find_patches(
         developed,
         count=arguments["count"],
         selector=arguments["selector"],
@@ -146,7 +146,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
         place = {"row": window.row, "col": window.col, "size": window.size}
         rejected.append({**place, "r": position.r, "phi": position.phi, "reason": window.reason})
     try:
-        lateral = codec.to_json(pipeline.lateral_of(developed))
+        lateral = codec.to_json(correcting.lateral_of(developed))
     except LensModelError as error:
         log.info("no lateral colour: %s", error)
         lateral = None
@@ -158,17 +158,16 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
 
     The samples go to the folder.
     """
-    developed = pipeline.load_developed(Path(arguments["developed"]))
+    developed = sampling.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
     numbers = {(patch.row, patch.col): idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
-    results = pipeline.estimate_cell(
+    results = sampling.estimate_cell(
         developed,
         group,
         settings=_settings(arguments["settings"]),
         photo_id=arguments["photo"],
         estimator=arguments["estimator"],
         size=arguments["size"],
-        seed=arguments["seed"],
         on_step=progress,
     )
     write_samples(folder, [result.sample for result in results])
@@ -186,7 +185,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     The photo's own samples join them, unless they are there already: `photo` is what they are called.
     """
     _log_compiling()
-    developed = pipeline.load_developed(Path(arguments["developed"]))
+    developed = sampling.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
     output = arguments["output"]
@@ -195,7 +194,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     settings = _settings(arguments["settings"])
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
-    corrected = pipeline.correct_photo(
+    corrected = correcting.correct_photo(
         developed,
         model,
         settings,
@@ -266,7 +265,7 @@ def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     """Measure the PSF on photos made for it, in `developed`; samples go to the folder."""
-    photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
+    photos = [sampling.load_developed(Path(name)) for name in arguments["developed"]]
     method = lens_measure.methods.create(arguments["kind"])
     measurements = method.measure(photos, size=arguments["size"], on_step=progress)
     samples = lens_measure.samples_of(
@@ -342,7 +341,7 @@ def _log_compiling() -> None:
 
 def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
     try:
-        return pipeline.lateral_of(developed)
+        return correcting.lateral_of(developed)
     except LensModelError as error:
         log.info("corrected without lateral colour: %s", error)
         return None

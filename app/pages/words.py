@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from app.pages.groups import WaitingGroup
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
-from lensmodel.cli.words import gain_words
+from lensmodel.cli.console import gain_words
 from lensmodel.core.types import FieldPosition
 from lensmodel.correction.audit import HELD
 from lensmodel.report import Centring, Unit, little_seen, place_in_words

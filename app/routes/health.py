@@ -28,9 +28,9 @@ from app.schemas import (
     VersionOut,
 )
 from app.store.upkeep import migrate
+from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
-from lensmodel.estimation import estimators
-from lensmodel.estimation.patches import selectors
+from lensmodel.patches import selectors
 
 FRESH_S: Final = 2.0
 """Seconds for which `/readyz` repeats its answer (chosen): strangers who ask often cost nothing."""

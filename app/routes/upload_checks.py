@@ -6,7 +6,7 @@ from app.errors import ConflictError, InvalidParameterError
 from app.schemas import UploadFields
 from app.store.tables import LensRow
 from lensmodel.core.errors import UnknownMethodError
-from lensmodel.estimation.patches import selectors
+from lensmodel.patches import selectors
 
 
 def check_selector(fields: UploadFields) -> None:

@@ -213,7 +213,7 @@ class Settings(BaseSettings):
     def _known_estimator(self) -> Settings:
         if self.estimator != "default":
             # not at the top: heavy, and most processes never ask for another one
-            from lensmodel.estimation import estimators  # noqa: PLC0415
+            from lensmodel.blind import estimators  # noqa: PLC0415
 
             try:
                 estimators.create(self.estimator)
@@ -229,7 +229,7 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _known_selector(self) -> Settings:
         if self.selector != "r-map":
-            from lensmodel.estimation.patches import selectors  # noqa: PLC0415 - as above
+            from lensmodel.patches import selectors  # noqa: PLC0415 - as above
 
             try:
                 selectors.create(self.selector)

@@ -32,7 +32,7 @@ from app.sandbox import confine
 from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep import migrate
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 

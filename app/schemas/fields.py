@@ -39,7 +39,7 @@ def _odd(value: int) -> int:
 
 
 PsfModel = Literal["default", "paper"]
-"""How a lens is learned and its photos are corrected: names of `lensmodel.workflow.ways`."""
+"""How a lens is learned and its photos are corrected: names of `lensmodel.workflow.sampling`."""
 
 
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]

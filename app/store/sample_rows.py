@@ -1,4 +1,4 @@
-"""PSF samples in the tables: the fields of `lensmodel.model.sample_codec`, each with its column."""
+"""PSF samples in the tables: the fields of `lensmodel.model.samples`, each with its column."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.store.access.owners import now
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import EncodedPatch, PsfSample
-from lensmodel.model.sample_codec import entry_of, sample_of
+from lensmodel.model.samples import entry_of, sample_of
 
 DTYPE: Final = "<f4"
 FORMAT_VERSION: Final = 2

@@ -34,11 +34,11 @@ from lab.blind.judges import Judge, judges, squared_error
 from lab.blind.methods import compared
 from lab.cases import CHOICES, HALVES, BlindCase, Choice, Half, list_photos, load_psfs, make_cases, observe
 from lab.page import table
+from lensmodel.blind import PsfEstimator
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, StepHook, ignore_step
-from lensmodel.estimation import PsfEstimator
 
 logger = logging.getLogger(__name__)
 
@@ -406,7 +406,6 @@ def _run_job(job: _Job) -> list[CaseResult]:
                     [seen.patch],
                     [seen.noise],
                     size=job.kernel_size,
-                    rng=np.random.default_rng(job.case.seed),
                 )
             except NotEnoughEvidenceError as error:
                 logger.info("%s declined %s: %s", name, job.case.name, error)

@@ -1,4 +1,4 @@
-"""Fit the expected error of patch recurrence: `recurrence_error` in lensmodel/estimation/data/fitted.json.
+"""Fit the expected error of patch recurrence: `recurrence_error` in lensmodel/blind/data/fitted.json.
 
     lensmodel bench blind --photos sharp/ --methods michaeli-irani --half dev --noise 0.01 --cases 24
     python -m lab.blind.recurrence_line bench-output/blind.json
@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.cases import photo_half, psf_half
+from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.core.files import fitted
-from lensmodel.estimation.methods.patch_recurrence import PatchRecurrence
 
-_USED: Final[Mapping[str, float]] = fitted("estimation")["recurrence_error"]
+_USED: Final[Mapping[str, float]] = fitted("blind")["recurrence_error"]
 
 Floats = NDArray[np.float64]
 

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from lab.commands.gallery import gallery
-from lensmodel.cli.console import display
-from lensmodel.cli.console.display import Display
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.console.files import as_usage, refuse_existing
-from lensmodel.cli.console.options import Force, Quiet, Verbose
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.files import as_usage, refuse_existing
+from lensmodel.cli.options import Force, Quiet, Verbose
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 
@@ -72,7 +71,7 @@ bench.command()(gallery)
 @bench.callback()
 def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) -> None:
     """Run the three quick ones unless one is named."""
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     context.obj = shown
     if context.invoked_subcommand is None:
         from lab.blind.benchmark import BlindBenchmark, markdown_table  # noqa: PLC0415 - see the top
@@ -134,7 +133,7 @@ def blind(
         write_report,
     )
 
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
     with as_usage():
         settings = BlindBenchmark(
@@ -195,7 +194,7 @@ def model(
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
     try:
         first, last = (int(part) for part in seeds.split(":"))
@@ -272,7 +271,7 @@ def correct(
     """
     from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - see the top of the module
 
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")

@@ -9,9 +9,9 @@ from typing import Annotated, Final
 
 import typer
 
-from lensmodel.cli.console import display
-from lensmodel.cli.console.files import as_usage
-from lensmodel.cli.console.options import Quiet, Verbose
+from lensmodel.cli.console import Display
+from lensmodel.cli.files import as_usage
+from lensmodel.cli.options import Quiet, Verbose
 
 DATA_VARIABLE: Final = "LENSMODEL_TEST_DATA"
 
@@ -59,7 +59,7 @@ def gallery(
     from lab.gallery import pictures, run  # noqa: PLC0415 - it needs half of SciPy
     from lab.gallery.page import text, write_page  # noqa: PLC0415 - same
 
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     named = os.environ.get(DATA_VARIABLE)
     folder = data or (Path(named) if named else None)
     began = time.monotonic()

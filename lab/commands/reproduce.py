@@ -9,9 +9,9 @@ from typing import Annotated, Literal, cast, get_args
 
 import typer
 
-from lensmodel.cli.console import display
-from lensmodel.cli.console.files import refuse_existing
-from lensmodel.cli.console.options import Force, Quiet, Verbose, choice
+from lensmodel.cli.console import Display
+from lensmodel.cli.files import refuse_existing
+from lensmodel.cli.options import Force, Quiet, Verbose, choice
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
 Size = Literal["quick", "small", "default", "full"]
@@ -96,7 +96,7 @@ def reproduce(
 
     Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
     """
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(*(output / name for name in PAGE), force=force)
     from lab.reproduce.bars import missed  # noqa: PLC0415 - the simulation is slow to import
     from lab.reproduce.cases import planned  # noqa: PLC0415 - same

@@ -24,7 +24,7 @@ from lab.correction.correction_benchmark import SoftCorners
 from lensmodel.correction import correct_planes
 from lensmodel.photo import develop, write_image
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.workflow.pipeline import lateral_of
+from lensmodel.workflow.correcting import lateral_of
 
 
 def write_photo(path: Path, megapixels: float) -> None:

@@ -31,7 +31,7 @@ from lensmodel.core.files import atomic
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import develop
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 from lensmodel.workflow.lens import Lens
 
 OnPicture = Callable[[str, int, int], None]
@@ -297,7 +297,7 @@ def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings,
     reasons: list[str] = []
     heard_last = [""]
 
-    def heard(event: pipeline.CalibrationEvent) -> None:
+    def heard(event: sampling.CalibrationEvent) -> None:
         if event.stage == "skipped":
             reasons.append(event.detail)
         quarter = f" {25 * (4 * event.done // event.total)} %" if event.total else ""

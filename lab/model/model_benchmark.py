@@ -30,7 +30,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfSample, as_kernel, centred, distance
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
-from lensmodel.model import LensModel, ModelSettings, smoothers
+from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model.answer import MODES
 from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)
@@ -101,7 +102,7 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, "eff-linear", "polynomial" or "paper"; by default all.
+        "eff-linear", "polynomial", "paper", "mode-default" or "mode-paper"; by default all.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     on_step : StepHook
@@ -195,7 +196,7 @@ def _fits(methods: Sequence[str] | None) -> dict[str, Fit]:
         "eff-linear": _linear,
         "polynomial": _polynomial,
         "paper": _paper,
-        **{name: _regression(ModelSettings(method=name)) for name in smoothers},
+        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
     }
     unknown = [name for name in methods or () if name not in known]
     if unknown:

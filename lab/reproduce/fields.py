@@ -15,11 +15,11 @@ from lab import targets
 from lab.correction.filter_flow import EfficientFilterFlow
 from lab.model.model_benchmark import PATCHES, asked_places, patch_places, predictor
 from lab.reproduce.cases import Case
+from lensmodel import measured as measure
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel, delta, distance
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings
-from lensmodel.estimation import measure
-from lensmodel.estimation.measure.target import Target
+from lensmodel.measured.target import Target
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, SimulatedField, draw_lens, photograph, write_photo
@@ -31,7 +31,7 @@ COPIES: Final = 6
 """Lenses that a profile of a third-order lens is the mean of (chosen: a maker measures a few)."""
 
 EFF: Final = "efficient filter flow"
-REGRESSIONS: Final = {"the paper's regression": "paper", "regression of today's default": "combined"}
+REGRESSIONS: Final = {"the paper's regression": "paper", "regression of today's default": "mode-default"}
 FRAME: Final = Frame(288, 432)
 """Of the flow. Weights depend on the place in the field alone: a small frame is as good as a large one."""
 

@@ -19,11 +19,11 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width
 from lensmodel.core.types import FieldPosition, Kernel, Plane
-from lensmodel.estimation.patches import r_map
 from lensmodel.model import LensModel
+from lensmodel.patches import r_map
 from lensmodel.photo import develop
 from lensmodel.quality.images import Picture, as_shown, crop_boxes
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 
 # Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))
@@ -96,10 +96,10 @@ def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int) -> dict[st
     with TemporaryDirectory(prefix="lensmodel-figure-") as work:
         shots = take(case, plan.files(), Path(work), first=1)
         developed = develop(shots.learn[0])
-        recipe = pipeline.Recipe(estimator=plan.estimator)
-        chosen = pipeline.find_patches(developed, count=recipe.patches, estimator=recipe.method)
+        recipe = sampling.Recipe(estimator=plan.estimator)
+        chosen = sampling.find_patches(developed, count=recipe.patches, estimator=recipe.method)
         try:
-            samples = pipeline.samples_of_photo(shots.learn[0], recipe, workers=workers)
+            samples = sampling.samples_of_photo(shots.learn[0], recipe, workers=workers)
         except LensModelError as error:
             return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]

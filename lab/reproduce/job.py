@@ -42,7 +42,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality.images import as_shown
-from lensmodel.workflow.ways import WAYS, Way
+from lensmodel.workflow.sampling import WAYS, Way
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)
 CONTROL: Final = "standard"

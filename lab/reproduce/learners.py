@@ -17,8 +17,8 @@ from lensmodel.correction import correct_planes
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.lateral import LateralColour, resample
-from lensmodel.workflow import pipeline
-from lensmodel.workflow.ways import WAYS, Way
+from lensmodel.workflow import correcting, sampling
+from lensmodel.workflow.sampling import WAYS, Way
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
 
@@ -88,7 +88,7 @@ def paper_way(case: Case) -> Way:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
         return WAYS["paper"]
-    return replace(WAYS["paper"], kernel_size=pipeline.DEFAULT_KERNEL_SIZE)
+    return replace(WAYS["paper"], kernel_size=sampling.DEFAULT_KERNEL_SIZE)
 
 
 class LibraryLearner:
@@ -112,7 +112,7 @@ class LibraryLearner:
 
     def learn(self, photo: Path) -> str:
         """Learn from one more photo; see `Learner`."""
-        name = pipeline.photo_id(photo)
+        name = sampling.photo_id(photo)
         if name in self._seen:
             return self._seen[name]
         self._seen[name] = self._learned(photo, name)
@@ -129,9 +129,9 @@ class LibraryLearner:
         else:
             try:
                 samples = tuple(
-                    pipeline.samples_of_photo(
+                    sampling.samples_of_photo(
                         photo,
-                        pipeline.Recipe(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
+                        sampling.Recipe(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
                         workers=self._workers,
                     )
                 )
@@ -151,12 +151,12 @@ class LibraryLearner:
     def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
         """Correct a photo; see `Learner`."""
         developed = develop(photo)
-        done = pipeline.correct_photo(
+        done = correcting.correct_photo(
             developed,
             self._known(),
-            pipeline.settings_of(developed),
+            sampling.settings_of(developed),
             method=method,
-            lateral=pipeline.lateral_of(developed),
+            lateral=correcting.lateral_of(developed),
             workers=self._workers,
         )
         expected: dict[str, float | None] = {
@@ -173,9 +173,9 @@ class LibraryLearner:
 def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, workers: int = 1) -> Planes:
     """Correct a photo with a PSF field taken as right, as learners do with theirs."""
     planes, cfa = developed.planes, developed.cfa
-    lateral: LateralColour | None = pipeline.lateral_of(developed)
+    lateral: LateralColour | None = correcting.lateral_of(developed)
     if method == "paper" and lateral is not None:
-        # the same way as `pipeline.correct_photo` goes, so that only the PSFs differ
+        # the same way as `correcting.correct_photo` goes, so that only the PSFs differ
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correct_planes(
         planes,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import FieldPosition, NoiseModel, Plane, Planes
 from lensmodel.photo import LinearPhoto
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 
 PATCHES = 48
 """Patches looked at in one photo: twice those of a calibration, because rivals are cheap."""
@@ -62,7 +62,7 @@ def windows_of(photos: Sequence[LinearPhoto]) -> list[PhotoWindow]:
     """Cut the windows that tell about the blur, chosen in green as a calibration does."""
     found = []
     for photo in photos:
-        for patch in pipeline.find_patches(photo, count=PATCHES).patches:
+        for patch in sampling.find_patches(photo, count=PATCHES).patches:
             rows, cols = slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size)
             planes = np.ascontiguousarray(photo.planes[:, rows, cols])
             found.append(PhotoWindow(planes, photo.noise, patch.position))

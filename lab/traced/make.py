@@ -19,7 +19,7 @@ from lensmodel.core.types import CHANNELS, FieldPosition, StepHook, ignore_step
 logger = logging.getLogger(__name__)
 
 DEFAULT_STEP: Final = 0.1
-"""Distance of the nodes in half diagonals, that of `lensmodel.simulate.blur`."""
+"""Distance of the nodes in half diagonals, that of `lensmodel.simulate.camera`."""
 
 
 def make_grid(

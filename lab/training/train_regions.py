@@ -1,4 +1,4 @@
-"""Train and judge the learned choice of patches (`lensmodel.estimation.patches.good_regions`).
+"""Train and judge the learned choice of patches (`lensmodel.patches.good_regions`).
 
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz
@@ -27,16 +27,15 @@ from scipy import signal, stats
 from lab.blind.judges import HyperLaplacian, squared_error
 from lab.blind.methods import compared
 from lab.cases import list_photos, photo_half, scene_of
+from lensmodel.blind import PsfEstimator
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
-from lensmodel.estimation import PsfEstimator
-from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE, measure_blocks
-from lensmodel.estimation.patches.details import joined_details, look_at
-from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble, features_of
-from lensmodel.estimation.patches.select import RMapSelector, first_reasons
-from lensmodel.estimation.patches.windows import windows_of
+from lensmodel.patches.checks import joined_details, look_at
+from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
+from lensmodel.patches.select import RMapSelector, first_reasons
+from lensmodel.patches.windows import BLOCKS_A_SIDE, measure_blocks, windows_of
 from lensmodel.simulate import draw_lens
 
 SIZE: Final = 192  # pixels of a window: that of a calibration

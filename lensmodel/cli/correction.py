@@ -14,17 +14,16 @@ from rich.progress import Progress, TaskID
 
 import lensmodel
 from lensmodel import correction
-from lensmodel.cli.console import files
-from lensmodel.cli.console.display import Display
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.words import gain_words, mtf50_words
+from lensmodel.cli import files
+from lensmodel.cli.console import Display, gain_words, mtf50_words
+from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.endings import CORRECTED
 from lensmodel.workflow.api import FORMATS
-from lensmodel.workflow.identity import Identity, difference
+from lensmodel.workflow.calibrating import Identity, difference
 from lensmodel.workflow.lens import Lens
 
 EXTENSION: Final[dict[OutputFormat | None, str]] = {

@@ -1,10 +1,20 @@
-"""`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains."""
+"""`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains.
+
+A folder of photos, sorted by what took them: one copy of a lens, one focal length.
+
+What a run over a folder found out and need not find out again: a small JSON file beside its results.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -12,19 +22,20 @@ from typing import Any, Final
 import typer
 from rich.progress import Progress, TaskID
 
+from lensmodel import blind, patches
 from lensmodel import correction as corrections
-from lensmodel import estimation
-from lensmodel.cli import calibration, correction
-from lensmodel.cli.console import files
-from lensmodel.cli.console.display import Display
-from lensmodel.cli.console.table import aligned
-from lensmodel.cli.grouping import PhotoGroup, Shot, groups
-from lensmodel.cli.journal import Journal
-from lensmodel.cli.words import gain_words
+from lensmodel.cli import calibrate, correction, files
+from lensmodel.cli.console import Display, aligned, gain_words
+from lensmodel.core import processes
 from lensmodel.core.errors import LensModelError
+from lensmodel.core.files import atomic
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.types import LensSettings
 from lensmodel.correction.expected_gain import WORTH_DB
-from lensmodel.workflow import pipeline
+from lensmodel.photo import inspect
+from lensmodel.photo.values import PhotoMetadata
+from lensmodel.workflow import calibrating, sampling
+from lensmodel.workflow.calibrating import Identity
 from lensmodel.workflow.lens import Lens
 
 LEARN_FROM: Final = 8
@@ -83,19 +94,19 @@ def run(
     paths = files.photos(names)
     targets, twice = correction.targets_of(paths, output, options.file_format)
     with files.as_usage():
-        estimation.estimators.create(learning.estimator)
-        estimation.patches.selectors.create(learning.selector)
+        blind.estimators.create(learning.estimator)
+        patches.selectors.create(learning.selector)
         if options.method is not None:
             corrections.deconvolvers.create(options.method)
         LensSettings(aperture=options.aperture)
     base = next(iter({**targets, **twice})).parent
     options = replace(options, least_gain_db=WORTH_DB)
-    work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display)
     shots, failed = _read(list(targets.values()), display)
     results = [*correction.clashes(twice, display), *failed]
     lens_groups = groups(shots)
     by_path = {path: target for target, path in targets.items()}
-    with display.progress() as bars:
+    with processes.pool(None, options.workers) as pool, display.progress() as bars:
+        work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display, pool)
         for group in lens_groups:
             work.learn(group, bars)
         rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in lens_groups]
@@ -130,12 +141,13 @@ class _Folder:
         options: correction.CorrectionOptions,
         learning: Learning,
         display: Display,
+        pool: Executor,
     ) -> None:
         self._profiles, self._options, self._learning = profiles, options, learning
-        self._display = display
+        self._display, self._pool = display, pool
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
-        self._calibrations: dict[Path, pipeline.Calibration] = {}
+        self._calibrations: dict[Path, calibrating.Calibration] = {}
 
     def profile_of(self, group: PhotoGroup) -> Path:
         """Name the file of a group's lens profile."""
@@ -160,8 +172,8 @@ class _Folder:
         bars.remove_task(task)
         self._learned[group.name, group.focal] = counted
 
-    def _calibration(self, target: Path) -> pipeline.Calibration:
-        options = calibration.CalibrationOptions(
+    def _calibration(self, target: Path) -> calibrating.Calibration:
+        options = calibrate.CalibrationOptions(
             aperture=self._options.aperture,
             estimator=self._learning.estimator,
             workers=self._options.workers,
@@ -169,11 +181,11 @@ class _Folder:
             force=False,
             selector=self._learning.selector,
         )
-        return calibration.calibration_of(target, options)
+        return calibrate.calibration_of(target, options, self._pool)
 
-    def _learns(self, calibrated: pipeline.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
+    def _learns(self, calibrated: calibrating.Calibration, shot: Shot, on_event: sampling.EventHook) -> bool:
         """Learn from one photo; return whether it counts, now or from an earlier run."""
-        photo = pipeline.photo_id(shot.path)
+        photo = sampling.photo_id(shot.path)
         learning, options = self._learning, self._options
         under = (
             f"{learning.estimator}, {learning.selector}, aperture {options.aperture}, any {options.any_lens}"
@@ -228,7 +240,7 @@ class _Folder:
     ) -> dict[str, Any]:
         if lens is None:
             return {"state": "left", "reason": "its lens could not be learned from these photos"}
-        photo = pipeline.photo_id(shot.path)
+        photo = sampling.photo_id(shot.path)
         samples = len(lens.profile.model.samples)
         options = self._options
         under = (
@@ -264,7 +276,7 @@ class _Folder:
                 self._display.detail(f"{path.name}, {line}")
 
 
-def _learning(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
+def _learning(bars: Progress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
     share = event.done / event.total if event.total else 0.0
     bars.update(
         task, description=f"learning from {event.photo.name}: {event.stage}", completed=number + share
@@ -307,3 +319,204 @@ def _table(rows: Sequence[GroupResult]) -> str:
         for row in rows
     ]
     return aligned(head, lines, numbers=range(3, 9))
+
+
+SAME_FOCAL: Final = 1.19
+"""Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
+(`focal_octaves` in `lensmodel.model.variables`)."""
+
+BURST: Final = timedelta(seconds=2)
+"""Photos at the same settings that follow each other within this time show the same (chosen)."""
+
+MOST_IN_NAME: Final = 80
+"""Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One photo and what its file says."""
+
+    path: Path
+    metadata: PhotoMetadata
+    half_diagonal_mm: float = 0.0
+
+    @classmethod
+    def of(cls, path: Path) -> Shot:
+        """Read the header of a photo."""
+        info = inspect(path)
+        pitch = info.metadata.pixel_pitch_um or 0.0
+        return cls(path, info.metadata, math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0)
+
+    @property
+    def owner(self) -> tuple[str, ...]:
+        """What two photos of one copy of a lens agree in: its serial, or that of the body it was on."""
+        said = self.metadata
+        lens = (name_key(said.lens.model), serial_key(said.lens.serial))
+        if said.lens.serial:
+            return lens
+        return (*lens, name_key(said.camera_model), serial_key(said.body_serial))
+
+    @property
+    def names_lens(self) -> bool:
+        """Whether the file says which lens it was."""
+        return Identity.of(self.metadata).names_lens
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoGroup:
+    """Photos of one lens, of one body where the lens has no serial, and of about one focal length.
+
+    Parameters
+    ----------
+    shots : tuple of Shot
+        By name; at least one.
+    name : str
+        Of the lens profile that the group belongs to, without an ending. A lens that the files name has one
+        for all its focal lengths, since a profile tells them apart; photos that name no lens may be of as
+        many lenses as there are focal lengths.
+    """
+
+    shots: tuple[Shot, ...]
+    name: str
+
+    @property
+    def camera(self) -> str:
+        """The body in words."""
+        return self.shots[0].metadata.camera_model or "unknown camera"
+
+    @property
+    def lens(self) -> str:
+        """The lens in words; its serial shortened, as tables are shown around."""
+        said = self.shots[0].metadata.lens
+        serial = f" #{said.serial[-4:]}" if said.serial else ""
+        return f"{said.model or 'lens not named'}{serial}"
+
+    @property
+    def focal(self) -> str:
+        """The focal length in words."""
+        known = [shot.metadata.focal_mm for shot in self.shots if shot.metadata.focal_mm]
+        if not known:
+            return "unknown"
+        low, high = f"{min(known):.3g}", f"{max(known):.3g}"
+        return f"{low} mm" if low == high else f"{low}-{high} mm"
+
+    @property
+    def scenes(self) -> int:
+        """How many different things the photos show: the frames of a burst are one."""
+        return len(_bursts(self.shots)[0])
+
+    def to_learn_from(self) -> list[Shot]:
+        """Return the photos in the order in which they tell most: each aperture's first one, then the second.
+
+        A photo whose aperture is unknown comes last, and later frames of a burst after all (`scenes`).
+        """
+        first, again = _bursts(self.shots)
+        return [*_by_aperture(first), *_by_aperture(again)]
+
+
+def _by_aperture(shots: Sequence[Shot]) -> list[Shot]:
+    by_aperture: dict[float, list[Shot]] = {}
+    # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
+    for shot in sorted(shots, key=lambda shot: -round(shot.half_diagonal_mm)):
+        by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
+    ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
+    longest = max(map(len, ordered), default=0)
+    return [group[i] for i in range(longest) for group in ordered if i < len(group)]
+
+
+def _bursts(shots: Sequence[Shot]) -> tuple[list[Shot], list[Shot]]:
+    """Part the photos into the first of each burst, and those that follow it at the same settings."""
+    first: list[Shot] = []
+    again: list[Shot] = []
+    last: dict[tuple[float | None, float | None], datetime] = {}
+    for shot in sorted(shots, key=lambda shot: (shot.metadata.taken_at or datetime.min, shot.path)):  # noqa: DTZ901  cameras' clocks have no zone
+        said = shot.metadata
+        settings = said.aperture, said.focal_mm
+        before = last.get(settings)
+        follows = said.taken_at is not None and before is not None and said.taken_at - before <= BURST
+        (again if follows else first).append(shot)
+        if said.taken_at is not None:
+            last[settings] = said.taken_at
+    return sorted(first, key=lambda shot: shot.path), sorted(again, key=lambda shot: shot.path)
+
+
+def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
+    """Sort photos by body, lens and focal length."""
+    owners: dict[tuple[str, ...], list[Shot]] = {}
+    for shot in shots:
+        owners.setdefault(shot.owner, []).append(shot)
+    all_groups: list[PhotoGroup] = []
+    names: set[str] = set()
+    for owner in sorted(owners):
+        runs = _by_focal(owners[owner])
+        shared = _free(_name(runs[0][0], with_focal=False), names) if runs[0][0].names_lens else None
+        for run in runs:
+            name = shared or _free(_name(run[0], with_focal=True), names)
+            names.add(name)
+            all_groups.append(PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name))
+    return all_groups
+
+
+def _by_focal(shots: Sequence[Shot]) -> list[list[Shot]]:
+    """Cut into runs in which no focal length is more than `SAME_FOCAL` times the shortest."""
+    runs: list[list[Shot]] = []
+    start = -1.0
+    for shot in sorted(shots, key=lambda shot: shot.metadata.focal_mm or 0.0):
+        focal = shot.metadata.focal_mm or 0.0
+        if not runs or focal > start * SAME_FOCAL:
+            runs.append([])
+            start = focal
+        runs[-1].append(shot)
+    return runs
+
+
+def _name(shot: Shot, *, with_focal: bool) -> str:
+    said = shot.metadata
+    focal = f"{said.focal_mm:g}mm" if with_focal and said.focal_mm else None
+    words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], focal]
+    plain = re.sub(r"[^\w.+-]+", "-", "-".join(word for word in words if word)).strip("-.")
+    return plain[:MOST_IN_NAME] or "unknown-camera"
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Two copies whose serials end alike get a number."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free
+
+
+NAME: Final = ".lensmodel-folder.json"
+
+
+class Journal:
+    """Verdicts by photo, each valid as long as what it was given under is unchanged.
+
+    Written after each verdict, complete or not at all: a run that was stopped goes on where it was.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        self._verdicts: dict[str, list[str]] = {}
+        try:
+            stored = json.loads(self._path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # none yet, or damaged: every verdict is determined anew
+            return
+        if isinstance(stored, dict):
+            self._verdicts = {
+                key: [str(text) for text in value]
+                for key, value in stored.items()
+                if isinstance(value, list) and len(value) == 2  # a condition and a verdict
+            }
+
+    def verdict(self, kind: str, photo: str, under: str) -> str | None:
+        """Return the verdict on a photo under the same conditions, or None."""
+        given, text = self._verdicts.get(f"{kind} {photo}", ["", ""])
+        return text if given == under and text else None
+
+    def note(self, kind: str, photo: str, under: str, text: str) -> None:
+        """Store the verdict on a photo."""
+        self._verdicts[f"{kind} {photo}"] = [under, text]
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(self._path) as file:
+            file.write(json.dumps(self._verdicts, indent=1, ensure_ascii=False).encode())

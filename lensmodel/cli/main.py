@@ -15,12 +15,13 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from lensmodel.cli.console import display, extras, interrupt
-from lensmodel.cli.console.failure import InterruptedByUser, UsageError
-from lensmodel.cli.console.on_demand import CommandEntry, OnDemand
+from lensmodel.cli import ending
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import InterruptedByUser, UsageError
+from lensmodel.cli.on_demand import CommandEntry, OnDemand
 from lensmodel.core.errors import LensModelError
 
-interrupt.workers_ignore_it()
+ending.workers_ignore_it()
 
 
 class Commands(OnDemand):
@@ -28,23 +29,23 @@ class Commands(OnDemand):
 
     entries: ClassVar[Mapping[str, CommandEntry]] = {
         "calibrate": CommandEntry(
-            "lensmodel.cli.photos:calibrate", "Learn the blur of one lens from photos, into a profile."
+            "lensmodel.cli.calibrate:calibrate", "Learn the blur of one lens from photos, into a profile."
         ),
-        "correct": CommandEntry("lensmodel.cli.photos:correct", "Remove the blur of the lens from photos."),
+        "correct": CommandEntry("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos."),
         "check": CommandEntry(
-            "lensmodel.cli.checking:check",
+            "lensmodel.cli.check:check",
             "Find where a photo corrected by any program shows what the original cannot have contained.",
         ),
         "psf": CommandEntry(
-            "lensmodel.cli.photos:psf",
+            "lensmodel.cli.psf:psf",
             "Show what the lens makes of a point of light at one place in the picture.",
         ),
         "measure": CommandEntry(
-            "lensmodel.cli.measurement:measure",
+            "lensmodel.cli.measure:measure",
             "Measure the blur of a lens from photos made for the purpose, into a profile.",
         ),
         "target": CommandEntry(
-            "lensmodel.cli.measurement:target", "Write the page to print for `lensmodel measure target`."
+            "lensmodel.cli.measure:target", "Write the page to print for `lensmodel measure target`."
         ),
         "report": CommandEntry(
             "lensmodel.cli.report:report",
@@ -136,21 +137,21 @@ def configure(
 ) -> None:
     """Learn the blur of one copy of a lens from ordinary photos, and remove it."""
     del version
-    shown = display.Display(quiet, verbose)
+    shown = Display(quiet, verbose)
     shown.configure()
     context.obj = shown
 
 
 def main() -> None:
     """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 128 + signal interrupted."""
-    interrupt.install()
+    ending.install()
     try:
         app(prog_name="lensmodel")  # also where `python -m lensmodel` runs it
     except LensModelError as error:
         typer.echo(f"lensmodel: {error}", err=True)
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except ModuleNotFoundError as error:
-        remedy = extras.remedy(error)
+        remedy = ending.remedy(error)
         if remedy is None:
             raise
         typer.echo(f"lensmodel: {remedy}", err=True)

@@ -11,9 +11,10 @@ from typing import Annotated, Final
 
 import typer
 
-from lensmodel.cli.console import display, files
-from lensmodel.cli.console.failure import UsageError
-from lensmodel.cli.console.options import (
+from lensmodel.cli import files
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import (
     ANGLE,
     RADIUS,
     Channel,
@@ -42,8 +43,8 @@ from lensmodel.report import (
     widest,
 )
 from lensmodel.report.documents import comparison_html, to_csv, to_html
-from lensmodel.report.errors import DRAWS
-from lensmodel.workflow.pipeline import lateral_of
+from lensmodel.report.lens_report import DRAWS
+from lensmodel.workflow.correcting import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
 Aspect = Annotated[
@@ -99,7 +100,7 @@ def report(
 
     Exit status: 0 reported, 1 the profile cannot be used, 2 called wrongly.
     """
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
         names = (*FILES, *(COMPARED if against else ()))
         files.refuse_existing(*(output / name for name in names), force=force)
@@ -232,7 +233,7 @@ def export_psfs(
 
     Exit status: 0 written, 1 the profile cannot be used, 2 called wrongly.
     """
-    shown = display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
     written = _format(output, file_format)
     files.refuse_existing(output, force=force)
     if phi is not None and r is None:

@@ -19,13 +19,7 @@ T = TypeVar("T")
 
 
 def to_json(value: Any) -> Any:
-    """Turn dataclasses, tuples, mappings, bytes, dates and numbers into what `json` can write.
-
-    Raises
-    ------
-    InvalidInputError
-        For a value of any other kind: nothing is written that cannot be read back.
-    """
+    """Turn dataclasses, tuples, mappings, bytes, dates and numbers into what `json` can write."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Enum):

@@ -56,11 +56,6 @@ def save_array(file: BinaryIO, array: NDArray[Any]) -> None:
 
     `numpy.save` writes to files by a C function and forgets why it failed: that a disk is full would pass
     for a fault of the program.
-
-    Raises
-    ------
-    OSError
-        With its number.
     """
     whole = np.ascontiguousarray(array)
     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(whole))

@@ -20,18 +20,7 @@ def nonnegative_least_squares(
     *,
     smallest: float = -np.inf,
 ) -> NDArray[np.float64]:
-    """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA).
-
-    Parameters
-    ----------
-    a : ndarray, shape (n, n)
-        Symmetric; directions of negative curvature, which noise correction can leave, are lifted.
-    b, start : ndarray, shape (n,)
-        Where A is zero, nothing is known and the start is returned.
-    steps : int
-    smallest : float
-        What no eigenvalue is below, if that is known: to find it out costs as much as all steps.
-    """
+    """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA)."""
     if not a.any():
         return start.copy()
     largest, lift = _largest_and_lift(a, smallest)

@@ -33,21 +33,7 @@ def in_order(
     *,
     ahead: int,
 ) -> Iterator[tuple[A, Future[T] | None]]:
-    """Give items in their order with the futures of their calls, of which few are submitted ahead.
-
-    Parameters
-    ----------
-    executor : Executor
-        Runs the calls.
-    call : callable
-        What is done with each item.
-    items : iterable
-        As many as there are: they are taken up one by one.
-    arguments : callable
-        Returns what to call with for an item, or None where nothing is to be done for it.
-    ahead : int
-        Calls at once; the memory that their arguments take grows with it.
-    """
+    """Give items in their order with the futures of their calls, of which few are submitted ahead."""
     waiting: deque[tuple[A, Future[T] | None]] = deque()
     try:
         for item in items:

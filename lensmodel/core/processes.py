@@ -40,17 +40,7 @@ def portable(part: object) -> bool:
 
 @contextmanager
 def pool(executor: Executor | None, workers: int | None, part: object = None) -> Iterator[Executor]:
-    """Give the executor, or else `workers` of our own for as long as needed.
-
-    Parameters
-    ----------
-    executor : Executor or None
-        Used as it is.
-    workers : int or None
-        How many; None is one a core.
-    part : object
-        What will be sent to them: where it is not `portable`, they are threads of this process.
-    """
+    """Give the executor, or else `workers` of our own for as long as needed."""
     if executor is not None:
         yield executor
         return

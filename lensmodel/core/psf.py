@@ -260,13 +260,7 @@ class EncodedPatch:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> EncodedPatch:
-        """Read what `to_bytes` wrote.
-
-        Raises
-        ------
-        InvalidInputError
-            For anything else.
-        """
+        """Read what `to_bytes` wrote."""
         if len(data) % 2 == 0 or len(data) <= 2 * TOKEN_LENGTH or data[0] >= len(KINDS):
             raise InvalidInputError(f"an encoded patch was not written by this program ({len(data)} bytes)")
         numbers = np.frombuffer(data, dtype="<f2", offset=1)

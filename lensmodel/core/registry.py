@@ -45,25 +45,7 @@ class Registry(Generic[T]):
         object.__setattr__(self, "entries", dict(self.entries))  # our own, never the caller's
 
     def create(self, name: str, **params: object) -> T:
-        """Build the entry called `name` from keyword parameters.
-
-        Parameters
-        ----------
-        name : str
-            One of those that iterating gives.
-        **params
-            Fields of the entry; the others keep their defaults.
-
-        Returns
-        -------
-        object
-            A deconvolver, estimator or selector, as the registry's kind says.
-
-        Raises
-        ------
-        UnknownMethodError
-            If no entry has that name, or the package that brings it cannot be loaded; the text says which.
-        """
+        """Build the entry called `name` from keyword parameters."""
         if name in self.entries:
             return self.entries[name](**params)
         if name not in self:
@@ -91,56 +73,18 @@ class Registry(Generic[T]):
         return factory
 
     def resolve(self, method: str | T) -> T:
-        """Return an entry that was given by its name, with its default parameters, or as an object.
-
-        Parameters
-        ----------
-        method : str or object
-            A name, or what is returned as it is.
-
-        Returns
-        -------
-        object
-
-        Raises
-        ------
-        UnknownMethodError
-            If no entry has that name.
-        """
+        """Return an entry that was given by its name, with its default parameters, or as an object."""
         return self.create(method) if isinstance(method, str) else method
 
     def register(self, name: str, factory: Callable[..., T]) -> None:
-        """Add an entry for as long as this process lives.
-
-        Parameters
-        ----------
-        name : str
-            A new name; those that exist keep their meaning.
-        factory : callable
-            Returns an entry; called with no arguments where only the name is given.
-
-        Raises
-        ------
-        InvalidInputError
-            If the name is taken or empty.
-        """
+        """Add an entry for as long as this process lives."""
         if not name or name in self:
             raise InvalidInputError(f"the {self.kind} {name!r} exists already, or is no name; choose another")
         assert isinstance(self.entries, dict)
         self.entries[name] = factory
 
     def extended(self, **entries: Callable[..., T]) -> Registry[T]:
-        """Return a registry with more entries; this one stays as it is.
-
-        Parameters
-        ----------
-        **entries : callable
-            Factories by name; a hyphen is given as an underscore. One of a name that is there replaces it.
-
-        Returns
-        -------
-        Registry
-        """
+        """Return a registry with more entries; this one stays as it is."""
         added = {name.replace("_", "-"): factory for name, factory in entries.items()}
         return Registry(self.kind, {**self.entries, **added}, self.group)
 

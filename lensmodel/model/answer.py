@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
-from lensmodel.model.field.smoothers import smoothers
 
 DEFAULT: Final = "default"
 PAPER: Final = "paper"
@@ -32,8 +31,6 @@ class ModelSettings:
         Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
         eq. (8) of the paper [1]_, and from three photos on the factors on it with the least
         leave-one-photo-out error.
-    method : str
-        Name in `smoothers`: how the regression weighs its samples.
     rotational : float or None
         Strength of rotational symmetry: 0 none, 1 all angles count alike. None: by cross-validation.
     mirror : float or None
@@ -52,7 +49,7 @@ class ModelSettings:
     InvalidInputError
         If a value is out of its range.
     UnknownMethodError
-        If there is no such regression or mode.
+        If there is no such mode.
 
     References
     ----------
@@ -62,7 +59,6 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    method: str = "combined"
     rotational: float | None = None
     mirror: float | None = None
     robust: bool = True
@@ -80,7 +76,6 @@ class ModelSettings:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
-        smoothers.create(self.method)  # refuses a name that there is not
         if self.mode not in MODES:
             raise UnknownMethodError(
                 f"no mode {self.mode!r} of the lens model; choose one of {', '.join(MODES)}"
@@ -92,7 +87,7 @@ class ModelSettings:
         """The choices that hold: the mode "paper" leaves none but those of bandwidths and photos."""
         if self.mode != PAPER:
             return self
-        return replace(self, method="nadaraya-watson", mirror=0.0, robust=False)
+        return replace(self, mirror=0.0, robust=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,13 +15,11 @@ from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
-from lensmodel.model import pitch as pitches
-from lensmodel.model import support
+from lensmodel.model import bodies, support
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
-from lensmodel.model.circle import on_one_circle
-from lensmodel.model.field.robust import Flag
 from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
+from lensmodel.model.validation import Flag
 
 _LEAST_ERROR: Final = 0.01
 """Relative L2 error below which no part of an answer is believed (chosen: of an answer of several parts one
@@ -78,7 +76,7 @@ class LensModel:
         NoSamplesError
             If there are none, or all photos are excluded.
         """
-        settings, kept = settings or ModelSettings(), _distinct((), on_one_circle(samples))
+        settings, kept = settings or ModelSettings(), _distinct((), bodies.on_one_circle(samples))
         if not kept:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         encoded, kernels = _parted(kept, settings)
@@ -92,11 +90,8 @@ class LensModel:
         )
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
-        """Return the model with more samples, those of other photos untouched.
-
-        A regression is fitted anew when it has grown by a twentieth.
-        """
-        placed = on_one_circle((*self.samples, *samples))
+        """Return the model with more samples; a regression is fitted anew where these are of its kind."""
+        placed = bodies.on_one_circle((*self.samples, *samples))
         known = placed[: len(self.samples)]
         new = _distinct(known, placed[len(known) :])
         if not new:
@@ -109,10 +104,7 @@ class LensModel:
         if encoded:
             attention = LearnedField.of(encoded) if attention is None else attention.added(encoded)
         if kernels:
-            if regression is not None and regression.takes(kernels):
-                regression = regression.extended(kernels)
-            else:
-                regression = Regression.of(_parted(every, self.settings)[1], self.settings)
+            regression = Regression.of(_parted(every, self.settings)[1], self.settings)
         return LensModel(every, self.settings, attention, regression)
 
     # --- asking ---------------------------------------------------------------------------------
@@ -190,7 +182,7 @@ class LensModel:
                 _Part(
                     regression.kernels(near, [position], settings, size, pitch_um)[0],
                     max(regression.error(near, around), _LEAST_ERROR),
-                    near.shares,
+                    near.weights,
                     regression.photos[near.rows],
                     around,
                 )
@@ -257,7 +249,7 @@ class LensModel:
     @cached_property
     def pitch_um(self) -> float | None:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
-        return pitches.usual_pitch(self.samples)
+        return bodies.usual_pitch(self.samples)
 
     @property
     def bandwidth(self) -> dict[str, float]:

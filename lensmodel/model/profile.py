@@ -27,7 +27,7 @@ from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.model.answer import ModelSettings
 from lensmodel.model.lens_model import LensModel
-from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
+from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
 
 FORMAT = 2  # raised when samples of before mean nothing to the model any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
@@ -86,38 +86,13 @@ class LensProfile:
 
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:
-    """Write a profile; the file appears complete or not at all.
-
-    Parameters
-    ----------
-    path : Path or str
-        Replaced if it is there.
-    profile : LensProfile
-
-    Raises
-    ------
-    InvalidInputError
-        As `write_profile`.
-    OSError
-        If the file cannot be written.
-    """
+    """Write a profile; the file appears complete or not at all."""
     with atomic(Path(path)) as file:
         write_profile(file, profile)
 
 
 def write_profile(file: IO[bytes], profile: LensProfile) -> None:
-    """Write a profile to an open file.
-
-    Parameters
-    ----------
-    file : binary file, open for writing
-    profile : LensProfile
-
-    Raises
-    ------
-    InvalidInputError
-        If it has more samples, or larger ones, than a profile holds.
-    """
+    """Write a profile to an open file."""
     samples = profile.model.samples
     side = max(sample.kernel.shape[0] for sample in samples)
     if not _within_limits(len(samples), side):
@@ -161,42 +136,12 @@ def _unpacked(archive: zipfile.ZipFile) -> int:
 
 
 def load_profile(path: Path | str) -> LensProfile:
-    """Open a profile.
-
-    Parameters
-    ----------
-    path : Path or str
-
-    Returns
-    -------
-    LensProfile
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is no profile, or one of another format; the text says which.
-    """
+    """Open a profile."""
     return _read(path, Path(path).name)
 
 
 def read_profile(file: IO[bytes], name: str) -> LensProfile:
-    """Open a profile that lies in an open file.
-
-    Parameters
-    ----------
-    file : binary file, open for reading
-    name : str
-        What errors call it.
-
-    Returns
-    -------
-    LensProfile
-
-    Raises
-    ------
-    InvalidInputError
-        As `load_profile`.
-    """
+    """Open a profile that lies in an open file."""
     return _read(file, name)
 
 

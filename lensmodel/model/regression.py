@@ -7,14 +7,14 @@ So the sum over all pixels of all samples is one of kernels::
 
 with C_i the sample's kernel in its own radial frame. Departures from the paper: n in eq. (8) counts PSFs, not
 pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of pixels would widen the PSF;
-unless the mode is "paper", kernels are scaled to the width of the place before averaging (`transport`).
+unless the mode is "paper", kernels are scaled to the width of the place before averaging (`widths`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,19 +23,13 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import pitch as pitches
-from lensmodel.model import support
+from lensmodel.model import bodies, support
 from lensmodel.model import variables as va
-from lensmodel.model.answer import ModelSettings
-from lensmodel.model.field.cross_validation import CrossValidation, bandwidth, cross_validate
-from lensmodel.model.field.index import SampleIndex
-from lensmodel.model.field.local_frame import Answers, LocalKernels
-from lensmodel.model.field.neighbourhood import Neighbourhood
-from lensmodel.model.field.smoothers import smoothers
-from lensmodel.model.field.transport import WidthField
-
-GROWTH: Final = 0.05
-"""Growth after which all is fitted anew: eq. (8) moves bandwidths by a hundredth until then (chosen)."""
+from lensmodel.model.answer import PAPER, ModelSettings
+from lensmodel.model.local_frame import LocalKernels
+from lensmodel.model.neighbours import Answers, Neighbourhood
+from lensmodel.model.validation import CrossValidation, bandwidth, cross_validate
+from lensmodel.model.widths import WidthField
 
 _DRIFT: Final = 0.15
 """Relative L2 error for each unit of `support` beyond the first between a question and the nearest sample
@@ -53,91 +47,59 @@ class Regression:
     ----------
     pitch_um : float or None
         Pixel pitch that all kernels are brought to; None where none is known.
-    size : int
-        How many samples it was fitted to; those added since keep what was fitted.
     widths : WidthField
     local : LocalKernels
-    index : SampleIndex
-        Points of the samples.
     where : ndarray, shape (n, 5)
-        The same in units of `support`.
+        Points of the samples in units of `support`.
     validation : CrossValidation
     expected : ndarray, shape (n,)
         Errors that the estimators expect of their samples; 0 where they expect nothing.
     photos : ndarray of str, shape (n,)
-    rule, bandwidth : dict
-        Bandwidths of eq. (8), and those in use.
+    bandwidth : dict
+        Bandwidths in use.
     neighbourhood : Neighbourhood
         Which samples answer a question, and with which weights.
     """
 
     pitch_um: float | None
-    size: int
     widths: WidthField
     local: LocalKernels
-    index: SampleIndex
     where: NDArray[np.float64]
     validation: CrossValidation
     expected: NDArray[np.float64]
     photos: NDArray[np.object_]
-    rule: dict[str, float]
     bandwidth: dict[str, float]
     neighbourhood: Neighbourhood
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Regression:
-        """Fit widths, bandwidths and robust weights.
-
-        Raises
-        ------
-        NoSamplesError
-            If no sample has a weight.
-        """
-        settings = settings.regression
+        """Fit widths, bandwidths and robust weights; `NoSamplesError` if no sample has a weight."""
+        settings, normalised = settings.regression, settings.mode != PAPER
         base = np.array([s.weight for s in samples])
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples has a weight; include a photo again")
-        smoother = smoothers.create(settings.method)
-        pitch_um = pitches.usual_pitch(samples)
-        common = pitches.at_pitch(samples, pitch_um)
-        index = SampleIndex.of(va.points(common))
-        widths = WidthField.fit(common, base) if smoother.transport else WidthField()
-        local = LocalKernels.of(common, index.points, widths)
-        validation = cross_validate(common, settings, local, index.points, base)
-        if smoother.transport and any(flag.sample is None for flag in validation.flags):
-            # a spoilt photo has bent the widths too: fit them again without it
-            widths = WidthField.fit(common, validation.votes)
-            local = local.rescaled(index.points, widths)
-            validation = cross_validate(common, settings, local, index.points, base)
-        rule = va.bandwidths(index.points)
-        used = bandwidth(rule, settings, validation.choice)
-        return cls(
-            *(pitch_um, len(samples), widths, local, index, support.points(common), validation),
-            *(_expected(samples), _photos(samples), rule, used),
-            Neighbourhood(index, validation.votes, va.scales(used), smoother),
-        )
-
-    def takes(self, samples: Sequence[PsfSample]) -> bool:
-        """Whether samples can join without fitting everything anew: they have room, and are few."""
-        total = len(self.where) + len(samples)
-        sides = [pitches.side_at(s, self.pitch_um) for s in samples]
-        return total <= (1.0 + GROWTH) * self.size and max(sides) <= self.local.side
-
-    def extended(self, samples: Sequence[PsfSample]) -> Regression:
-        """Return it with more samples; widths, bandwidths and weights stay as they were fitted."""
-        common = pitches.at_pitch(samples, self.pitch_um)
+        pitch_um = bodies.usual_pitch(samples)
+        common = bodies.at_pitch(samples, pitch_um)
         points = va.points(common)
-        index = self.index.extended(points)
-        validation = self.validation.extended(np.array([s.weight for s in samples]))
-        return replace(
-            self,
-            local=self.local.extended(common, points, self.widths),
-            index=index,
-            where=np.concatenate([self.where, support.points(common)]),
-            validation=validation,
-            expected=np.concatenate([self.expected, _expected(samples)]),
-            photos=np.concatenate([self.photos, _photos(samples)]),
-            neighbourhood=replace(self.neighbourhood, index=index, votes=validation.votes),
+        widths = WidthField.fit(common, base) if normalised else WidthField()
+        local = LocalKernels.of(common, points, widths)
+        validation = cross_validate(common, settings, local, points, base)
+        if normalised and any(flag.sample is None for flag in validation.flags):
+            # a spoilt photo has bent the widths too: fit them again without it
+            widths = WidthField.fit(common, validation.weights)
+            local = local.rescaled(points, widths)
+            validation = cross_validate(common, settings, local, points, base)
+        used = bandwidth(va.bandwidths(points), settings, validation.choice)
+        return cls(
+            pitch_um,
+            widths,
+            local,
+            support.points(common),
+            validation,
+            expected=np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples]),
+            photos=np.array([s.photo for s in samples], dtype=object),
+            bandwidth=used,
+            neighbourhood=Neighbourhood(points, validation.weights, va.scales(used)),
         )
 
     def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
@@ -156,11 +118,11 @@ class Regression:
         widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
         own, mirror = self.pitch_um, self.validation.choice.mirror
-        if own is None or pitch_um is None or pitches.alike(own, pitch_um):
+        if own is None or pitch_um is None or bodies.alike(own, pitch_um):
             return self.local.kernels(near, angles, widths, size, mirror)
         inside = min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
         kernels = self.local.kernels(near, angles, widths, inside, mirror)
-        return np.stack([pitches.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
+        return np.stack([bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
     def error(self, near: Answers, found: support.Support) -> float:
         """Expected relative L2 error of one answer.
@@ -173,7 +135,7 @@ class Regression:
 
         Estimators that err alike do not scatter: at least half of what they expect is taken for shared.
         """
-        weight, rows = near.shares, near.rows
+        weight, rows = near.weights, near.rows
         _, number = np.unique(self.photos[rows].astype(str), return_inverse=True)
         independent = 1.0 / float((np.bincount(number, weight) ** 2).sum())
         held_out = float(weight @ self.validation.errors[rows] ** 2)
@@ -190,11 +152,3 @@ class Regression:
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
         return self.local.nbytes
-
-
-def _expected(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
-    return np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
-
-
-def _photos(samples: Sequence[PsfSample]) -> NDArray[np.object_]:
-    return np.array([s.photo for s in samples], dtype=object)

@@ -74,11 +74,6 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
 
     n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
     about another place. d counts the place and those settings that vary.
-
-    Parameters
-    ----------
-    where : ndarray, shape (n, 7)
-        From `points`.
     """
     _, counts = np.unique(where[:, 4], return_counts=True)
     varying = [3, 5, 6]

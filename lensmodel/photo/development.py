@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import rawpy
 
 from lensmodel.core.errors import UnreadablePhotoError
 from lensmodel.core.geometry import Frame
@@ -17,7 +19,7 @@ from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
-from lensmodel.photo.raw import Demosaic, develop_raw, stored_levels
+from lensmodel.photo.raw import Demosaic, develop_raw, opened_raw, stored_levels
 from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
 from lensmodel.photo.values import (
     Encoding,
@@ -30,7 +32,13 @@ from lensmodel.photo.values import (
 )
 
 
-def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosaic = "default") -> LinearPhoto:
+def develop(
+    path: Path | str,
+    *,
+    limits: Limits | None = None,
+    demosaic: Demosaic = "default",
+    on_info: Callable[[PhotoInfo], None] | None = None,
+) -> LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
     The planes are in sensor orientation, whatever the file says about turning them; RAW is in
@@ -45,6 +53,8 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
         How large it may be; checked before decoding.
     demosaic : {"default", "ahd", "dht", "linear", "half"}
         Demosaicing of RAW; "half" makes one pixel of each 2 x 2 cell, without interpolation.
+    on_info : callable, optional
+        Called with what `inspect` returns before anything is decoded; raising there refuses the photo.
 
     Returns
     -------
@@ -70,18 +80,26 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     """
     path, limits = Path(path), limits or Limits()
     with opened_header(path, limits) as header:
-        info = info_of(path, header, limits)
-        if info.kind in {"raw", "dng"}:
-            developed = _develop_raw(path, header, info, demosaic)
+        if header.kind in {"raw", "dng"}:
+            with opened_raw(path) as raw:
+                info = _accepted(info_of(path, header, limits, raw), on_info)
+                developed = _develop_raw(raw, header, info, demosaic)
         else:
+            info = _accepted(info_of(path, header, limits), on_info)
             developed = _develop_raster(path, header, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)
     return developed
 
 
-def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
-    raw = develop_raw(path, demosaic, header.white)
+def _accepted(info: PhotoInfo, on_info: Callable[[PhotoInfo], None] | None) -> PhotoInfo:
+    if on_info is not None:
+        on_info(info)
+    return info
+
+
+def _develop_raw(file: rawpy.RawPy, header: Header, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
+    raw = develop_raw(file, demosaic, header.white)
     _, height, width = raw.planes.shape
     metadata, binned = info.metadata, max(round(info.width / width), 1)
     if metadata.pixel_pitch_um is not None:

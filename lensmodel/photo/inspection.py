@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+import rawpy
+
 from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
 from lensmodel.photo.headers.header import Header, check_size
 from lensmodel.photo.headers.opening import opened_header
@@ -44,15 +46,15 @@ def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
         return info_of(path, header, limits)
 
 
-def info_of(path: Path, header: Header, limits: Limits) -> PhotoInfo:
-    """Put together what a parsed header says; see `inspect`."""
+def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None = None) -> PhotoInfo:
+    """Put together what a parsed header says, and LibRaw where it has a RAW file open; see `inspect`."""
     width, height = header.width, header.height
     if header.kind in {"raw", "dng"}:
         if (packing := _UNDECODED.get(header.compression)) is not None:
             raise UnsupportedFormatError(
                 f"RAW data packed as {packing} are not read; convert it to a plain DNG or TIFF"
             )
-        width, height = raw_size(path)
+        width, height = raw_size(path) if raw is None else (raw.sizes.width, raw.sizes.height)
         check_size(width, height, path.stat().st_size, limits)
     if header.kind == "jpeg" and header.channels == 4:
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")

@@ -117,9 +117,9 @@ def raw_size(path: Path) -> tuple[int, int]:
 
 
 def develop_raw(
-    path: Path, demosaic: Demosaic = "default", linear_white: tuple[int, ...] = ()
+    raw: rawpy.RawPy, demosaic: Demosaic = "default", linear_white: tuple[int, ...] = ()
 ) -> DevelopedRaw:
-    """Develop a RAW file to linear camera RGB.
+    """Develop an open RAW file to linear camera RGB.
 
     No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
     1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
@@ -137,31 +137,30 @@ def develop_raw(
         raise InvalidInputError(
             f"no demosaicing {demosaic!r}; known: default, {', '.join(sorted(_ALGORITHMS))}"
         )
-    with opened_raw(path) as raw:
-        mosaic = Mosaic.of(raw)
-        white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
-        if mosaic is not None:
-            mosaic.check()
-            white, clip = mosaic.saturation()
-        sensor_noise = _sensor_noise(mosaic, white)
-        defects = 0 if mosaic is None or sensor_noise is None else mosaic.repair(sensor_noise, white)
-        balance = _white_balance(raw, mosaic)
-        spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
-        planes = _developed(raw, method, white, balance, spans)
-        to_srgb, xyz_to_camera = _colour(raw, balance)
-        return DevelopedRaw(
-            planes=planes,
-            noise=_plane_noise(planes, sensor_noise, method, balance),
-            sensor_noise=sensor_noise,
-            clip=clip,
-            white_balance=balance,
-            to_srgb=None if to_srgb is None else matrix3(to_srgb),
-            xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
-            bits=max(1, white.bit_length()),
-            pipeline=f"raw/{_pipeline_step(mosaic, method)}/1",
-            cfa=None if mosaic is None or method == "half" else mosaic.bayer_pattern(),
-            defects=defects,
-        )
+    mosaic = Mosaic.of(raw)
+    white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
+    if mosaic is not None:
+        mosaic.check()
+        white, clip = mosaic.saturation()
+    sensor_noise = _sensor_noise(mosaic, white)
+    defects = 0 if mosaic is None or sensor_noise is None else mosaic.repair(sensor_noise, white)
+    balance = _white_balance(raw, mosaic)
+    spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
+    planes = _developed(raw, method, white, balance, spans)
+    to_srgb, xyz_to_camera = _colour(raw, balance)
+    return DevelopedRaw(
+        planes=planes,
+        noise=_plane_noise(planes, sensor_noise, method, balance),
+        sensor_noise=sensor_noise,
+        clip=clip,
+        white_balance=balance,
+        to_srgb=None if to_srgb is None else matrix3(to_srgb),
+        xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
+        bits=max(1, white.bit_length()),
+        pipeline=f"raw/{_pipeline_step(mosaic, method)}/1",
+        cfa=None if mosaic is None or method == "half" else mosaic.bayer_pattern(),
+        defects=defects,
+    )
 
 
 def _pipeline_step(mosaic: Mosaic | None, method: str) -> str:

@@ -79,30 +79,7 @@ class ZoneSharpness:
 def measure_edges(
     plane: NDArray[np.floating], boxes: Sequence[Box], *, rendered: bool = False
 ) -> tuple[EdgeMeasurement, ...]:
-    """Measure the slanted edges of a photo.
-
-    Parameters
-    ----------
-    plane : ndarray, shape (H, W)
-        The whole frame, linear light.
-    boxes : sequence of (row, col, height, width)
-        One edge each.
-    rendered : bool
-        The chart was rendered pixel by pixel, so take its pixel box out; see
-        `EdgeResponse.compensated`.
-
-    Returns
-    -------
-    tuple of EdgeMeasurement
-        In the order of `boxes`; edges that cannot be measured are left out, with a warning logged.
-
-    Raises
-    ------
-    InvalidInputError
-        If a box leaves the plane.
-    NotEnoughEvidenceError
-        If no edge can be measured.
-    """
+    """Measure the slanted edges of a photo."""
     frame = Frame(*plane.shape)
     measured = []
     for box in boxes:

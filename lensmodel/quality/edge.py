@@ -87,17 +87,7 @@ class EdgeResponse:
         return min(folded, 90.0 - folded)
 
     def contrast(self, frequencies: ArrayLike) -> NDArray[np.float64]:
-        """Contrast at any frequencies in cycles/pixel, linearly interpolated.
-
-        Parameters
-        ----------
-        frequencies : array_like, shape (n,)
-            Cycles/pixel.
-
-        Returns
-        -------
-        ndarray of float64, shape (n,)
-        """
+        """Contrast at any frequencies in cycles/pixel, linearly interpolated."""
         return np.interp(np.asarray(frequencies, dtype=np.float64), self.frequencies, self.mtf)
 
     def compensated(self) -> EdgeResponse:
@@ -115,37 +105,13 @@ class EdgeResponse:
 
 
 def pixel_mtf(frequencies: ArrayLike, angle: float) -> NDArray[np.float64]:
-    """Contrast that a square pixel leaves of a wave whose normal has this angle.
-
-    Parameters
-    ----------
-    frequencies : array_like, shape (n,)
-        Cycles/pixel.
-    angle : float
-        Radians, counter-clockwise from the right.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-    """
+    """Contrast that a square pixel leaves of a wave whose normal has this angle."""
     f = np.asarray(frequencies, dtype=np.float64)
     return np.abs(np.sinc(f * math.cos(angle)) * np.sinc(f * math.sin(angle)))
 
 
 def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float:
-    """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never.
-
-    Parameters
-    ----------
-    frequencies, contrast : array_like, shape (n,)
-        Frequencies ascend.
-    level : float
-
-    Returns
-    -------
-    float
-        In the unit of the frequencies.
-    """
+    """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never."""
     f, c = np.asarray(frequencies, dtype=np.float64), np.asarray(contrast, dtype=np.float64)
     below = np.flatnonzero(c < level)
     below = below[below > 0]

@@ -134,18 +134,6 @@ def edge_gains(
     """Sharpness of a chart's edges before and after a correction, by zone of the frame.
 
     The edges are those that `find_edges` finds before the correction.
-
-    Parameters
-    ----------
-    before, after : ndarray, shape (H, W)
-        Linear light, the same part of the frame.
-    frame, origin, noise, clip
-        See `find_edges`.
-
-    Returns
-    -------
-    dict of Zone to EdgeGain
-        Medians; zones with fewer than two edges that can be measured both times are missing.
     """
     boxes = find_edges(before, frame, origin=origin, noise=noise, clip=clip)
     if not boxes:

@@ -24,17 +24,7 @@ Picture = NDArray[np.uint8]
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Linear light, clipped to 0..1, with the sRGB curve (IEC 61966-2-1): what an eye compares.
-
-    Parameters
-    ----------
-    linear : ndarray
-        Linear light, saturation 1.
-
-    Returns
-    -------
-    ndarray of float64, same shape, 0..1
-    """
+    """Linear light, clipped to 0..1, with the sRGB curve (IEC 61966-2-1): what an eye compares."""
     v = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
@@ -118,21 +108,6 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
 
     Gauss-Newton on the sum of squared differences, s <- s - (G'G)^-1 G'(image(s) - reference), with
     G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
-
-    Parameters
-    ----------
-    image, reference : ndarray, shape (..., H, W)
-        Linear light.
-
-    Returns
-    -------
-    tuple of float
-        Rows and columns; (0, 0) where nothing in the picture says.
-
-    Raises
-    ------
-    InvalidInputError
-        If shapes differ.
     """
     _same_shape(image, reference)
     rows, cols = (
@@ -160,18 +135,7 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
 
 
 def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.float64]:
-    """Move a picture by a real-valued shift, mirrored at its borders; exact for what it resolves.
-
-    Parameters
-    ----------
-    image : ndarray, shape (..., H, W)
-    row, col : float
-        Pixels, downwards and to the right.
-
-    Returns
-    -------
-    ndarray of float64, same shape
-    """
+    """Move a picture by a real-valued shift, mirrored at its borders; exact for what it resolves."""
     picture = np.asarray(image, dtype=np.float64)
     if row == 0.0 and col == 0.0:
         return picture

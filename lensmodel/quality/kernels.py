@@ -49,35 +49,11 @@ def _waves(frequencies: NDArray[np.float64], side: int) -> NDArray[np.complex128
 
 
 def mtf50_from_kernel(kernel: Kernel, angle: float) -> float:
-    """Frequency in cycles/pixel where the contrast along `angle` falls to one half, 1.0 if never.
-
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    angle : float
-        Radians, as of `mtf_from_kernel`.
-
-    Returns
-    -------
-    float
-        Cycles/pixel.
-    """
+    """Frequency in cycles/pixel where the contrast along `angle` falls to one half, 1.0 if never."""
     f = np.linspace(0.0, 1.0, _FREQUENCIES)
     return crossing(f, mtf_from_kernel(kernel, angle, f), 0.5)
 
 
 def tangential_sagittal_mtf50(kernel: Kernel, phi: float) -> tuple[float, float]:
-    """MTF50 along u and along v of a kernel at field angle `phi`, cycles/pixel.
-
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    phi : float
-        Radians.
-
-    Returns
-    -------
-    tuple of float
-        Tangential and sagittal.
-    """
+    """MTF50 along u and along v of a kernel at field angle `phi`, cycles/pixel."""
     return mtf50_from_kernel(kernel, phi), mtf50_from_kernel(kernel, phi + math.pi / 2.0)

@@ -3,7 +3,6 @@
 Figures are drawn by `lensmodel.report.plots`, which needs matplotlib, and is imported where they are wanted.
 """
 
-from lensmodel.report.advice import Advice, Suggestion, advice
 from lensmodel.report.centring import Asymmetry, Centring, centring
 from lensmodel.report.comparison import Comparison, Side, compare
 from lensmodel.report.export import Exporter, PsfGrid, export, exporters, format_of, psf_grid
@@ -18,7 +17,14 @@ from lensmodel.report.lens_report import (
     lens_report,
     widest,
 )
-from lensmodel.report.places import direction_in_words, little_seen, place_in_words
+from lensmodel.report.places import (
+    Advice,
+    Suggestion,
+    advice,
+    direction_in_words,
+    little_seen,
+    place_in_words,
+)
 
 __all__ = [
     "Advice",

@@ -106,14 +106,7 @@ class Centring:
 
 
 def centring(model: LensModel, settings: LensSettings) -> Centring:
-    """Judge the centring of a copy from the samples near some settings.
-
-    Parameters
-    ----------
-    model : LensModel
-    settings : LensSettings
-        Channel, and aperture within 0.7 stop; wide open shows most.
-    """
+    """Judge the centring of a copy from the samples near some settings."""
     samples = _near(model, settings)
     if len(samples) < _FEWEST:
         few = f"{len(samples)} sample{'' if len(samples) == 1 else 's'}"

@@ -75,26 +75,7 @@ def psf_grid(
     aspect: float = DEFAULT_ASPECT,
     at: FieldPosition | None = None,
 ) -> PsfGrid:
-    """Ask a model for the kernels of a grid of places.
-
-    Parameters
-    ----------
-    model : LensModel
-    settings : LensSettings
-    rows, cols : int
-        Cells of the picture; a kernel is that of its cell's centre.
-    size : int
-        Odd side in pixels.
-    aspect : float
-        Width over height of the picture.
-    at : FieldPosition, optional
-        A single place instead of the grid.
-
-    Raises
-    ------
-    InvalidInputError
-        If that would take more than 512 MiB.
-    """
+    """Ask a model for the kernels of a grid of places."""
     places = grid(rows, cols, aspect) if at is None else (at,)
     if at is not None:
         rows = cols = 1
@@ -140,13 +121,7 @@ class Fits:
     suffix: str = ".fits"
 
     def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file.
-
-        Raises
-        ------
-        InvalidInputError
-            If astropy is not installed.
-        """
+        """Return the content of the file."""
         fits = _astropy_fits()
         cube = psfs.kernels[:, ::-1, :]
         primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
@@ -250,23 +225,7 @@ def format_of(path: Path) -> str | None:
 
 
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
-    """Write a grid in a format; the file appears complete or not at all.
-
-    Parameters
-    ----------
-    path : Path or str
-        An existing file is replaced.
-    psfs : PsfGrid
-    file_format : str
-        A name in `exporters`.
-
-    Raises
-    ------
-    UnknownMethodError
-        If there is no such format.
-    InvalidInputError
-        If the format needs a library that is not installed.
-    """
+    """Write a grid in a format; the file appears complete or not at all."""
     write_atomically(Path(path), exporters.create(file_format).encode(psfs))
 
 

@@ -19,14 +19,22 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import Channel
 from lensmodel.report.comparison import SURE, Comparison
-from lensmodel.report.lens_report import NYQUIST, ApertureReport, LensReport, SensorGeometry, Unit
+from lensmodel.report.lens_report import (
+    NYQUIST,
+    ApertureReport,
+    Curve,
+    LateralColourCurve,
+    LensReport,
+    SensorGeometry,
+    Unit,
+)
 
 try:
     import matplotlib as mpl
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
     from matplotlib.patches import Circle, Rectangle
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
@@ -51,7 +59,9 @@ _UNITS: Final[dict[Unit, str]] = {
 }
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
+_A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
 _LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none (chosen)
+_IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
 _DOTS: Final = 160  # a inch of a PNG (chosen: a page is as wide as a screen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
@@ -83,65 +93,107 @@ class Chart:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg).decode("ascii")
 
 
-Draw = Callable[[Axes], None]
+Place = Figure | SubFigure
+Panel = tuple[str, Callable[[Place], None]]
+"""Title of a drawing, and what draws it."""
 
 
 def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
     """All charts of one aperture, those over apertures and of lateral colour last."""
-    found = report.at(aperture)
-    made = [
-        _maps_chart(f"MTF50 in {_UNITS[unit]}", found, report.sensor, unit),
-        _chart("Contrast over the picture", found, lambda ax: contrast(ax, found)),
-        _chart("Contrast by colour", found, lambda ax: colours(ax, report, found.settings.aperture)),
-        _chart("Width of a point", found, lambda ax: widths(ax, found)),
-        _chart("Centring", found, lambda ax: side_softer(ax, found)),
-    ]
-    if found.tangential_error:
-        made.insert(1, _maps_chart("Standard error of MTF50, cycles/pixel", found, report.sensor, None))
-    if len(report.apertures) > 1:
-        made.append(_chart("MTF50 by aperture", None, lambda ax: over_apertures(ax, report, unit)))
-    if report.lateral is not None:
-        made.append(_chart("Lateral colour", None, lambda ax: lateral_colour(ax, report)))
-    return made
+    return [_chart(panel) for panel in _panels(report, report.at(aperture), unit)]
 
 
 def comparison_charts(comparison: Comparison) -> list[Chart]:
     """Contrast of both at the lowest and the highest frequency they share, and the map of the difference."""
-    made = []
-    for which, words in ((0, "Contrast of coarse detail"), (-1, "Contrast of fine detail")):
-
-        def draw(ax: Axes, which: int = which) -> None:
-            both_contrasts(ax, comparison, which)
-
-        made.append(_chart(words, None, draw))
-    if _same_grid(comparison):
-        made.append(_chart("Difference of MTF50, cycles/pixel", None, lambda ax: difference(ax, comparison)))
-    return made
+    return [_chart(panel) for panel in _compared(comparison)]
 
 
 def pages(report: LensReport) -> list[Figure]:
-    """Draw what a photographer shows around on one page, and two for testers for each aperture."""
+    """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     drawn = [_photographer(report)]
     for number in report.apertures:
-        drawn += _tester(report, report.at(number))
+        panels = _panels(report, report.at(number), "c/px")
+        for first in range(0, len(panels), _A_PAGE):
+            figure = _page(report.name, "" if first else report.error_words)
+            _placed(figure, panels[first : first + _A_PAGE])
+            drawn.append(figure)
     return drawn
 
 
 def comparison_page(comparison: Comparison) -> Figure:
     """Draw a comparison on one page."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_PAGE)
-        _heading(figure, f"{comparison.first.name} and {comparison.second.name}", comparison.verdict)
-        top, middle, bottom = (figure.add_axes((0.1, y, 0.6, 0.2)) for y in (0.58, 0.32, 0.05))
-        both_contrasts(top, comparison, 0)
-        both_contrasts(middle, comparison, -1)
-        if _same_grid(comparison):
-            difference(bottom, comparison)
-        else:
-            bottom.set_axis_off()
-        facts = [f"{side.name}: {side.facts}" for side in (comparison.first, comparison.second) if side.facts]
-        figure.text(0.08, 0.85, "\n".join(facts), color="#55585d", fontsize=8.5, va="top")
+    sides = (comparison.first, comparison.second)
+    facts = [f"{side.name}: {side.facts}" for side in sides if side.facts]
+    figure = _page(" and ".join(side.name for side in sides), "\n".join([comparison.verdict, *facts]))
+    _placed(figure, _compared(comparison))
     return figure
+
+
+def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
+    at = f", {found.at}" if found.at else ""
+    panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
+    if found.tangential_error:
+        errors = f"Standard error of MTF50, cycles/pixel{at}"
+        panels.append((errors, lambda on: _maps(on, found, report.sensor, None)))
+    panels += [
+        (f"Contrast over the picture{at}: sagittal solid, tangential dashed", _on(contrast, found)),
+        (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
+        (f"Width of a point{at}: where the lines part is astigmatism", _on(widths, found)),
+        (f"Centring{at}", _on(side_softer, found)),
+    ]
+    if len(report.apertures) > 1:
+        panels.append(("MTF50 by aperture", _on(over_apertures, report, unit)))
+    if report.lateral is not None:
+        panels.append(("Lateral colour", _on(lateral_colour, report.lateral)))
+    return panels
+
+
+def _compared(comparison: Comparison) -> list[Panel]:
+    panels: list[Panel] = [
+        ("Contrast of coarse detail", _on(both_contrasts, comparison, 0)),
+        ("Contrast of fine detail", _on(both_contrasts, comparison, -1)),
+    ]
+    one, two = comparison.first.found, comparison.second.found
+    if (one.rows, one.cols) == (two.rows, two.cols):
+        panels.append(("Difference of MTF50, cycles/pixel", _on(difference, comparison)))
+    return panels
+
+
+def _on(draw: Callable[..., None], *given: Any) -> Callable[[Place], None]:  # noqa: ANN401 - what it draws
+    """A drawing on the only axes of its place."""
+    return lambda place: draw(place.add_subplot(), *given)
+
+
+def _chart(panel: Panel) -> Chart:
+    """One panel as a figure of its own."""
+    with mpl.rc_context(_STYLE):
+        figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
+        _titled(figure, panel)
+        figure.savefig(out, format="svg", metadata={"Date": None})
+    return Chart(panel[0], out.getvalue())
+
+
+def _titled(place: Place, panel: Panel) -> None:
+    title, draw = panel
+    place.suptitle(title, x=0.01, ha="left", fontsize=10.0)
+    draw(place)
+
+
+def _page(title: str, words: str) -> Figure:
+    figure = Figure(figsize=_PAGE)
+    figure.text(0.08, 0.965, title, fontsize=15, weight="bold", va="top")
+    text = "\n".join(textwrap.fill(line, 110) for line in words.split("\n"))
+    figure.text(0.08, 0.935, text, fontsize=8.5, va="top", color="#55585d")
+    return figure
+
+
+def _placed(figure: Figure, panels: Sequence[Panel]) -> None:
+    """Draw panels below each other, as many to a page whatever their number."""
+    with mpl.rc_context(_STYLE):
+        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, 0.86))
+        places: Any = figure.subfigures(_A_PAGE, 1)
+        for place, panel in zip(places, panels, strict=False):
+            _titled(place, panel)
 
 
 def to_pdf(figures: Iterable[Figure]) -> bytes:
@@ -190,30 +242,18 @@ def sharpness_map(
         row, col = divmod(i, found.cols)
         left, low = col * wide, 1.0 - (row + 1) * high
         if found.unknown[i] and not error:
-            ax.add_patch(
-                Rectangle(
-                    (left, low),
-                    wide,
-                    high,
-                    fill=True,
-                    facecolor="#f4f4f2",
-                    edgecolor="#a8a8a2",
-                    hatch="////",
-                    lw=0,
-                )
-            )
+            hatched: dict[str, Any] = {
+                "facecolor": "#f4f4f2",
+                "edgecolor": "#a8a8a2",
+                "hatch": "////",
+                "lw": 0,
+            }
+            ax.add_patch(Rectangle((left, low), wide, high, **hatched))
         share = grid[row, col] / top
         pale = share > 0.6 if error else 0.15 < share < 0.58
         ink = "#131416" if pale != error or (found.unknown[i] and not error) else "#ffffff"
-        ax.text(
-            left + wide / 2,
-            low + high / 2,
-            _cell(value, factor, error=error),
-            ha="center",
-            va="center",
-            color=ink,
-            fontsize=7.0,
-        )
+        text = _cell(value, factor, error=error)
+        ax.text(left + wide / 2, low + high / 2, text, color=ink, **_IN_CELL)
     ax.set_xticks([])
     ax.set_yticks([])
     return image
@@ -236,11 +276,22 @@ def _number(value: float, factor: float) -> str:
 def contrast(ax: Axes, found: ApertureReport) -> None:
     """Draw contrast over the radius: sagittal solid, tangential dashed, bands of one standard error."""
     for ink, curve in zip(_INKS, found.curves, strict=False):
-        ax.plot(found.radii, curve.sagittal, color=ink, label=f"{curve.name} S")
-        ax.plot(found.radii, curve.tangential, color=ink, ls="--", label=f"{curve.name} T")
-        _band(ax, found.radii, curve.sagittal, curve.sagittal_error, ink)
-        _band(ax, found.radii, curve.tangential, curve.tangential_error, ink)
+        _both_ways(ax, found.radii, curve, curve.name, ink)
     _radial(ax, "contrast", 1.0)
+
+
+def _both_ways(ax: Axes, radii: Sequence[float], curve: Curve, name: str, ink: str) -> None:
+    ways = (
+        ("S", "-", curve.sagittal, curve.sagittal_error),
+        ("T", "--", curve.tangential, curve.tangential_error),
+    )
+    for way, style, values, errors in ways:
+        ax.plot(radii, values, color=ink, ls=style, label=f"{name} {way}")
+        if errors:
+            low, high = np.subtract(values, errors), np.add(values, errors)
+            ax.fill_between(
+                radii, np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0), color=ink, alpha=0.12, lw=0
+            )
 
 
 def colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
@@ -294,12 +345,8 @@ def over_apertures(ax: Axes, report: LensReport, unit: Unit = "c/px") -> None:
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def lateral_colour(ax: Axes, report: LensReport) -> None:
+def lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
     """Draw by how much red and blue images lie outwards of the green one."""
-    if report.lateral is None:
-        ax.set_axis_off()
-        return
-    shift = report.lateral
     ax.plot(shift.radii, shift.red, color=_CHANNELS["r"][1], label="red")
     ax.plot(shift.radii, shift.blue, color=_CHANNELS["b"][1], label="blue")
     ax.axhline(0.0, color=_CHANNELS["g"][1], lw=0.8)
@@ -312,10 +359,7 @@ def both_contrasts(ax: Axes, comparison: Comparison, which: int) -> None:
     one, two = comparison.first.found.curves, comparison.second.found.curves
     pairs = [(a, b) for a in one for b in two if a.name == b.name] or [(one[0], two[0])]
     for ink, side, curve in zip(_INKS, (comparison.first, comparison.second), pairs[which], strict=False):
-        ax.plot(side.found.radii, curve.sagittal, color=ink, label=f"{side.name} S")
-        ax.plot(side.found.radii, curve.tangential, color=ink, ls="--", label=f"{side.name} T")
-        _band(ax, side.found.radii, curve.sagittal, curve.sagittal_error, ink)
-        _band(ax, side.found.radii, curve.tangential, curve.tangential_error, ink)
+        _both_ways(ax, side.found.radii, curve, side.name, ink)
     _radial(ax, f"contrast at {pairs[which][0].name}", 1.0)
 
 
@@ -332,24 +376,9 @@ def difference(ax: Axes, comparison: Comparison) -> None:
     for i, value in enumerate(values):
         row, col = divmod(i, one.cols)
         text = f"{value:+.2f}" if abs(value) > SURE * error[i] else "·"
-        ax.text(
-            (col + 0.5) * one.aspect / one.cols,
-            1.0 - (row + 0.5) / one.rows,
-            text,
-            ha="center",
-            va="center",
-            fontsize=7.0,
-        )
+        ax.text((col + 0.5) * one.aspect / one.cols, 1.0 - (row + 0.5) / one.rows, text, **_IN_CELL)
     ax.set(xticks=[], yticks=[])
     ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper; a dot: within the error")
-
-
-def _band(
-    ax: Axes, radii: Sequence[float], values: Sequence[float], errors: Sequence[float], ink: str
-) -> None:
-    if errors:
-        low, high = np.subtract(values, errors), np.add(values, errors)
-        ax.fill_between(radii, np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0), color=ink, alpha=0.12, lw=0)
 
 
 def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
@@ -357,71 +386,27 @@ def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _same_grid(comparison: Comparison) -> bool:
-    one, two = comparison.first.found, comparison.second.found
-    return (one.rows, one.cols) == (two.rows, two.cols)
+# --- pages ------------------------------------------------------------------------------------
 
 
-# --- charts and pages -------------------------------------------------------------------------
-
-
-def _svg(figure: Figure, title: str) -> Chart:
-    out = io.BytesIO()
-    figure.savefig(out, format="svg", metadata={"Date": None})
-    return Chart(title, out.getvalue())
-
-
-def _chart(title: str, found: ApertureReport | None, draw: Draw) -> Chart:
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_CHART, layout="constrained")
-        ax = figure.add_subplot()
-        draw(ax)
-        words = f"{title}, {found.at}" if found is not None and found.at else title
-        ax.set_title(words)
-        return _svg(figure, words)
-
-
-def _maps_chart(title: str, found: ApertureReport, sensor: SensorGeometry, unit: Unit | None) -> Chart:
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_CHART, layout="constrained")
-        words = f"{title}, {found.at}" if found.at else title
-        figure.suptitle(words, x=0.01, ha="left", fontsize=10.0)
-        _two_maps(figure, list(figure.subplots(1, 2)), found, sensor, unit, None)
-        return _svg(figure, words)
-
-
-def _two_maps(
-    figure: Figure,
-    axes: list[Axes],
-    found: ApertureReport,
-    sensor: SensorGeometry,
-    unit: Unit | None,
-    below: Axes | None,
-) -> None:
+def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Unit | None) -> None:
     """Tangential and sagittal on one scale: MTF50 in a unit, or its errors where the unit is None."""
-    error = unit is None
-    kinds = (found.tangential_error, found.sagittal_error) if error else (found.tangential, found.sagittal)
-    if error:  # an error of a figure beyond what the sensor shows is none
-        both = zip(kinds, (found.tangential, found.sagittal), strict=True)
-        kinds = tuple(
-            tuple(math.nan if v >= NYQUIST else e for e, v in zip(*one, strict=True)) for one in both
-        )  # type: ignore[assignment]
-    top = max(0.01, float(np.nanmax([*kinds[0], *kinds[1], 0.0]))) if error else NYQUIST
-    factor = 1.0 if unit is None else sensor.factor(unit) or 1.0
-    for ax, name, values in zip(axes, ("tangential", "sagittal"), kinds, strict=True):
-        image = sharpness_map(ax, found, values, factor=factor, top=top, error=error)
+    pairs = [("tangential", found.tangential, found.tangential_error)]
+    pairs += [("sagittal", found.sagittal, found.sagittal_error)]
+    top, factor = NYQUIST, 1.0 if unit is None else sensor.factor(unit) or 1.0
+    if unit is None:  # an error of a figure beyond what the sensor shows is none
+        pairs = [
+            (name, tuple(math.nan if v >= NYQUIST else e for v, e in zip(values, errors, strict=True)), ())
+            for name, values, errors in pairs
+        ]
+        top = max(0.01, float(np.nanmax([*pairs[0][1], *pairs[1][1], 0.0])))
+    axes = place.subplots(1, 2)
+    for ax, (name, values, _) in zip(axes, pairs, strict=True):
+        image = sharpness_map(ax, found, values, factor=factor, top=top, error=unit is None)
         ax.set_xlabel(name)
-    where: dict[str, Any] = {"ax": axes, "location": "bottom", "fraction": 0.05, "aspect": 50}
-    if below is not None:
-        where = {"cax": below, "orientation": "horizontal"}
-    scale = figure.colorbar(image, **where)
+    scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
     ticks = np.linspace(0.0, top, 6)
     scale.set_ticks(ticks.tolist(), labels=[_number(t, factor) for t in ticks])
-
-
-def _heading(figure: Figure, title: str, words: str) -> None:
-    figure.text(0.08, 0.955, title, fontsize=17, weight="bold", va="top")
-    figure.text(0.08, 0.92, textwrap.fill(words, 78), fontsize=11, va="top", linespacing=1.4)
 
 
 def _photographer(report: LensReport) -> Figure:
@@ -429,7 +414,8 @@ def _photographer(report: LensReport) -> Figure:
     found = report.tested[0]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=_PAGE)
-        _heading(figure, report.name, report.verdict)
+        figure.text(0.08, 0.955, report.name, fontsize=17, weight="bold", va="top")
+        figure.text(0.08, 0.92, textwrap.fill(report.verdict, 78), fontsize=11, va="top", linespacing=1.4)
         big = figure.add_axes((0.08, 0.44, 0.84, 0.38))
         image = sharpness_map(big, found, found.mean)
         words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
@@ -462,43 +448,6 @@ def _photographer(report: LensReport) -> Figure:
         wrapped = "\n".join(textwrap.fill(line, 120) for line in lines)
         figure.text(0.08, 0.115, wrapped, fontsize=8, color="#55585d", va="top")
     return figure
-
-
-def _tester(report: LensReport, found: ApertureReport) -> list[Figure]:
-    """Maps with their errors and curves; colours, widths, apertures, centring and lateral colour."""
-    title = f"{report.name}{', ' + found.at if found.at else ''}"
-    with mpl.rc_context(_STYLE):
-        first = Figure(figsize=_PAGE)
-        first.text(0.08, 0.97, title, fontsize=13, weight="bold", va="top")
-        kinds: list[tuple[float, Unit | None, str]] = [(0.70, "c/px", "MTF50, cycles/pixel")]
-        kinds += [(0.40, None, "Its standard error")] if found.tangential_error else []
-        for low, unit, words in kinds:
-            first.text(0.08, low + 0.225, words, fontsize=10)
-            axes = [first.add_axes((left, low, 0.41, 0.21)) for left in (0.08, 0.51)]
-            _two_maps(
-                first, axes, found, report.sensor, unit, first.add_axes((0.08, low - 0.035, 0.84, 0.01))
-            )
-        ax = first.add_axes((0.1, 0.09, 0.64, 0.22))
-        contrast(ax, found)
-        ax.set_title("Contrast over the picture: sagittal solid, tangential dashed")
-        first.text(0.08, 0.02, textwrap.fill(report.error_words, 120), fontsize=7.5, color="#55585d")
-        second = Figure(figsize=_PAGE)
-        second.text(0.08, 0.965, title, fontsize=13, weight="bold", va="top")
-        draws: list[tuple[str, Draw]] = [
-            ("Contrast by colour", lambda ax: colours(ax, report, found.settings.aperture)),
-            ("Width of a point: where the lines part is astigmatism", lambda ax: widths(ax, found)),
-            ("Centring", lambda ax: side_softer(ax, found)),
-        ]
-        if report.lateral is not None:
-            draws.append(("Lateral colour", lambda ax: lateral_colour(ax, report)))
-        if len(report.apertures) > 1:
-            draws.append(("MTF50 by aperture", lambda ax: over_apertures(ax, report)))
-        high = 0.9 / len(draws)
-        for k, (words, draw) in enumerate(draws):
-            ax = second.add_axes((0.1, 0.94 - (k + 1) * high + 0.05, 0.62, high - 0.085))
-            draw(ax)
-            ax.set_title(words)
-    return [first, second]
 
 
 def _star(side: int) -> NDArray[np.float64]:

@@ -1,12 +1,18 @@
 """Synthetic lenses, cameras and scenes whose truth is known."""
 
-from lensmodel.simulate.aberrations import Aberrations
-from lensmodel.simulate.blur import BlurOptions, blurred
-from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, photograph
+from lensmodel.simulate.camera import (
+    BlurOptions,
+    SimulatedCamera,
+    SimulatedPhoto,
+    Truth,
+    blurred,
+    photograph,
+    shot_info,
+    write_photo,
+)
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
-from lensmodel.simulate.files import shot_info, write_photo
-from lensmodel.simulate.lens import CameraLens, SimulatedField, SimulatedLens
+from lensmodel.simulate.lens import Aberrations, CameraLens, SimulatedField, SimulatedLens
 from lensmodel.simulate.scenes import (
     DEMO_SCENES,
     demo_data_path,

@@ -1,22 +1,35 @@
-"""A sensor, and the photo that it takes through a simulated lens."""
+"""A sensor, and the photo that it takes through a simulated lens.
+
+Spatially varying blur of a scene by exact kernels.
+
+Independent of `lensmodel.correction` and its operators on purpose: what those are tested against must not
+come from them.
+
+Simulated photos as files that any raw converter reads.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
+from scipy.interpolate import CubicSpline
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
-from lensmodel.photo.dng import XYZ_TO_SRGB
-from lensmodel.simulate.blur import BlurOptions, blurred, with_margin
-from lensmodel.simulate.lens import CameraLens
+from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes, StepHook, ignore_step
+from lensmodel.photo.dng import XYZ_TO_SRGB, ShotInfo, write_bayer_dng, write_linear_dng
+from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
 logger = logging.getLogger(__name__)
 
@@ -112,62 +125,23 @@ class SimulatedCamera:
         return np.asarray(XYZ_TO_SRGB) / np.asarray(self.white_balance)[:, None]
 
     def channel_map(self) -> NDArray[np.intp]:
-        """Index into r, g, b of the colour filter over every pixel, `(height, width)`.
-
-        Returns
-        -------
-        ndarray of int, shape (height, width)
-        """
+        """Index into r, g, b of the colour filter over every pixel, `(height, width)`."""
         cell = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
         return np.tile(cell, (self.height // 2, self.width // 2))
 
     def balanced(self, planes: Planes) -> Planes:
-        """What the sensor sees of a scene: each channel over its white balance multiplier.
-
-        Parameters
-        ----------
-        planes : Planes, shape (3, H, W), float32
-            White-balanced linear light.
-
-        Returns
-        -------
-        Planes, shape (3, H, W), float32
-        """
+        """What the sensor sees of a scene: each channel over its white balance multiplier."""
         gains = np.asarray(self.white_balance, dtype=np.float32)[:, None, None]
         return np.ascontiguousarray(planes / gains)
 
     def mosaic(self, planes: Planes, rng: np.random.Generator | None) -> NDArray[np.uint16]:
-        """Raw numbers of the light `planes` (sensor values, saturation 1); no noise without `rng`.
-
-        Parameters
-        ----------
-        planes : Planes, shape (3, H, W), float32
-            Sensor values.
-        rng : numpy.random.Generator or None
-            Source of the noise.
-
-        Returns
-        -------
-        ndarray of uint16, shape (H, W)
-        """
+        """Raw numbers of the light `planes` (sensor values, saturation 1); no noise without `rng`."""
         self._check(planes)
         light = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
         return self._numbers(self._noisy(light, rng))
 
     def develop(self, planes: Planes, rng: np.random.Generator | None) -> Planes:
-        """Three full planes with noise, quantised and clipped at 1: a sensor without a mosaic.
-
-        Parameters
-        ----------
-        planes : Planes, shape (3, H, W), float32
-            Sensor values.
-        rng : numpy.random.Generator or None
-            Source of the noise; None makes none.
-
-        Returns
-        -------
-        Planes, shape (3, H, W), float32
-        """
+        """Three full planes with noise, quantised and clipped at 1: a sensor without a mosaic."""
         self._check(planes)
         numbers = self._numbers(self._noisy(planes, rng)).astype(np.float32)
         return (numbers - np.float32(self.black)) / np.float32(self.white - self.black)
@@ -306,4 +280,300 @@ def photograph(
         clean=clean,
         sharp=camera.balanced(sharp * np.float32(exposure)),
         truth=truth,
+    )
+
+
+DEFAULT_STEP: Final = 0.1
+"""Distance in half diagonals of the nodes where kernels are exact."""
+
+_REFINED: Final = 2  # nodes of the windows per exact node
+
+
+@dataclass(frozen=True, slots=True)
+class BlurOptions:
+    """How the blur of a scene is simulated.
+
+    Parameters
+    ----------
+    pitch_um : float
+        Pixel pitch in micrometres.
+    size : int
+        Odd side of the kernels in pixels.
+    step : float
+        Distance in half diagonals of the nodes where kernels are exact.
+    defocus : float
+        Focus error of this photo, waves at the open aperture.
+    lateral, vignetting : bool
+        Whether to simulate lateral colour, and the loss of light by the cat's eye.
+    """
+
+    pitch_um: float = DEFAULT_PITCH_UM
+    size: int = DEFAULT_SIZE
+    step: float = DEFAULT_STEP
+    defocus: float = 0.0
+    lateral: bool = True
+    vignetting: bool = False
+
+    def __post_init__(self) -> None:
+        if self.size < 3 or self.size % 2 == 0:
+            raise InvalidInputError(f"kernel size must be odd and at least 3, got {self.size}")
+        if not 0.01 <= self.step <= 0.5:
+            raise InvalidInputError(f"step must lie in 0.01..0.5 half diagonals, got {self.step}")
+
+
+def blurred(
+    scene: Planes,
+    lens: CameraLens,
+    settings: LensSettings,
+    frame: Frame,
+    options: BlurOptions | None = None,
+    *,
+    on_step: StepHook = ignore_step,
+) -> Planes:
+    """Blur a scene as the lens does: every point becomes the kernel of its place.
+
+    Kernels k_i sit on a grid of nodes; the scene x is divided among them by windows before the
+    convolution, so that the image of a point is a mean of the kernels of its four neighbours,
+    weighted by nearness, and light is neither lost nor made::
+
+        y = sum_i  k_i * (w_i x)          sum_i w_i = 1,  w_i a triangle in row and column
+
+    The kernels are exact on every second node; those between are cubic splines through them.
+    Triangles, not raised cosines: they reproduce kernels that vary linearly, so that the image of
+    a constant has no ripple.
+
+    Parameters
+    ----------
+    scene : Planes, shape (3, H + 2 m, W + 2 m)
+        Linear light, the frame in its middle. Where the margin m is narrower than half a kernel,
+        the scene is mirrored.
+    lens, settings
+        The lens and how it is set; the channel of `settings` is ignored.
+    frame : Frame
+        The frame, (H, W).
+    options : BlurOptions, optional
+        Grid, kernel size, and which effects to simulate.
+    on_step : StepHook
+        Called after each row of nodes.
+
+    Returns
+    -------
+    Planes, shape (3, H, W), float32
+
+    Raises
+    ------
+    InvalidInputError
+        If the scene does not fit the frame or holds negative or non-finite values.
+
+    Notes
+    -----
+    With the default step the kernel of a point differs from the exact one by a relative L2 of
+    0.5 to 1.5 percent (median over the field; 2 for a soft f/1.6), its MTF by 0.001 to 0.004.
+    Cost: 9 to 19 CPU seconds for 1.5 million pixels, most of it for the exact kernels, whose
+    number does not depend on the number of pixels.
+
+    Source: the windows before the convolution are those of M. Hirsch et al., "Efficient filter flow
+    for space-variant multiframe blind deconvolution", CVPR 2010, eq. 2.
+    """
+    options = options or BlurOptions()
+    half = options.size // 2
+    padded, _ = with_margin(scene, frame, half)
+    grid = _Grid.over(padded.shape[1:], frame, options.step)
+    out = np.zeros((3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half), dtype=np.float32)
+    total = len(CHANNELS) * (len(grid.exact_rows) + len(grid.rows))
+    done = 0
+    shares = np.ones((len(grid.rows), len(grid.cols)), dtype=np.float32)
+    if options.vignetting:
+        fields = [[grid.field(row, col) for col in grid.cols] for row in grid.rows]
+        shares[:] = [[lens.transmission(h, settings) for h in line] for line in fields]
+    for index, channel in enumerate(CHANNELS):
+        kernels = []
+        for row in grid.exact_rows:
+            kernels.append(
+                [
+                    _kernel(lens, settings.with_channel(channel), grid.field(row, col), frame, options)
+                    for col in grid.exact_cols
+                ]
+            )
+            done += 1
+            on_step(done, total)
+        spread = grid.spread(np.asarray(kernels, dtype=np.float32))
+        for i, row in enumerate(grid.rows):
+            for j, col in enumerate(grid.cols):
+                for top, left, light in grid.windowed(padded[index], row, col):
+                    image = _convolved(light, spread[i, j] * shares[i, j])
+                    out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
+            done += 1
+            on_step(done, total)
+    inner = out[:, 2 * half : 2 * half + frame.height, 2 * half : 2 * half + frame.width]
+    return np.ascontiguousarray(np.maximum(inner, 0.0))
+
+
+def with_margin(scene: Planes, frame: Frame, margin: int) -> tuple[Planes, int]:
+    """Cut or mirror a scene to the frame plus `margin`."""
+    if scene.ndim != 3 or scene.shape[0] != len(CHANNELS):
+        raise InvalidInputError(f"a scene has the shape (3, H, W), got {scene.shape}")
+    spare = (scene.shape[1] - frame.height, scene.shape[2] - frame.width)
+    if min(spare) < 0 or spare[0] % 2 or spare[1] % 2:
+        raise InvalidInputError(
+            f"the scene {scene.shape[1:]} must exceed the frame ({frame.height}, {frame.width}) by an even "
+            "number of rows and columns, or equal it; crop or enlarge it first"
+        )
+    if not np.isfinite(scene).all() or float(scene.min()) < 0.0:
+        raise InvalidInputError("scene values must be finite and not negative linear light")
+    cut = [max(s // 2 - margin, 0) for s in spare]
+    inner = scene[:, cut[0] : scene.shape[1] - cut[0], cut[1] : scene.shape[2] - cut[1]]
+    missing = [max(margin - s // 2, 0) for s in spare]
+    padded = np.pad(inner, ((0, 0), (missing[0],) * 2, (missing[1],) * 2), mode="symmetric")
+    return np.ascontiguousarray(padded, dtype=np.float32), max(missing)
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Nodes of the windows, in pixels of the padded scene; every `_REFINED`-th has an exact kernel."""
+
+    rows: tuple[int, ...]
+    cols: tuple[int, ...]
+    spacing: int
+    center: tuple[float, float]
+    half_diagonal: float
+
+    @classmethod
+    def over(cls, shape: tuple[int, ...], frame: Frame, step: float) -> _Grid:
+        spacing = max(round(step * frame.half_diagonal / _REFINED), 4)
+        rows, cols = _nodes(shape[0], spacing), _nodes(shape[1], spacing)
+        center = ((shape[0] - 1) / 2.0, (shape[1] - 1) / 2.0)
+        return cls(rows, cols, spacing, center, frame.half_diagonal)
+
+    @property
+    def exact_rows(self) -> tuple[int, ...]:
+        return self.rows[::_REFINED]
+
+    @property
+    def exact_cols(self) -> tuple[int, ...]:
+        return self.cols[::_REFINED]
+
+    def field(self, row: int, col: int) -> tuple[float, float]:
+        """Field vector (right, up) of a pixel; beyond the frame it is longer than 1."""
+        return (col - self.center[1]) / self.half_diagonal, (self.center[0] - row) / self.half_diagonal
+
+    def spread(self, exact: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Kernels of all nodes, `(rows, cols, k, k)`, by cubic splines through the exact ones."""
+        along_rows = _spline(exact.shape[0], len(self.rows))
+        along_cols = _spline(exact.shape[1], len(self.cols))
+        fine = np.tensordot(along_rows, exact, axes=(1, 0))
+        fine = np.tensordot(along_cols, fine, axes=(1, 1)).swapaxes(0, 1)
+        fine = np.maximum(fine, 0.0)
+        return np.asarray(fine / fine.sum(axis=(2, 3), keepdims=True), dtype=np.float32)
+
+    def windowed(
+        self, plane: NDArray[np.float32], row: int, col: int
+    ) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+        """The part of a plane that belongs to a node, times its window, and its top left corner."""
+        reach = self.spacing - 1
+        top, left = max(row - reach, 0), max(col - reach, 0)
+        # nodes may lie beyond the plane: a negative end would count from its far side
+        tile = plane[top : max(row + reach + 1, 0), left : max(col + reach + 1, 0)]
+        if tile.size:
+            weights = [
+                1.0 - np.abs(np.arange(n) + start - node) / self.spacing
+                for n, start, node in zip(tile.shape, (top, left), (row, col), strict=True)
+            ]
+            yield top, left, tile * np.outer(*weights).astype(np.float32)
+
+
+def _nodes(length: int, spacing: int) -> tuple[int, ...]:
+    """Nodes symmetric about the middle, the outer ones on or beyond the edges, exact ones outermost."""
+    middle = (length - 1) // 2
+    unit = spacing * _REFINED
+    before, after = -(-middle // unit), -(-(length - 1 - middle) // unit)
+    return tuple(middle + k * spacing for k in range(-before * _REFINED, after * _REFINED + 1))
+
+
+def _spline(known: int, wanted: int) -> NDArray[np.float32]:
+    """Matrix `(wanted, known)` of cubic spline interpolation at `known` even places."""
+    places = np.arange(known, dtype=np.float64)
+    basis = CubicSpline(places, np.eye(known))
+    return np.asarray(basis(np.linspace(0.0, known - 1.0, wanted)), dtype=np.float32)
+
+
+@lru_cache(maxsize=2048)  # photos of one lens and frame share all their kernels, 50 MB at most
+def _kernel(
+    lens: CameraLens, settings: LensSettings, h: tuple[float, float], frame: Frame, options: BlurOptions
+) -> NDArray[np.float64]:
+    channel: Channel = settings.channel
+    offset, r = (0.0, 0.0), math.hypot(*h)
+    if options.lateral and channel != "g" and r > 0:
+        outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
+        offset = (-outwards * h[1] / r, outwards * h[0] / r)
+    return lens.kernel_at_field(
+        h, settings, options.size, pitch_um=options.pitch_um, defocus=options.defocus, offset=offset
+    )
+
+
+def _convolved(light: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Full convolution, larger than `light` by the side of the kernel less one."""
+    shape = (light.shape[0] + kernel.shape[0] - 1, light.shape[1] + kernel.shape[1] - 1)
+    grid = [int(fft.next_fast_len(n, real=True)) for n in shape]
+    product = fft.rfft2(light, s=grid) * fft.rfft2(kernel, s=grid)
+    return fft.irfft2(product, s=grid, overwrite_x=True)[: shape[0], : shape[1]]
+
+
+_BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100
+
+
+def shot_info(photo: SimulatedPhoto, *, taken_at: datetime | None = None, orientation: int = 1) -> ShotInfo:
+    """Metadata of a simulated photo as its camera would write it."""
+    truth = photo.truth
+    lens, camera, settings = truth.lens, truth.camera, truth.settings
+    widest = lens.widest(lens.focal_mm[0]), lens.widest(lens.focal_mm[-1])
+    return ShotInfo(
+        camera_maker=camera.maker,
+        camera_model=camera.model,
+        body_serial=camera.serial,
+        lens_maker=lens.maker,
+        lens_model=lens.model,
+        lens_serial=lens.serial,
+        aperture=round(lens.f_number(settings), 2),
+        focal_mm=settings.focal_mm if settings.focal_mm is not None else lens.focal_mm[0],
+        focal_range_mm=(lens.focal_mm[0], lens.focal_mm[-1]),
+        widest_aperture=widest,
+        focus_m=settings.focus_m,
+        iso=max(round(100.0 * _BASE_ISO_ELECTRONS / camera.full_well_electrons), 1),
+        exposure_s=1.0 / 125.0,
+        taken_at=taken_at,
+        pixel_pitch_um=camera.pitch_um,
+        orientation=orientation,
+    )
+
+
+def write_photo(
+    path: str | Path,
+    photo: SimulatedPhoto,
+    *,
+    demosaiced: bool = False,
+    taken_at: datetime | None = None,
+    orientation: int = 1,
+) -> None:
+    """Write a simulated photo as DNG: its mosaic, or its three full planes as a linear DNG."""
+    camera = photo.truth.camera
+    info = shot_info(photo, taken_at=taken_at, orientation=orientation)
+    if demosaiced:
+        write_linear_dng(
+            path,
+            np.clip(np.rint(photo.planes * np.float32(65535.0)), 0, 65535).astype(np.uint16),
+            color_matrix=camera.color_matrix,
+            as_shot_neutral=camera.as_shot_neutral,
+            shot=info,
+        )
+        return
+    write_bayer_dng(
+        path,
+        photo.mosaic,
+        black=camera.black,
+        white=camera.white,
+        pattern=camera.pattern,
+        color_matrix=camera.color_matrix,
+        as_shot_neutral=camera.as_shot_neutral,
+        shot=info,
     )

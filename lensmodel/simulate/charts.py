@@ -79,18 +79,6 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
 
         F(d) = [(d + p)+^2 - (d + m)+^2 - (d - m)+^2 + (d - p)+^2] / (2 a b)
         p = (a + b) / 2,  m = |a - b| / 2
-
-    Parameters
-    ----------
-    rows, cols : ndarray
-        Pixel centres relative to the edge's point, broadcasting together.
-    normal : float
-        Angle of the normal, counter-clockwise from the right, pointing to the bright side.
-
-    Returns
-    -------
-    ndarray of float64
-        0 dark to 1 bright.
     """
     distance = np.asarray(cols) * math.cos(normal) - np.asarray(rows) * math.sin(normal)
     a, b = abs(math.cos(normal)), abs(math.sin(normal))
@@ -108,21 +96,7 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
 def slanted_edge_scene(
     height: int, width: int, normal: float, *, dark: float = 0.2, bright: float = 0.8
 ) -> NDArray[np.float32]:
-    """One plane with one edge through its middle; see `edge_area`.
-
-    Parameters
-    ----------
-    height, width : int
-        Pixels.
-    normal : float
-        Angle of the normal in radians, pointing to the bright side.
-    dark, bright : float
-        Linear light.
-
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-    """
+    """One plane with one edge through its middle; see `edge_area`."""
     rows = (np.arange(height) - (height - 1) / 2.0)[:, None]
     cols = (np.arange(width) - (width - 1) / 2.0)[None, :]
     return (dark + (bright - dark) * edge_area(rows, cols, normal)).astype(np.float32)
@@ -137,26 +111,6 @@ def edge_chart(
     bright: float = 0.75,
 ) -> Chart:
     """Chart with edges in the centre, half way out and in all four corners, of both directions.
-
-    Parameters
-    ----------
-    frame : Frame
-        At least 432 pixels high, wider than high.
-    margin : int
-        Pixels of grey around the frame, for the lens to blur in.
-    guard : int
-        Pixels between an edge's box and the border of its tile: half a kernel or more.
-    dark, bright : float
-        Levels of the two sides.
-
-    Returns
-    -------
-    Chart
-
-    Raises
-    ------
-    InvalidInputError
-        If the frame is too small.
 
     Notes
     -----

@@ -3,129 +3,98 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from lensmodel.core.errors import UnknownMethodError
-from lensmodel.simulate.aberrations import Aberrations
-from lensmodel.simulate.lens import DEFAULT_PITCH_UM, SimulatedLens
-from lensmodel.simulate.pupil import REFERENCE_UM
+from lensmodel.simulate.lens import DEFAULT_PITCH_UM, REFERENCE_UM, Aberrations, SimulatedLens
 
-Draw = Callable[[np.random.Generator], "_Recipe"]
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """Proportions of the aberrations of a kind of lens, and how much blur they shall make."""
+
+    f_numbers: tuple[float, ...]
+    center_px: tuple[float, float]  # rms width of the ray spot at the centre, pixels of 4.5 um: from, to
+    corner_px: tuple[float, float]  # same at r = 1, mean over phi
+    fixed: Mapping[str, float] = field(default_factory=dict)  # other than the defaults of `_Recipe`
+    drawn: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # from, to
+
+    def recipe(self, rng: np.random.Generator) -> _Recipe:
+        """Draw one copy."""
+        f_number = float(rng.choice(self.f_numbers))
+        center, corner = (float(rng.uniform(*ends)) for ends in (self.center_px, self.corner_px))
+        drawn = {name: float(rng.uniform(*ends)) for name, ends in self.drawn.items()}
+        return _Recipe(f_number, center, corner, **{**self.fixed, **drawn})
 
 
 @dataclass(frozen=True, slots=True)
 class _Recipe:
-    """Proportions of the aberrations, and how much blur they shall make."""
+    """What was drawn of a kind; widths as there, uniform faults and tilt as shares of the corner's blur."""
 
     f_number: float
-    center_px: float  # rms width of the ray spot at the centre, pixels of 4.5 um
-    corner_px: float  # same at r = 1, mean over phi
+    center_px: float
+    corner_px: float
     spherical: float = 1.0
     coma: float = 1.0
     astigmatism: float = 1.0
     field_curvature: float = 1.0
     decentring: float = 0.05
-    uniform_coma: float = 0.03  # as a share of the blur of the corner
+    uniform_coma: float = 0.03
     uniform_astigmatism: float = 0.03
     tilt: float = 0.03
 
 
-def _recipes() -> dict[str, Draw]:
-    def uniform(rng: np.random.Generator, low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
+_KINDS: Final = {
+    "soft-fast": _Kind((1.4, 1.6, 1.8), (0.9, 1.4), (2.2, 4.2), {"coma": 1.5}),
+    "coma": _Kind(
+        (1.8, 2.0, 2.4), (0.3, 0.7), (1.3, 3.0), {"coma": 3.0, "astigmatism": 0.4, "field_curvature": 0.3}
+    ),
+    "astigmatism": _Kind(
+        (2.0, 2.4, 2.8), (0.3, 0.7), (1.2, 3.0), {"coma": 0.4, "astigmatism": 3.0, "field_curvature": 0.2}
+    ),
+    "field-curvature": _Kind(
+        (1.8, 2.0, 2.8), (0.3, 0.7), (1.2, 3.0), {"coma": 0.4, "astigmatism": 0.3, "field_curvature": 3.0}
+    ),
+    "decentred": _Kind(
+        (1.8, 2.0, 2.8),
+        (0.4, 0.8),
+        (1.2, 2.6),
+        drawn={"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)},
+    ),
+    "tilted": _Kind(
+        (1.8, 2.0, 2.8),
+        (0.3, 0.7),
+        (1.0, 2.2),
+        drawn={"tilt": (0.4, 0.7), "uniform_astigmatism": (0.05, 0.15)},
+    ),
+    "nearly-perfect": _Kind((2.8, 3.5, 4.0), (0.1, 0.25), (0.5, 0.8), {"tilt": 0.1}),
+    "zoom": _Kind((2.8, 3.5, 4.0), (0.4, 0.9), (1.2, 3.0), {"decentring": 0.12}),
+}
 
-    return {
-        "soft-fast": lambda g: _Recipe(
-            float(g.choice([1.4, 1.6, 1.8])), uniform(g, 0.9, 1.4), uniform(g, 2.2, 4.2), coma=1.5
-        ),
-        "coma": lambda g: _Recipe(
-            float(g.choice([1.8, 2.0, 2.4])),
-            uniform(g, 0.3, 0.7),
-            uniform(g, 1.3, 3.0),
-            coma=3.0,
-            astigmatism=0.4,
-            field_curvature=0.3,
-        ),
-        "astigmatism": lambda g: _Recipe(
-            float(g.choice([2.0, 2.4, 2.8])),
-            uniform(g, 0.3, 0.7),
-            uniform(g, 1.2, 3.0),
-            coma=0.4,
-            astigmatism=3.0,
-            field_curvature=0.2,
-        ),
-        "field-curvature": lambda g: _Recipe(
-            float(g.choice([1.8, 2.0, 2.8])),
-            uniform(g, 0.3, 0.7),
-            uniform(g, 1.2, 3.0),
-            coma=0.4,
-            astigmatism=0.3,
-            field_curvature=3.0,
-        ),
-        "decentred": lambda g: _Recipe(
-            float(g.choice([1.8, 2.0, 2.8])),
-            uniform(g, 0.4, 0.8),
-            uniform(g, 1.2, 2.6),
-            decentring=uniform(g, 0.2, 0.4),
-            uniform_coma=uniform(g, 0.15, 0.3),
-        ),
-        "tilted": lambda g: _Recipe(
-            float(g.choice([1.8, 2.0, 2.8])),
-            uniform(g, 0.3, 0.7),
-            uniform(g, 1.0, 2.2),
-            tilt=uniform(g, 0.4, 0.7),
-            uniform_astigmatism=uniform(g, 0.05, 0.15),
-        ),
-        "nearly-perfect": lambda g: _Recipe(
-            float(g.choice([2.8, 3.5, 4.0])), uniform(g, 0.1, 0.25), uniform(g, 0.5, 0.8), tilt=0.1
-        ),
-        "zoom": lambda g: _Recipe(
-            float(g.choice([2.8, 3.5, 4.0])), uniform(g, 0.4, 0.9), uniform(g, 1.2, 3.0), decentring=0.12
-        ),
-    }
-
-
-LENS_KINDS: Final = tuple(_recipes())
+LENS_KINDS: Final = tuple(_KINDS)
 """Kinds of lenses that `draw_lens` knows."""
 
 
 def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
     """Draw a copy of a lens.
 
-    Parameters
-    ----------
-    seed : int
-        Not negative; equal seeds and kinds give equal lenses. It also makes the serial number.
-    kind : str, optional
-        One of `LENS_KINDS`; None takes them in turn by seed.
-
-    Returns
-    -------
-    SimulatedLens
-
-    Raises
-    ------
-    UnknownMethodError
-        If there is no such kind.
-
     Notes
     -----
     Blur is set through the ray spot: its root mean square width per axis, over the whole pupil,
     without diffraction and pixel, hits a width drawn for the centre and one for the corner.
     """
-    recipes = _recipes()
     kind = LENS_KINDS[seed % len(LENS_KINDS)] if kind is None else kind
-    if kind not in recipes:
+    if kind not in _KINDS:
         raise UnknownMethodError(f"no kind of lens {kind!r}; known: {', '.join(LENS_KINDS)}")
     rng = np.random.default_rng([seed, LENS_KINDS.index(kind)])
     serial = f"SIM{seed:07d}"
     if kind == "zoom":
         short, long = float(rng.choice([18.0, 24.0, 28.0])), float(rng.choice([70.0, 85.0, 105.0]))
-        recipe = recipes[kind](rng)
+        recipe = _KINDS[kind].recipe(rng)
         wide = _optics(recipe, rng)
         tele = _optics(replace(recipe, corner_px=recipe.corner_px * float(rng.uniform(0.6, 1.1))), rng)
         # a shifted element stays where it is when one zooms
@@ -133,7 +102,7 @@ def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
         name = f"Simulated Zoom {short:.0f}-{long:.0f}mm f/{recipe.f_number:g}"
         return SimulatedLens((wide, tele), (short, long), model=name, serial=serial)
     focal = float(rng.choice([24.0, 35.0, 50.0, 85.0]))
-    recipe = recipes[kind](rng)
+    recipe = _KINDS[kind].recipe(rng)
     name = f"Simulated {kind.title()} {focal:.0f}mm f/{recipe.f_number:g}"
     return SimulatedLens((_optics(recipe, rng),), (focal,), model=name, serial=serial)
 

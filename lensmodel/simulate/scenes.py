@@ -21,38 +21,14 @@ DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 
 
 def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Undo the sRGB curve (IEC 61966-2-1) on values in 0..1.
-
-    Parameters
-    ----------
-    values : ndarray
-        Coded values, 0..1.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-    """
+    """Undo the sRGB curve (IEC 61966-2-1) on values in 0..1."""
     v = np.asarray(values, dtype=np.float32)
     high = ((np.maximum(v, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(v <= 0.04045, v / np.float32(12.92), high).astype(np.float32)
 
 
 def load_scene(path: str | Path) -> Planes:
-    """Load an sRGB photograph (PNG, JPEG, TIFF of 8 bits) as linear light.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Planes, shape (3, H, W), values 0..1
-
-    Raises
-    ------
-    NotAnImageError
-        If the file is no such image.
-    """
+    """Load an sRGB photograph (PNG, JPEG, TIFF of 8 bits) as linear light."""
     try:
         with Image.open(path) as image:
             coded = np.asarray(image.convert("RGB"), dtype=np.uint8)
@@ -63,23 +39,7 @@ def load_scene(path: str | Path) -> Planes:
 
 
 def demo_data_path(name: str) -> Path:
-    """Path of a file of `lensmodel/demo_data`; see its README for origin and licences.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InvalidInputError
-        If there is no such file; the text lists those that exist. Packages that are installed from a wheel
-        have none of them: they come with the source tree.
-    """
+    """Path of a file of `lensmodel/demo_data`; see its README for origin and licences."""
     folder = resources.files("lensmodel") / "demo_data"
     known = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
     if not set(known) - {"README.md"}:
@@ -93,22 +53,7 @@ def demo_data_path(name: str) -> Path:
 
 
 def demo_scene(name: str) -> Planes:
-    """Photograph of `DEMO_SCENES` as linear light, `(3, H, W)`.
-
-    Parameters
-    ----------
-    name : str
-        One of `DEMO_SCENES`.
-
-    Returns
-    -------
-    Planes, shape (3, H, W), float32
-
-    Raises
-    ------
-    InvalidInputError
-        If there is no photograph of that name.
-    """
+    """Photograph of `DEMO_SCENES` as linear light, `(3, H, W)`."""
     if name not in DEMO_SCENES:
         raise InvalidInputError(f"no demo scene {name!r}; known: {', '.join(DEMO_SCENES)}")
     return load_scene(demo_data_path(f"{name}.jpg"))

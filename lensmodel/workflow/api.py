@@ -11,19 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel import correction, photo
+from lensmodel.blind import PsfEstimator, estimators
+from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
-from lensmodel.estimation import PsfEstimator
-from lensmodel.estimation.patches import Selector
 from lensmodel.model import ModelSettings
+from lensmodel.patches import Selector
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.tags.location import gps_directory
 from lensmodel.photo.tags.xmp_block import sidecar_for, write_sidecar
-from lensmodel.workflow import pipeline
-from lensmodel.workflow.arguments import require_workers
+from lensmodel.workflow.calibrating import Calibration, InMemory
+from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.pipeline import CalibrationEvent, EventHook, ignore_event
-from lensmodel.workflow.ways import way_of
+from lensmodel.workflow.sampling import (
+    CalibrationEvent,
+    EventHook,
+    Recipe,
+    ignore_event,
+    photo_id,
+    settings_of,
+    way_of,
+)
 
 FORMATS: dict[str, photo.OutputFormat] = {
     ".tif": "tiff16",
@@ -111,37 +119,34 @@ def calibrate(
     CancelledError
         As `on_event` raised it.
     """
-    require_workers(workers)
+    _require_workers(workers)
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
     if lens is not None and model is not None:
         raise InvalidInputError("the lens has a model of its own; give lens or model, not both")
-    calibration = pipeline.Calibration(
-        pipeline.InMemory(lens),
-        pipeline.Recipe(
-            LensSettings(aperture, focal_mm, focus_m),
-            model=model if isinstance(model, str) else None,
-            estimator=estimator,
-            kernel_size=kernel_size,
-            selector=selector,
-            count=patches,
-        ),
-        begin=None if isinstance(model, str) else model,
-        any_lens=any_lens,
-        workers=workers,
+    recipe = Recipe(
+        LensSettings(aperture, focal_mm, focus_m),
+        model=model if isinstance(model, str) else None,
+        estimator=estimator,
+        kernel_size=kernel_size,
+        selector=selector,
+        count=patches,
     )
+    begin = None if isinstance(model, str) else model
     reasons = []
-    for verdict in calibration.learn(paths, executor, on_event=on_event):
-        path, count = verdict.photo, verdict.samples
-        if verdict.error is not None:
-            reasons.append(f"{path.name}: {verdict.error}")
-            event = CalibrationEvent(path, "skipped", detail=str(verdict.error))
-        elif count is None:
-            event = CalibrationEvent(path, "skipped", detail="its samples are in the model already")
-        else:
-            event = CalibrationEvent(path, "counted", count, count)
-        on_event(event)
+    with processes.pool(None, workers, estimators.resolve(recipe.of_lens(lens).method)) as pool:
+        calibration = Calibration(InMemory(lens), recipe, begin=begin, any_lens=any_lens, pool=pool)
+        for verdict in calibration.learn(paths, executor, on_event=on_event):
+            path, count = verdict.photo, verdict.samples
+            if verdict.error is not None:
+                reasons.append(f"{path.name}: {verdict.error}")
+                event = CalibrationEvent(path, "skipped", detail=str(verdict.error))
+            elif count is None:
+                event = CalibrationEvent(path, "skipped", detail="its samples are in the model already")
+            else:
+                event = CalibrationEvent(path, "counted", count, count)
+            on_event(event)
     learned = calibration.known
     if learned is None:
         raise NotEnoughEvidenceError(
@@ -237,7 +242,7 @@ def correct(
     CancelledError
         If `on_step` raised it.
     """
-    require_workers(workers)
+    _require_workers(workers)
     given = LensSettings(aperture, focal_mm, focus_m)
     target = None if output is None else Path(output)
     written = file_format or (None if target is None else _format_of(target))
@@ -255,15 +260,15 @@ def correct(
         if source is None
         else photo.develop(source)
     )
-    corrected = pipeline.correct_photo(
+    corrected = correct_photo(
         developed,
         known.model,
-        pipeline.settings_of(developed, given),
+        settings_of(developed, given),
         method=method,
         strength=strength,
         bounds=bounds,
-        lateral=pipeline.lateral_of(developed),
-        photo="" if source is None else pipeline.photo_id(source),
+        lateral=lateral_of(developed),
+        photo="" if source is None else photo_id(source),
         workers=workers or os.cpu_count() or 1,
         on_step=on_step,
     )
@@ -313,3 +318,8 @@ def _format_of(output: Path) -> photo.OutputFormat:
             f"no format for {output.name}; give a name that ends in {', '.join(FORMATS)}, or file_format"
         )
     return known
+
+
+def _require_workers(workers: int | None) -> None:
+    if workers is not None and workers < 1:
+        raise InvalidInputError(f"workers must be at least 1, got {workers}; None takes all cores")

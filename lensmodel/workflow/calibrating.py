@@ -5,31 +5,131 @@ photo, photo, ... -> samples of each (`sampling`) -> added to the model
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from lensmodel import photo
 from lensmodel.core import parallel
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import PsfSample
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.measured import is_measured
+from lensmodel.model import Camera, LensModel, LensProfile, ModelSettings
+from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.endings import CORRECTED
-from lensmodel.workflow.developed import photo_id, require_aperture
-from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
     EventHook,
     Recipe,
     ignore_event,
+    photo_id,
+    require_aperture,
     samples_of_bytes,
     samples_of_photo,
 )
 
 AHEAD: Final = 32
 """Photos that are sent to an executor at once (chosen): a gigabyte of them, work for some dozen processes."""
+
+SAME_STOPS: Final = 1.0 / 3.0
+"""Apertures nearer than this are one setting: cameras set thirds of a stop."""
+
+_SAME_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a photo says of its lens and of its camera.
+
+    Parameters
+    ----------
+    lens : mapping of str to str
+        maker, model, serial, as far as they are known.
+    camera : Camera or None
+        The body; `None` where the photo does not name its model.
+    """
+
+    lens: Mapping[str, str] = field(default_factory=dict)
+    camera: Camera | None = None
+
+    @classmethod
+    def of(cls, metadata: PhotoMetadata) -> Identity:
+        """Take from a photo's metadata what tells of its lens and its camera."""
+        lens = metadata.lens
+        named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial}
+        camera = Camera(metadata.camera_maker, metadata.camera_model, metadata.body_serial)
+        return cls({name: value for name, value in named.items() if value}, camera if camera.model else None)
+
+    @property
+    def names_lens(self) -> bool:
+        """Whether there is more than a maker, which says nothing of the lens."""
+        return _names_lens(self.lens)
+
+
+def difference(known: Mapping[str, str], cameras: Iterable[Camera], identity: Identity) -> str | None:
+    """Say why a photo cannot be, or need not be, of the lens of a profile.
+
+    - What both name of the lens must agree.
+    - A lens that is part of a camera, and names itself after it, is as unique as the body: the serials of
+      both must agree.
+    - Where the photo names no lens, its camera must be one that the profile's photos were taken with: the
+      lens of a compact is part of it, and two models of camera have two lenses. On the same body an
+      unnamed lens may be any that was screwed on; that is for the owner to know.
+    - Where only the photo names its lens, its camera recorded more than for the profile's photos, so
+      nothing says that they are of one lens, unless the owner gave the profile a label.
+    """
+    for name, value in identity.lens.items():
+        key = serial_key if name == "serial" else name_key
+        if key(known.get(name, value)) != key(value):
+            return (
+                f"it was taken with another lens, {name} {value}, and the profile is of {name} {known[name]}"
+            )
+    bodies = list(cameras)
+    if identity.names_lens and not _names_lens(known) and not known.get("label"):
+        return f"it names its lens, {_lens_words(identity.lens)}, and the profile's photos name none"
+    if identity.camera is None or not bodies:
+        return None
+    alike = [body for body in bodies if _same_model(body, identity.camera)]
+    if not identity.names_lens and not alike:
+        return (
+            f"it names no lens and was taken with another camera, {_camera_words(identity.camera)}, "
+            f"and the profile's photos with {', '.join(map(_camera_words, bodies))}"
+        )
+    built_in = not _names_lens(known) if not identity.names_lens else _is_built_in(identity)
+    serials = {serial_key(body.serial) for body in alike if body.serial}
+    serial = identity.camera.serial
+    if built_in and serial and serials and serial_key(serial) not in serials:
+        return (
+            f"it was taken with another copy of the camera, serial {serial}, and nothing "
+            "says that the lens is the same"
+        )
+    return None
+
+
+def _names_lens(lens: Mapping[str, str]) -> bool:
+    return bool(lens.get("model") or lens.get("serial"))
+
+
+def _is_built_in(identity: Identity) -> bool:
+    camera = "" if identity.camera is None else name_key(identity.camera.model)
+    return bool(camera) and camera in name_key(identity.lens.get("model")) and not identity.lens.get("serial")
+
+
+def _same_model(one: Camera, other: Camera) -> bool:
+    # makers write their name into the model or not, and in more than one way; models are not shared
+    a, b = name_key(one.model), name_key(other.model)
+    return bool(a) and bool(b) and (a.endswith(b) or b.endswith(a))
+
+
+def _camera_words(camera: Camera) -> str:
+    return camera.model or "an unknown camera"
+
+
+def _lens_words(lens: Mapping[str, str]) -> str:
+    return " ".join(lens[name] for name in ("model", "serial") if lens.get(name))
 
 
 class LensKeeper(Protocol):
@@ -79,8 +179,9 @@ class Calibration:
         Choices of the regression of a new lens; a known one keeps its own.
     any_lens : bool
         Take photos that seem to be of another lens as well.
-    workers : int, optional
-        Processes, where photos are estimated here.
+    pool : Executor, optional
+        Estimates the cells of all photos, where they are estimated here; without one each photo starts and
+        ends `workers` processes of its own.
 
     Raises
     ------
@@ -95,13 +196,18 @@ class Calibration:
         *,
         begin: ModelSettings | None = None,
         any_lens: bool = False,
+        pool: Executor | None = None,
         workers: int | None = None,
     ) -> None:
         self._keeper, self._recipe = keeper, recipe
         self._begin = begin or ModelSettings(mode=recipe.way.mode)
-        self._any_lens, self._workers = any_lens, workers
-        self._current = keeper.lens()
-        recipe.of_lens(self._current).check()
+        self._any_lens, self._pool, self._workers = any_lens, pool, workers
+        recipe.of_lens(self.known).check()
+
+    @property
+    def known(self) -> Lens | None:
+        """The lens as it is now, with what other runs added; None where no photo could be used."""
+        return self._keeper.lens()
 
     def learn(
         self,
@@ -124,88 +230,76 @@ class Calibration:
         on_event : callable
             Learns of each step that is done here; raising `CancelledError` there stops the work.
         """
+        orders: dict[Path, tuple[str, Identity]] = {}
 
         def sent(path: Path) -> tuple[Any, ...] | None:
-            return None if executor is None else self._order(path)
+            """What the executor needs; None where there is nothing to send, and `add` says why."""
+            if executor is None:
+                return None
+            try:
+                key = photo_id(path)
+                if self._knows(key):
+                    return None
+                require_original(path)
+                orders[path] = key, self._admitted(photo.inspect(path).metadata)
+                return path.name, path.read_bytes(), self._recipe.of_lens(self.known), key
+            except (LensModelError, OSError):
+                return None
 
         jobs = parallel.in_order(
             executor or parallel.Here(), samples_of_bytes, paths, sent, ahead=1 if executor is None else ahead
         )
         for path, job in jobs:
             try:
-                verdict = PhotoVerdict(path, self.add(path, job, on_event=on_event))
+                if job is None:
+                    verdict = PhotoVerdict(path, self.add(path, on_event=on_event))
+                else:
+                    verdict = PhotoVerdict(path, self._keep(path, *orders[path], job.result()))
             except CancelledError:  # is of the whole work, not of one photo
                 raise
             except (LensModelError, OSError) as error:
                 verdict = PhotoVerdict(path, error=error)
             yield verdict
 
-    def add(
-        self,
-        path: Path,
-        estimated: Future[list[PsfSample]] | None = None,
-        *,
-        on_event: EventHook = ignore_event,
-    ) -> int | None:
+    def add(self, path: Path, *, on_event: EventHook = ignore_event) -> int | None:
         """Learn from one photo; return how many samples it gave, None where the lens has it already."""
         key = photo_id(path)
         if self._knows(key):
             return None
-        identity = self._admitted(path)
-        samples = (
-            samples_of_photo(
-                path, self._recipe.of_lens(self._lens()), workers=self._workers, on_event=on_event
-            )
-            if estimated is None
-            else estimated.result()
+        require_original(path)
+        identities: list[Identity] = []
+        samples = samples_of_photo(
+            path,
+            self._recipe.of_lens(self.known),
+            key=key,
+            admit=lambda metadata: identities.append(self._admitted(metadata)),
+            executor=self._pool,
+            workers=self._workers,
+            on_event=on_event,
         )
+        return self._keep(path, key, identities[0], samples)
+
+    def _keep(self, path: Path, key: str, identity: Identity, samples: Sequence[PsfSample]) -> int | None:
+        """Add the samples of a photo to the lens as it is now."""
         if self._knows(key):  # another run has added it meanwhile
             return None
-        lens = self._lens()
+        lens = self.known
         self._require_same_lens(lens, identity)
         model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
-        grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens)
-        self._keeper.keep(grown)
-        self._current = grown
+        self._keeper.keep(grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens))
         return len(samples)
 
-    @property
-    def known(self) -> Lens | None:
-        """The lens as it is now; None where no photo could be used."""
-        return self._lens()
-
-    def _order(self, path: Path) -> tuple[str, bytes, Recipe] | None:
-        """Return what an executor needs to estimate a photo; None if there is nothing to estimate."""
-        try:
-            if self._knows(photo_id(path)):
-                return None
-            self._admitted(path)
-            return path.name, path.read_bytes(), self._recipe.of_lens(self._lens())
-        except (LensModelError, OSError):  # `add` says so when its turn comes
-            return None
-
-    def _lens(self) -> Lens | None:
-        """Return what is known; where another run has changed it, that contains what this one kept."""
-        lens = self._keeper.lens()
-        self._current = lens
-        return lens
-
     def _knows(self, key: str) -> bool:
-        lens = self._lens()
+        lens = self.known
         return lens is not None and (
             key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
         )
 
-    def _admitted(self, path: Path) -> Identity:
+    def _admitted(self, metadata: PhotoMetadata) -> Identity:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
-        if path.stem.endswith(CORRECTED):
-            raise InvalidInputError(
-                "it was corrected already and says nothing about the lens; give the original"
-            )
-        said = photo.inspect(path).metadata
-        identity = Identity.of(said)
-        self._require_same_lens(self._lens(), identity)
-        require_aperture(said, self._recipe.settings)
+        identity = Identity.of(metadata)
+        self._require_same_lens(self.known, identity)
+        require_aperture(metadata, self._recipe.settings)
         return identity
 
     def _require_same_lens(self, lens: Lens | None, identity: Identity) -> None:
@@ -216,3 +310,56 @@ class Calibration:
             raise InvalidInputError(
                 f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
             )
+
+
+def require_original(path: Path) -> None:
+    """Refuse a photo that this program has corrected."""
+    if path.stem.endswith(CORRECTED):
+        raise InvalidInputError("it was corrected already and says nothing about the lens; give the original")
+
+
+def grown(
+    lens: Lens | None,
+    model: LensModel,
+    photos: Mapping[str, str],
+    identities: Iterable[Identity],
+    *,
+    any_lens: bool = False,
+) -> Lens:
+    """Return a lens whose model has learned from more photos (names by id), with names and cameras of both.
+
+    Photos that may be of other lenses (`any_lens`) do not name this one.
+    """
+    known = LensProfile(model) if lens is None else lens.profile
+    names, cameras = dict(known.lens), list(known.cameras)
+    for identity in identities:
+        if lens is None or not any_lens:
+            names = {**identity.lens, **names}
+        if identity.camera is not None and identity.camera not in cameras:
+            cameras.append(identity.camera)
+    return Lens(LensProfile(model, names, {**known.photos, **photos}, tuple(cameras)))
+
+
+def joined(
+    model: LensModel | None,
+    samples: Sequence[PsfSample],
+    *,
+    replace: bool = False,
+    model_settings: ModelSettings | None = None,
+) -> LensModel:
+    """Add measured samples to a model, or begin one with them."""
+    if model is None:
+        return LensModel.fit(samples, model_settings or ModelSettings())
+    if not replace:
+        return model.added(samples)
+    kept = [old for old in model.samples if is_measured(old) or not any(_alike(old, new) for new in samples)]
+    return LensModel.fit([*kept, *samples], model.settings)
+
+
+def _alike(old: PsfSample, new: PsfSample) -> bool:
+    """Whether two samples are of one setting of the lens."""
+    a, b = old.settings.stops, new.settings.stops
+    if a is not None and b is not None and abs(a - b) >= SAME_STOPS:
+        return False
+    f, g = old.settings.focal_mm, new.settings.focal_mm
+    return f is None or g is None or abs(f - g) < _SAME_FOCAL * g

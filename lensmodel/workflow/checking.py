@@ -21,7 +21,7 @@ from lensmodel.correction.audit.whole_photo import Window
 from lensmodel.correction.blur import UniformBlur, crop_to_support
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
-from lensmodel.workflow.pipeline import settings_of
+from lensmodel.workflow.sampling import settings_of
 
 _KERNEL: Final = 55  # pixels: the largest kernel that the paper estimates
 _BLOCK: Final = 8  # pixels: means over it keep what noise hides in one (chosen)
@@ -63,17 +63,6 @@ def check(
 
     Of a RAW file the corrected one shows the light in colours of its own: the mixture of these that comes
     closest to the photo is taken. All other pairs are taken at their word.
-
-    Parameters
-    ----------
-    original, corrected : Path
-        Photo files of one size, pixel for pixel of the same scene.
-    model : LensModel or None
-        The lens, for the check by re-blurring.
-    settings : LensSettings or None
-        What the photo does not say itself.
-    on_step : StepHook
-        Called after each tile; may raise to stop.
     """
     before, after = photo.develop(original), photo.develop(corrected)
     if before.planes.shape != after.planes.shape:

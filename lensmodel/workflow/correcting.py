@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from typing import Final
 
 from lensmodel import correction, quality
-from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
+from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError, OutsideSupportError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, ModelField
 from lensmodel.model.answer import PAPER
+from lensmodel.model.bodies import ALIKE, circle_mm
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.workflow.estimating import estimate_cell, find_patches
-from lensmodel.workflow.placing import placed
-from lensmodel.workflow.ways import way_of
+from lensmodel.photo.values import remarks_log
+from lensmodel.workflow.sampling import estimate_cell, find_patches, way_of
 
 log = logging.getLogger(__name__)
 
@@ -53,28 +53,6 @@ def correct_photo(
     The less sure a PSF is, by the error that the model expects, the gentler the correction. A lens that was
     learned the paper's way is corrected the paper's way: its PSFs are taken as right, and Richardson-Lucy
     deconvolution is all that is done.
-
-    Parameters
-    ----------
-    method : str or Deconvolver, optional
-        None takes that of the way the lens was learned (`way_of`).
-    strength : float
-        0 leaves the photo as it is, 1 applies what the noise allows, or `LOSSY_SHARE` of it if it is lossy.
-    bounds : Bounds, optional
-        What to allow beside edges and in flat areas.
-    layers : sequence of Bounds
-        Others to correct it within as well, in little more than the time of one.
-    roi : tuple of int, optional
-        `(row, col, height, width)` in sensor orientation; only that part is corrected.
-    photo : str
-        What samples of this photo are called, see `psfs_for`.
-    known : ModelField, optional
-        What `psfs_for` found for this photo; hand it over where the same photo is corrected several times.
-
-    Returns
-    -------
-    Corrected
-        Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
     whole, developed = developed.frame, placed(developed, model)
     if lateral is not None and developed.frame != whole:
@@ -128,11 +106,6 @@ def psfs_for(
     """Return the PSFs of a lens for the correction of a photo, whose own patches join the samples.
 
     Only the way of the paper, and lenses of measured kernels alone, take no patches of the photo.
-
-    Parameters
-    ----------
-    photo : str
-        What samples of this photo are called: they count once if the lens was learned from it.
     """
     developed = placed(developed, model)
     _, plain = _way(model, method)
@@ -182,3 +155,39 @@ def _with_measured_gain(
         for zone, report in corrected.zones.items()
     }
     return dataclasses.replace(corrected, zones=zones)
+
+
+def placed(developed: LinearPhoto, model: LensModel) -> LinearPhoto:
+    """Count the places of a photo in the half diagonal of the largest frame that its lens was seen on.
+
+    A frame in crop mode is the middle of the sensor. Where the pixel pitch is unknown the photo is taken for
+    a whole frame, and that is told where its size is another.
+    """
+    frame, info = developed.frame, developed.info
+    pitch, circle = info.metadata.pixel_pitch_um, circle_mm(model.samples)
+    if circle is None or frame.circle_px is not None:
+        return developed
+    if pitch is None:
+        pixels = {round(sample.half_diagonal_px) for sample in model.samples if sample.half_diagonal_px}
+        if pixels and not any(abs(frame.half_diagonal / size - 1.0) < ALIKE for size in pixels):
+            remarks_log.warning(
+                "its pixel pitch is unknown: %d x %d pixels are taken for the whole frame of %.1f mm",
+                frame.width,
+                frame.height,
+                2.0 * circle,
+            )
+        return developed
+    own = frame.half_diagonal * pitch / 1000.0
+    sizes = f"{2.0 * own:.1f} mm diagonal, and its lens is known on a frame of {2.0 * circle:.1f} mm"
+    if own > (1.0 + ALIKE) * circle:
+        raise OutsideSupportError(
+            f"it shows a frame of {sizes}: nothing is known of what lies beyond; calibrate the lens with "
+            "photos of the larger frame"
+        )
+    if own > (1.0 - ALIKE) * circle:
+        return developed
+    if not info.centred:
+        raise OutsideSupportError(
+            f"it was cut to {sizes}: nobody can tell from which part; correct the whole photo, then cut it"
+        )
+    return dataclasses.replace(developed, frame=dataclasses.replace(frame, circle_px=circle * 1000.0 / pitch))

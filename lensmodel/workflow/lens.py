@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +22,6 @@ from lensmodel.model import (
     save_profile,
 )
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
-from lensmodel.workflow.arguments import frequencies_of, named_each, one_each, places_joined
-from lensmodel.workflow.field_grid import field_grid
-from lensmodel.workflow.identity import Identity
 
 DEFAULT_SIZE = 55
 """Side of a kernel in pixels (chosen): what a correction uses, so that the same numbers are seen."""
@@ -102,8 +100,8 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        places = zip(one_each(r, n, "r"), one_each(phi, n, "phi"), strict=True)
-        apertures = [None] * n if aperture is None else one_each(aperture, n, "aperture")
+        places = zip(_one_each(r, n, "r"), _one_each(phi, n, "phi"), strict=True)
+        apertures = [None] * n if aperture is None else _one_each(aperture, n, "aperture")
         samples = [
             PsfSample(
                 centred(kernel),
@@ -118,54 +116,13 @@ class Lens:
                 stack,
                 places,
                 apertures,
-                named_each(channel, n, "channel"),
-                one_each(weight, n, "weight"),
-                named_each(photo, n, "photo"),
+                _named_each(channel, n, "channel"),
+                _one_each(weight, n, "weight"),
+                _named_each(photo, n, "photo"),
                 strict=True,
             )
         ]
         return cls(LensProfile(LensModel.fit(samples, model)))
-
-    @classmethod
-    def grown(
-        cls,
-        lens: Lens | None,
-        model: LensModel,
-        photos: Mapping[str, str],
-        identities: Iterable[Identity],
-        *,
-        any_lens: bool = False,
-    ) -> Lens:
-        """Return a lens whose model has learned from more photos.
-
-        Parameters
-        ----------
-        lens : Lens or None
-            What was known before.
-        model : LensModel
-            What is known now.
-        photos : mapping of str to str
-            File names of the new photos, by their ids.
-        identities : iterable of Identity
-            What the new photos say of lens and camera.
-        any_lens : bool
-            The photos may be of other lenses, so they do not name this one.
-
-        Returns
-        -------
-        Lens
-            With the names, cameras and photos of both.
-        """
-        known = None if lens is None else lens.profile
-        names = {} if known is None else dict(known.lens)
-        cameras = [] if known is None else list(known.cameras)
-        for identity in identities:
-            if known is None or not any_lens:
-                names = {**identity.lens, **names}
-            if identity.camera is not None and identity.camera not in cameras:
-                cameras.append(identity.camera)
-        earlier = {} if known is None else known.photos
-        return cls(LensProfile(model, names, {**earlier, **photos}, tuple(cameras)))
 
     @classmethod
     def load(cls, path: Path | str) -> Lens:
@@ -276,7 +233,7 @@ class Lens:
         InvalidInputError
             If the shapes of `r` and `phi` do not broadcast, or a value is out of its range.
         """
-        radii, angles = places_joined(r, phi)
+        radii, angles = _places_joined(r, phi)
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
@@ -316,7 +273,7 @@ class Lens:
             If the frequencies are no list of finite numbers from 0 on, the shapes of `r` and `phi` do not
             broadcast, or a value is out of its range.
         """
-        wanted = frequencies_of(frequencies)
+        wanted = _frequencies_of(frequencies)
         kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
         angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
         out = np.empty((2, *angles.shape, len(wanted)))
@@ -381,3 +338,73 @@ class Lens:
         words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
         count = len(self.profile.photos)
         return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
+
+
+def field_grid(
+    rows: int, cols: int, *, aspect: float = 1.5
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the field positions of the centers of equal cells of a picture.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Number of cells, at least 1.
+    aspect : float
+        Width over height of the picture.
+
+    Returns
+    -------
+    r, phi : ndarray of float64, shape (rows, cols)
+        Half diagonals, and radians; row 0 is the top in sensor orientation.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no cells, or the aspect is not positive.
+    """
+    if rows < 1 or cols < 1 or not aspect > 0.0:
+        raise InvalidInputError(f"a grid needs cells and an aspect, got {rows} x {cols}, aspect {aspect}")
+    half = np.hypot(aspect, 1.0)
+    up = (1.0 - (2.0 * np.arange(rows) + 1.0) / rows)[:, None] / half
+    right = ((2.0 * np.arange(cols) + 1.0) / cols - 1.0)[None, :] * aspect / half
+    return np.hypot(up, right), np.arctan2(up + 0.0 * right, right + 0.0 * up)
+
+
+def _places_joined(r: ArrayLike, phi: ArrayLike) -> Sequence[NDArray[np.float64]]:
+    """Broadcast the two numbers of field positions to arrays of one shape."""
+    radii, angles = np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
+    try:
+        return np.broadcast_arrays(radii, angles)
+    except ValueError as error:
+        raise InvalidInputError(
+            f"r and phi must have shapes that broadcast, got {radii.shape} and {angles.shape}"
+        ) from error
+
+
+def _frequencies_of(values: ArrayLike) -> NDArray[np.float64]:
+    """Return frequencies in cycles/pixel, shape (n,); one number is a list of one."""
+    wanted = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    if wanted.ndim != 1:
+        raise InvalidInputError(f"frequencies must have the shape (n,), got {wanted.shape}; give a flat list")
+    wrong = wanted[~(np.isfinite(wanted) & (wanted >= 0.0))]
+    if wrong.size:
+        raise InvalidInputError(
+            f"frequencies must be finite and not negative, in cycles/pixel, got {wrong[0]:g}; leave it out"
+        )
+    return wanted
+
+
+def _one_each(values: ArrayLike, n: int, name: str) -> list[float]:
+    """Return n numbers that were given one by one, or once for all."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape not in {(), (n,)}:
+        raise InvalidInputError(f"{name} must be one number or {n}, one for each kernel, got {array.shape}")
+    return [float(value) for value in np.broadcast_to(array, (n,))]
+
+
+def _named_each(values: str | Sequence[str], n: int, name: str) -> list[Any]:
+    """Return n names that were given one by one, or once for all."""
+    names = [values] * n if isinstance(values, str) else list(values)
+    if len(names) != n:
+        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(names)}")
+    return names

@@ -1,4 +1,4 @@
-"""From photos made to measure a lens to samples for its model: files in, samples out."""
+"""From photos made to measure a lens to samples for its model: photos in, samples out."""
 
 from __future__ import annotations
 
@@ -6,43 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from lensmodel import measured as measure
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
-from lensmodel.estimation import measure
-from lensmodel.photo import LinearPhoto, develop, inspect
-from lensmodel.workflow import pipeline
+from lensmodel.photo import LinearPhoto, inspect
+from lensmodel.workflow.sampling import require_aperture, settings_of
 
 DEFAULT_SIZE: Final = 31  # pixels: that of an estimate
-
-
-def samples_of_measurement(
-    kind: str,
-    paths: Sequence[Path],
-    *,
-    settings: LensSettings | None = None,
-    size: int = DEFAULT_SIZE,
-    on_step: StepHook = ignore_step,
-) -> list[PsfSample]:
-    """Develop the photos of one measurement and measure the PSF on them.
-
-    Parameters
-    ----------
-    kind : str
-        A name in `lensmodel.estimation.measure.methods`.
-    paths : sequence of Path
-        One photo; of an aperture pair two, the open one first.
-    settings : LensSettings, optional
-        Values that the first photo does not say, or says wrongly.
-    size : int
-        Odd side of the kernels in pixels.
-    on_step : StepHook
-        Called after each place.
-    """
-    photos = [develop(path) for path in paths]
-    return samples_of_developed(
-        kind, photos, photo_id=pipeline.photo_id(paths[0]), settings=settings, size=size, on_step=on_step
-    )
 
 
 def samples_of_developed(
@@ -54,12 +25,12 @@ def samples_of_developed(
     size: int = DEFAULT_SIZE,
     on_step: StepHook = ignore_step,
 ) -> list[PsfSample]:
-    """Measure the PSF on developed photos; see `samples_of_measurement`."""
+    """Measure the PSF on one photo, or on the two of an aperture pair, the open one first."""
     method = measure.methods.create(kind)
     if not photos:
         raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
-    pipeline.require_aperture(photos[0].info.metadata, settings)
-    chosen = pipeline.settings_of(photos[0], settings)
+    require_aperture(photos[0].info.metadata, settings)
+    chosen = settings_of(photos[0], settings)
     measured = method.measure(photos, size=size, on_step=on_step)
     return measure.samples_of(measured, method, photos[0], photo_id=photo_id, settings=chosen)
 

@@ -1,47 +1,398 @@
 """Step 1: from a photo to samples of its lens's PSF.
 
-inspect -> develop -> select -> estimate -> count      (`take`; in the service as well)
+inspect -> develop -> choose patches -> estimate each cell of them -> samples
+
+Each step is a plain function on values, so that a script, the command and the workers of the service run the
+same code. `Way` says which parts are taken where nobody asks for others, `Recipe` what somebody asked for.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
 import logging
+import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from types import MappingProxyType
+from typing import Final, Literal
 
-from lensmodel import estimation, photo
-from lensmodel.core import parallel, processes
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, NoUsablePatchesError
+import numpy as np
+
+from lensmodel import blind, patches, photo
+from lensmodel.blind.estimator import require_size
+from lensmodel.core import codec, parallel, processes
+from lensmodel.core.errors import (
+    InvalidInputError,
+    MetadataMissingError,
+    NotEnoughEvidenceError,
+    NoUsablePatchesError,
+    UnknownMethodError,
+)
+from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import LensSettings
-from lensmodel.estimation import patches
-from lensmodel.estimation.estimator import require_size
-from lensmodel.estimation.patches import Patch
-from lensmodel.workflow.developed import (
-    load_developed,
-    photo_id,
-    require_aperture,
-    save_developed,
-    settings_of,
-)
-from lensmodel.workflow.estimating import (
-    DEFAULT_KERNEL_SIZE,
-    CellSample,
-    estimate_cell,
-    find_patches,
-    patches_by_cell,
-    require_spread,
-)
+from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.model import LensModel
+from lensmodel.model.answer import DEFAULT, PAPER
+from lensmodel.patches import Patch, Selection
+from lensmodel.photo import LinearPhoto, PhotoMetadata
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.ways import KERNEL_PATCHES, Way, chosen_way, way_named
 
 log = logging.getLogger(__name__)
 
 Stage = Literal["developing", "selecting", "estimating"]
+
+DEFAULT_KERNEL_SIZE: Final = 31
+"""Pixels: holds the blur of usual lenses, while the cost grows with the square of it; the paper's largest has
+55 (chosen)."""
+_PATCH_SIZE: Final = 192  # pixels: room for a kernel, few enough for one blur (chosen)
+_SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
+KERNEL_PATCHES: Final = 24
+"""Patches that an estimator of kernels looks at: enough for every ring and octant of the field to get one,
+while each costs a second."""
+
+
+# --- which way ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """What is taken where nobody asks for something else.
+
+    Parameters
+    ----------
+    name : str
+        What users call it.
+    estimator : str
+        Of `estimators`.
+    kernel_size : int
+        Largest odd side of the estimated kernels in pixels.
+    patches : int
+        Parts of a photo that are looked at.
+    mode : str
+        Of `answer.MODES`.
+    method : str
+        Of `deconvolvers`.
+    """
+
+    name: str
+    estimator: str
+    kernel_size: int
+    patches: int
+    mode: str
+    method: str
+
+
+WAYS: Final[Mapping[str, Way]] = MappingProxyType(
+    {
+        "default": Way("default", "default", 55, 96, DEFAULT, "standard"),
+        "paper": Way("paper", "michaeli-irani", 55, KERNEL_PATCHES, PAPER, "paper"),
+    }
+)
+"""`default` encodes patches of whole photos and attends to them. `paper` is that of M. Hirsch and
+B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4 to 7, to be compared with: kernels
+by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and Richardson-Lucy deconvolution, without
+what guards photos from errors of any of them."""
+
+
+def way_named(name: str) -> Way:
+    """Return a way."""
+    if name not in WAYS:
+        raise UnknownMethodError(f"no model {name!r}; known: {', '.join(WAYS)}")
+    return WAYS[name]
+
+
+def way_of(model: LensModel) -> Way:
+    """Return the way that a lens was learned."""
+    return WAYS["paper" if model.settings.mode == PAPER else "default"]
+
+
+def chosen_way(name: str | None, model: LensModel | None) -> Way:
+    """Return the way to learn a lens: as asked for, else that of its model, else the usual one."""
+    return way_of(model) if name is None and model is not None else way_named(name or "default")
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the samples of a photo are made; what is None is as the lens is learned (`ways`).
+
+    Parameters
+    ----------
+    settings : LensSettings
+        Values for photos that do not say their own (`settings_of`).
+    model : str, optional
+        Name of a way; None is that of the lens, of a new one the usual.
+    estimator : str or PsfEstimator, optional
+        Name in `estimators`, or an object of one's own.
+    kernel_size : int, optional
+        Odd side of the kernels in pixels.
+    selector : str or Selector
+        Name in `selectors`, or an object of one's own.
+    count : int, optional
+        Patches asked for.
+    """
+
+    settings: LensSettings = field(default_factory=LensSettings)
+    model: str | None = None
+    estimator: str | blind.PsfEstimator | None = None
+    kernel_size: int | None = None
+    selector: str | patches.Selector = "r-map"
+    count: int | None = None
+
+    def of_lens(self, lens: Lens | None) -> Recipe:
+        """Return it as it holds for a lens."""
+        return replace(self, model=chosen_way(self.model, None if lens is None else lens.model).name)
+
+    @property
+    def way(self) -> Way:
+        """The way it follows where it says nothing else."""
+        return way_named(self.model or "default")
+
+    @property
+    def method(self) -> str | blind.PsfEstimator:
+        """The estimator that it takes."""
+        return self.way.estimator if self.estimator is None else self.estimator
+
+    @property
+    def size(self) -> int:
+        """The side of its kernels in pixels."""
+        if self.kernel_size is not None:
+            return self.kernel_size
+        return DEFAULT_KERNEL_SIZE if self._of_own_kernels else self.way.kernel_size
+
+    @property
+    def patches(self) -> int:
+        """How many patches of a photo it looks at."""
+        if self.count is not None:
+            return self.count
+        return KERNEL_PATCHES if self._of_own_kernels else self.way.patches
+
+    @property
+    def _of_own_kernels(self) -> bool:
+        """Whether an estimator of kernels takes the place of one that reads whole photos."""
+        own = blind.estimators.resolve(self.way.estimator)
+        return isinstance(own, blind.PhotoEstimator) and not isinstance(
+            blind.estimators.resolve(self.method), blind.PhotoEstimator
+        )
+
+    def check(self) -> None:
+        """Refuse names, sizes and counts that there are not, before any work."""
+        blind.estimators.resolve(self.method)
+        require_size(self.size)
+        patches.selectors.resolve(self.selector)
+        if self.patches < 1:
+            raise InvalidInputError(f"patches must be at least 1, got {self.patches}")
+
+
+# --- a developed photo ----------------------------------------------------------------------
+
+
+def save_developed(developed: LinearPhoto, folder: Path) -> None:
+    """Keep a developed photo so that other processes can map it: planes.npy and photo.json.
+
+    Neither is renamed, which a confined process may not do: the folder is of no use to others before the end.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    fields = {
+        f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
+    }
+    (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
+    with (folder / "planes.npy").open("wb") as file:
+        save_array(file, developed.planes)
+
+
+def load_developed(folder: Path) -> LinearPhoto:
+    """Open what `save_developed` kept; the planes are memory-mapped, read-only."""
+    try:
+        planes = np.load(folder / "planes.npy", mmap_mode="r", allow_pickle=False)
+        stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
+    return codec.from_json(LinearPhoto, {**stored, "planes": planes})
+
+
+def settings_of(developed: LinearPhoto, given: LensSettings | None = None) -> LensSettings:
+    """Settings of the lens as the photo's metadata say; the caller's values fill what they leave open.
+
+    The one rule of precedence, of the library and of the command: a value that is given for a folder of
+    photos is meant for those among them that do not say their own.
+    """
+    known, given = developed.info.metadata, given or LensSettings()
+    return LensSettings(
+        aperture=given.aperture if known.aperture is None else known.aperture,
+        focal_mm=given.focal_mm if known.focal_mm is None else known.focal_mm,
+        focus_m=given.focus_m if known.focus_m is None else known.focus_m,
+    )
+
+
+def require_aperture(said: PhotoMetadata, given: LensSettings | None = None) -> None:
+    """Refuse a photo of unknown aperture."""
+    if said.aperture is None and (given is None or given.aperture is None):
+        raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
+
+
+def photo_id(path: Path) -> str:
+    """Name a photo by its content: the first 16 hex digits of its SHA-256."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+# --- patches and cells ----------------------------------------------------------------------
+
+
+def find_patches(
+    developed: LinearPhoto,
+    *,
+    count: int,
+    selector: str | patches.Selector = "r-map",
+    estimator: str | blind.PsfEstimator = "default",
+    on_step: StepHook = ignore_step,
+) -> Selection:
+    """Choose the patches that tell about the blur.
+
+    An estimator of whole photos chooses its own; for others `selector` scores windows of the green plane.
+    """
+    method = blind.estimators.resolve(estimator)
+    if isinstance(method, blind.PhotoEstimator):
+        selection = method.select(developed, count=count)
+        require_spread(selection.patches, count=count)
+        return selection
+    third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
+    size = min(_PATCH_SIZE, max(third, _SMALLEST_PATCH))
+    selection = patches.select(
+        developed.planes[1],
+        developed.noise[1],
+        developed.frame,
+        clip=developed.clip[1],
+        count=count,
+        size=size,
+        selector=selector,
+        jpeg=developed.lossy,
+        coarse_noise=developed.coarse_noise[1],
+        on_step=on_step,
+    )
+    # the selector makes cells of about three patches: of few that were asked for, few lie apart
+    patches.require_enough(selection.patches, least=min(patches.LEAST_PATCHES, math.ceil(count / 3)))
+    return selection
+
+
+def require_spread(determined: Sequence[Patch], *, count: int) -> None:
+    """Refuse a photo of whose patches too few gave a PSF: three parts of the picture must be left."""
+    patches.require_enough(determined, least=min(patches.LEAST_PARTS, math.ceil(count / 3)))
+
+
+def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
+    """Group accepted patches by field cell, the unit of work, largest groups first."""
+    grouped: dict[int, list[Patch]] = {}
+    for patch in selection.patches:
+        grouped.setdefault(patch.cell, []).append(patch)
+    return [tuple(group) for _, group in sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))]
+
+
+@dataclass(frozen=True, slots=True)
+class CellSample:
+    """One PSF sample with what it was made from.
+
+    Parameters
+    ----------
+    patch : Patch
+        Where in the photo.
+    channel : {"r", "g", "b"}
+        Which colour plane.
+    sample : PsfSample
+        The estimate, ready for the model.
+    diagnostics : mapping of str to float
+        What the estimator reports of itself.
+    """
+
+    patch: Patch
+    channel: Channel
+    sample: PsfSample
+    diagnostics: Mapping[str, float]
+
+
+def estimate_cell(
+    developed: LinearPhoto,
+    group: Sequence[Patch],
+    *,
+    settings: LensSettings,
+    photo_id: str,
+    estimator: str | blind.PsfEstimator = "default",
+    size: int = DEFAULT_KERNEL_SIZE,
+    channels: Sequence[Channel] = CHANNELS,
+    on_step: StepHook = ignore_step,
+) -> list[CellSample]:
+    """Estimate the PSF of one field cell in each channel, green first.
+
+    The patches of a cell share one kernel: their normal equations are summed, which is worth
+    more than averaging finished kernels. Each patch becomes one sample at its own place, and
+    the weights of a cell's samples add up to the confidence of its estimate. An estimator of whole
+    photos has all patches of one in one cell, and gives each its own kernels.
+    """
+    method = blind.estimators.resolve(estimator)
+    if isinstance(method, blind.PhotoEstimator):
+        patches_of = {patch.position: patch for patch in group}
+        samples = method.samples(
+            developed, group, settings=settings, photo=photo_id, size=size, on_step=on_step
+        )
+        return [
+            CellSample(
+                patches_of[sample.position],
+                sample.settings.channel,
+                sample,
+                {"predicted_error": sample.error or 0.0},
+            )
+            for sample in samples
+        ]
+    order = sorted(channels, key=lambda c: c != "g")
+    views = {c: [_view(developed, patch, c) for patch in group] for c in order}
+    results: list[CellSample] = []
+    green: blind.PsfEstimate | None = None
+    for done, channel in enumerate(order):
+        planes = [view[0] for view in views[channel]]
+        noises = [view[1] for view in views[channel]]
+        try:
+            if green is None or "g" not in views:
+                estimate = method.estimate(planes, noises, size=size)
+            else:
+                reference = [view[0] for view in views["g"]]
+                estimate = method.estimate_channel(planes, noises, green, reference, size=size)
+        except NotEnoughEvidenceError:
+            if channel == "g":
+                raise
+            log.info("channel %s of a cell at r=%.2f gave no kernel", channel, group[0].position.r)
+            continue
+        if channel == "g":
+            green = estimate
+        for patch in group:
+            sample = PsfSample(
+                kernel=estimate.kernel,
+                position=patch.position,
+                settings=settings.with_channel(channel),
+                weight=float(np.clip(estimate.confidence / len(group), 0.0, 1.0)),
+                photo=photo_id,
+                pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
+                estimator=f"{method.name}/{method.version}",
+                error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
+                half_diagonal_px=developed.frame.half_diagonal,
+            )
+            diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
+            results.append(CellSample(patch, channel, sample, diagnostics))
+        on_step(done + 1, len(order))
+    return results
+
+
+def _view(developed: LinearPhoto, patch: Patch, channel: Channel) -> tuple[Plane, NoiseModel]:
+    index = CHANNELS.index(channel)
+    window = (slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size))
+    return np.ascontiguousarray(developed.planes[index][window]), developed.noise[index]
+
+
+# --- a whole photo --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,227 +425,94 @@ def ignore_event(event: CalibrationEvent) -> None:
     """Do nothing: the default `EventHook`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """How the samples of a photo are made; what is None is as the lens is learned (`ways`).
-
-    Parameters
-    ----------
-    settings : LensSettings
-        Values for photos that do not say their own (`settings_of`).
-    model : str, optional
-        Name of a way; None is that of the lens, of a new one the usual.
-    estimator : str or PsfEstimator, optional
-        Name in `estimators`, or an object of one's own.
-    kernel_size : int, optional
-        Odd side of the kernels in pixels.
-    selector : str or Selector
-        Name in `selectors`, or an object of one's own.
-    count : int, optional
-        Patches asked for.
-    """
-
-    settings: LensSettings = field(default_factory=LensSettings)
-    model: str | None = None
-    estimator: str | estimation.PsfEstimator | None = None
-    kernel_size: int | None = None
-    selector: str | patches.Selector = "r-map"
-    count: int | None = None
-
-    def of_lens(self, lens: Lens | None) -> Recipe:
-        """Return it as it holds for a lens."""
-        return replace(self, model=chosen_way(self.model, None if lens is None else lens.model).name)
-
-    @property
-    def way(self) -> Way:
-        """The way it follows where it says nothing else."""
-        return way_named(self.model or "default")
-
-    @property
-    def method(self) -> str | estimation.PsfEstimator:
-        """The estimator that it takes."""
-        return self.way.estimator if self.estimator is None else self.estimator
-
-    @property
-    def size(self) -> int:
-        """The side of its kernels in pixels."""
-        if self.kernel_size is not None:
-            return self.kernel_size
-        return DEFAULT_KERNEL_SIZE if self._of_own_kernels else self.way.kernel_size
-
-    @property
-    def patches(self) -> int:
-        """How many patches of a photo it looks at."""
-        if self.count is not None:
-            return self.count
-        return KERNEL_PATCHES if self._of_own_kernels else self.way.patches
-
-    @property
-    def _of_own_kernels(self) -> bool:
-        """Whether an estimator of kernels takes the place of one that reads whole photos."""
-        own = estimation.estimators.resolve(self.way.estimator)
-        return isinstance(own, estimation.PhotoEstimator) and not isinstance(
-            estimation.estimators.resolve(self.method), estimation.PhotoEstimator
-        )
-
-    def check(self) -> None:
-        """Refuse names, sizes and counts that there are not, before any work."""
-        estimation.estimators.resolve(self.method)
-        require_size(self.size)
-        patches.selectors.resolve(self.selector)
-        if self.patches < 1:
-            raise InvalidInputError(f"patches must be at least 1, got {self.patches}")
-
-
-class PhotoSteps(Protocol):
-    """The work on one photo, wherever it is done: here in `samples_of_photo`, in the service by jobs."""
-
-    def inspect(self) -> bool:
-        """Read what the file says; False where the photo is not to teach its lens, or cannot yet."""
-
-    def enter(self, stage: Stage) -> None:
-        """Take note of the step that comes."""
-
-    def develop(self) -> None:
-        """Make linear planes of the file."""
-
-    def select(self) -> None:
-        """Choose patches."""
-
-    def estimate(self) -> None:
-        """Estimate a PSF for each cell of them."""
-
-    def count(self) -> None:
-        """Hand over the samples; refuse the photo where they tell too little (`require_spread`)."""
-
-
-def take(photo: PhotoSteps) -> None:
-    """Take one photo through all steps."""
-    if not photo.inspect():
-        return
-    photo.enter("developing")
-    photo.develop()
-    photo.enter("selecting")
-    photo.select()
-    photo.enter("estimating")
-    photo.estimate()
-    photo.count()
-
-
-class _StepsHere:
-    """`PhotoSteps` in this process, and cells in those of a pool; the developed photo lies in a folder."""
-
-    def __init__(
-        self,
-        path: Path,
-        recipe: Recipe,
-        folder: Path,
-        workers: int | None,
-        executor: Executor | None,
-        on_event: EventHook,
-    ) -> None:
-        self.samples: list[PsfSample] = []
-        self._path, self._recipe, self._folder = path, recipe, folder
-        self._workers, self._executor, self._on_event = workers, executor, on_event
-        self._groups: list[tuple[Patch, ...]] = []
-        self._by_cell: dict[int, list[CellSample]] = {}
-
-    @property
-    def _total(self) -> int:
-        return sum(map(len, self._groups))
-
-    def inspect(self) -> bool:
-        require_aperture(photo.inspect(self._path).metadata, self._recipe.settings)
-        return True
-
-    def enter(self, stage: Stage) -> None:
-        self._on_event(CalibrationEvent(self._path, stage, 0, self._total))
-
-    def develop(self) -> None:
-        save_developed(photo.develop(self._path), self._folder)
-
-    def select(self) -> None:
-        developed = load_developed(self._folder)
-        recipe = self._recipe
-        selection = find_patches(
-            developed, count=recipe.patches, selector=recipe.selector, estimator=recipe.method
-        )
-        self._groups = patches_by_cell(selection)
-
-    def estimate(self) -> None:
-        recipe, done = self._recipe, 0
-        settings = settings_of(load_developed(self._folder), recipe.settings)
-        method = estimation.estimators.resolve(recipe.method)
-        order = (settings, photo_id(self._path), method, recipe.size)
-        alone = parallel.Here() if len(self._groups) == 1 else self._executor
-        with processes.pool(alone, self._workers, method) as pool:
-            jobs = {
-                pool.submit(_cell_from_folder, self._folder, group, *order): index
-                for index, group in enumerate(self._groups)
-            }
-            try:
-                for job in as_completed(jobs):
-                    index = jobs[job]
-                    try:
-                        self._by_cell[index] = job.result()
-                    except NotEnoughEvidenceError as error:
-                        log.info("a cell of %s was dropped: %s", self._path.name, error)
-                    done += len(self._groups[index])
-                    self._on_event(CalibrationEvent(self._path, "estimating", done, self._total))
-            except BaseException:
-                for job in jobs:
-                    job.cancel()  # leaving `with` waits only for what runs
-                raise
-
-    def count(self) -> None:
-        made = [cell for index in sorted(self._by_cell) for cell in self._by_cell[index]]
-        if not made:
-            raise NoUsablePatchesError(
-                f"none of the {self._total} patches of {self._path.name} determines a PSF; "
-                "use a photo with more fine detail in focus"
-            )
-        require_spread([cell.patch for cell in made if cell.channel == "g"], count=self._recipe.patches)
-        self.samples = [cell.sample for cell in made]
-
-
-def _cell_from_folder(
-    folder: Path,
-    group: tuple[Patch, ...],
-    settings: LensSettings,
-    key: str,
-    estimator: estimation.PsfEstimator,
-    size: int,
-) -> list[CellSample]:
-    return estimate_cell(
-        load_developed(folder), group, settings=settings, photo_id=key, estimator=estimator, size=size
-    )
-
-
 def samples_of_photo(
     path: Path,
     recipe: Recipe | None = None,
     *,
-    workers: int | None = None,
+    key: str = "",
+    admit: Callable[[PhotoMetadata], None] | None = None,
     executor: Executor | None = None,
+    workers: int | None = None,
     on_event: EventHook = ignore_event,
 ) -> list[PsfSample]:
     """Develop one photo, find its patches and estimate a PSF for each patch and channel.
 
-    Cells are estimated in `workers` processes (all cores by default), or by an executor that sees the
-    files of this machine; the result does not depend on it. An estimator of one's own that other processes
-    cannot load (`processes.portable`) runs in threads of this one.
+    Parameters
+    ----------
+    path : Path
+    recipe : Recipe, optional
+    key : str
+        What samples call the photo (`photo_id`); found out if empty.
+    admit : callable, optional
+        Looks at the metadata before the photo is decoded; raising there refuses it.
+    executor : Executor, optional
+        Estimates cells; it sees the files of this machine. Without one, `workers` processes do (all cores by
+        default), for this photo alone. The result does not depend on it.
+    on_event : callable
     """
     recipe = recipe or Recipe()
     recipe.check()
+
+    def admitted(info: photo.PhotoInfo) -> None:
+        require_aperture(info.metadata, recipe.settings)
+        if admit is not None:
+            admit(info.metadata)
+        on_event(CalibrationEvent(path, "developing"))
+
+    developed = photo.develop(path, on_info=admitted)
+    on_event(CalibrationEvent(path, "selecting"))
+    method = blind.estimators.resolve(recipe.method)
+    selection = find_patches(developed, count=recipe.patches, selector=recipe.selector, estimator=method)
+    groups = patches_by_cell(selection)
+    total, done = len(selection.patches), 0
+    on_event(CalibrationEvent(path, "estimating", done, total))
+    order = (settings_of(developed, recipe.settings), key or photo_id(path), method, recipe.size)
+    by_cell: dict[int, list[CellSample]] = {}
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
-        steps = _StepsHere(path, recipe, Path(folder), workers, executor, on_event)
-        take(steps)
-        return steps.samples
+        alone = len(groups) == 1
+        if not alone:
+            save_developed(developed, Path(folder))
+        source = developed if alone else Path(folder)
+        with processes.pool(parallel.Here() if alone else executor, workers, method) as pool:
+            jobs = {pool.submit(_cell_of, source, group, *order): index for index, group in enumerate(groups)}
+            try:
+                for job in as_completed(jobs):
+                    index = jobs[job]
+                    try:
+                        by_cell[index] = job.result()
+                    except NotEnoughEvidenceError as error:
+                        log.info("a cell of %s was dropped: %s", path.name, error)
+                    done += len(groups[index])
+                    on_event(CalibrationEvent(path, "estimating", done, total))
+            except BaseException:
+                for job in jobs:
+                    job.cancel()  # leaving `with` waits only for what runs
+                raise
+    made = [cell for index in sorted(by_cell) for cell in by_cell[index]]
+    if not made:
+        raise NoUsablePatchesError(
+            f"none of the {total} patches of {path.name} determines a PSF; "
+            "use a photo with more fine detail in focus"
+        )
+    require_spread([cell.patch for cell in made if cell.channel == "g"], count=recipe.patches)
+    return [cell.sample for cell in made]
 
 
-def samples_of_bytes(name: str, data: bytes, recipe: Recipe) -> list[PsfSample]:
+def _cell_of(
+    source: LinearPhoto | Path,
+    group: tuple[Patch, ...],
+    settings: LensSettings,
+    key: str,
+    estimator: blind.PsfEstimator,
+    size: int,
+) -> list[CellSample]:
+    developed = load_developed(source) if isinstance(source, Path) else source
+    return estimate_cell(developed, group, settings=settings, photo_id=key, estimator=estimator, size=size)
+
+
+def samples_of_bytes(name: str, data: bytes, recipe: Recipe, key: str = "") -> list[PsfSample]:
     """Do as `samples_of_photo` in this process alone, with a photo that lies on another machine."""
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(data)
-        return samples_of_photo(path, recipe, executor=parallel.Here())
+        return samples_of_photo(path, recipe, key=key, executor=parallel.Here())

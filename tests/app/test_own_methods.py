@@ -34,9 +34,7 @@ class Careful:
 
     def estimate(self, patches, noise, **options):
         found = lensmodel.estimators.create("default").estimate(patches, noise, **options)
-        return type(found)(
-            found.kernel, found.confidence / 2, found.reliability, found.predicted_error, {}, found.seconds
-        )
+        return type(found)(found.kernel, found.confidence / 2, found.predicted_error, {})
 
     def estimate_channel(self, patches, noise, reference, reference_patches, **options):
         return self.estimate(patches, noise, **options)

@@ -21,8 +21,7 @@ from lensmodel.core.psf import PsfSample, centroid, gaussian
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.workflow.field_grid import field_grid
-from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.lens import Lens, field_grid
 
 NAMES = [
     "Bounds",

@@ -9,8 +9,8 @@ from lab.blind.methods.cho_lee import ChoLee
 from lab.blind.methods.sun import Sun
 from lab.blind.methods.xu_jia import XuJia
 from lab.blind.methods.zhang import Zhang
+from lensmodel.blind import PsfEstimator, estimators
 from lensmodel.core.registry import Registry
-from lensmodel.estimation import PsfEstimator, estimators
 
 compared: Final[Registry[PsfEstimator]] = estimators.extended(
     cho_lee=ChoLee, sun=Sun, xu_jia=XuJia, zhang=Zhang

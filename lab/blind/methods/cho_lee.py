@@ -36,8 +36,8 @@ from lab.blind.steps.gradients import (
 )
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick
 from lab.blind.steps.starting_from import StartingFrom
+from lensmodel.blind import PsfEstimate
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation import PsfEstimate
 
 _ORDER_WEIGHTS = (50.0, 25.0, 12.5)  # of values, first and second derivatives: as in the paper
 _ALPHA = 0.1  # as in the paper

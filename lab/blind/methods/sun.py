@@ -11,7 +11,6 @@ allows, which few photographs are.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,11 +23,10 @@ from lab.blind.steps.edge_patches import SIDE, EdgePatchPrior, default_prior, ed
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lab.blind.steps.starting_from import StartingFrom
+from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, distance, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, usable
-from lensmodel.estimation.steps.finish import finished
 
 _INTENSITY_WEIGHT = 0.1  # w of values, of differences it is 1 (chosen): noise in values reaches far
 _LEAST_EDGE_PX = 30  # gradients on edges: of fewer a kernel is chance (chosen)
@@ -82,7 +80,6 @@ class Sun(StartingFrom):
         start: Kernel | None,
         on_step: StepHook,
     ) -> PsfEstimate:
-        began = time.process_time()
         kept = usable(patches, noise, size)
         views = [View.of(patch, model) for patch, model in kept]
         side = self.support or size
@@ -92,7 +89,6 @@ class Sun(StartingFrom):
         disagreement = self._disagreement(solver.terms, found.kernel)
         return finished(
             cleaned(found.kernel, self.threshold, self.least_mass),
-            kept,
             size=size,
             error=_ERROR_FLOOR + _ERROR_SLOPE * disagreement,
             diagnostics={
@@ -101,7 +97,6 @@ class Sun(StartingFrom):
                 "edge_px": float(sum(np.count_nonzero(term.x) for term in solver.terms)),
                 "misfit": _misfit(solver.terms, found.kernel),
             },
-            began=began,
         )
 
     def _disagreement(self, terms: Sequence[Term], kernel: Kernel) -> float:

@@ -38,8 +38,8 @@ from lab.blind.steps.gradients import (
 )
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
 from lab.blind.steps.starting_from import StartingFrom
+from lensmodel.blind import PsfEstimate
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation import PsfEstimate
 
 _WINDOW = 5  # pixels: h of the paper
 _OFFSET = 0.5  # as in the paper: keeps flat regions from standing out

@@ -16,7 +16,6 @@ Departures from the paper:
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,10 +25,9 @@ from lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
 from lab.blind.steps.cleaning import cleaned
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lab.blind.steps.starting_from import StartingFrom
+from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.psf import centred, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, usable
-from lensmodel.estimation.steps.finish import finished
 
 _FIRST_SIGMA_PX = 0.7  # of the first kernel, in pixels of the coarsest level (chosen)
 _ERROR_FLOOR, _ERROR_SLOPE = 0.15, 0.5  # by disagreement (chosen): nothing is kept that fitted them
@@ -73,7 +71,6 @@ class Zhang(StartingFrom):
         start: Kernel | None,
         on_step: StepHook,
     ) -> PsfEstimate:
-        began = time.process_time()
         kept = usable(patches, noise, size)
         views = [View.of(patch, model) for patch, model in kept]
         side = self.support or size
@@ -88,7 +85,6 @@ class Zhang(StartingFrom):
         learned = np.sqrt([scene.noise / 2.0 for scene in solver.scenes])
         return finished(
             cleaned(found.kernel, self.threshold),
-            kept,
             size=size,
             error=_ERROR_FLOOR + _ERROR_SLOPE * disagreement,
             diagnostics={
@@ -98,7 +94,6 @@ class Zhang(StartingFrom):
                 "noise_ratio": float(np.mean(learned / [max(view.noise, 1e-9) for view in views])),
                 "free_energy": sum(scene.free_energy(found.kernel) for scene in solver.scenes),
             },
-            began=began,
         )
 
 

@@ -9,7 +9,6 @@ image steps, and no edge within half a kernel of the border counts in kernel ste
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,11 +20,10 @@ from scipy import fft, ndimage
 
 from lab.blind.steps.cleaning import cleaned
 from lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
+from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, centroid, distance, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, usable
-from lensmodel.estimation.steps.finish import finished
 
 _ORIENTATIONS = 4  # as in Cho and Lee
 _TINY = 1e-12  # keeps divisions finite: far below any gradient
@@ -361,7 +359,6 @@ def estimate_by_edges(
 
     `error` is offset and slope of the expected relative L2 error by the disagreement.
     """
-    began = time.process_time()
     kept = usable(patches, noise, size)
     views = [View.of(patch, model) for patch, model in kept]
     schedule = Schedule(size, iterations, coarsest=size if start is not None or size < 5 else 5)
@@ -369,9 +366,7 @@ def estimate_by_edges(
     apart = solver.disagreement()
     return finished(
         found.kernel,
-        kept,
         size=size,
         error=error[0] + error[1] * apart,
         diagnostics={"support": float(size), "disagreement": apart},
-        began=began,
     )

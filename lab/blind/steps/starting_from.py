@@ -5,10 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-import numpy as np
-
+from lensmodel.blind import PsfEstimate
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
-from lensmodel.estimation import PsfEstimate
 
 
 class StartingFrom(ABC):
@@ -22,7 +20,6 @@ class StartingFrom(ABC):
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
-        rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `PsfEstimator`."""
@@ -36,7 +33,6 @@ class StartingFrom(ABC):
         reference_patches: Sequence[Plane],
         *,
         size: int = 31,
-        rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate another channel: the finest level alone, from the reference kernel on."""

@@ -396,7 +396,7 @@ def test_what_others_can_reach_does_not_start_without_a_key(
     settings: Settings, store: Store, open_to: dict[str, Any]
 ) -> None:
     from app.runtime import supervisor  # noqa: PLC0415 - few tests need it
-    from lensmodel.cli.console.failure import UsageError  # noqa: PLC0415 - same
+    from lensmodel.cli.ending import UsageError  # noqa: PLC0415 - same
 
     open_settings = Settings(**{**settings.model_dump(), **open_to})
     upgrade(store.database)

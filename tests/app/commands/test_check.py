@@ -11,7 +11,7 @@ import tifffile
 from PIL import Image
 from typer.testing import CliRunner
 
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 from lensmodel.cli.main import app
 from lensmodel.core.errors import LensModelError
 

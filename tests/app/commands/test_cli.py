@@ -31,15 +31,14 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from lensmodel import photo
-from lensmodel.cli import correction
-from lensmodel.cli.console import files
-from lensmodel.cli.console.progress_lines import EVERY_S, Pace, ProgressLines
+from lensmodel.cli import correction, files
+from lensmodel.cli.console import EVERY_S, Pace, ProgressLines
 from lensmodel.cli.main import app, main
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
-from lensmodel.workflow import pipeline
-from lensmodel.workflow.ways import way_of
+from lensmodel.workflow import sampling
+from lensmodel.workflow.sampling import way_of
 
 HERE = Path(__file__).parents[1]
 PROFILE = "my-24mm.lensprofile"
@@ -159,7 +158,7 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learn from two patches of a photo, too few for a wavefront: its fit takes longer than the rest."""
-    monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=2))
+    monkeypatch.setattr("lensmodel.workflow.sampling.Recipe", partial(sampling.Recipe, count=2))
 
 
 # --- results -----------------------------------------------------------------------------------
@@ -405,7 +404,8 @@ def test_a_picture_of_a_psf_says_what_made_it(folder: Path, suffix: str) -> None
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def estimated(path: Path, recipe: pipeline.Recipe, **options: Any) -> list[PsfSample]:
+    def estimated(path: Path, recipe: sampling.Recipe, **options: Any) -> list[PsfSample]:
+        options["admit"](photo.inspect(path).metadata)
         known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]

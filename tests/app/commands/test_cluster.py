@@ -18,7 +18,7 @@ from lensmodel.cli.main import app
 from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import load_profile
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 
 
 def test_the_calling_thread_is_an_executor_that_hands_on_errors() -> None:
@@ -77,11 +77,11 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
-    recipe = pipeline.Recipe(estimator="default", count=4)
-    here = pipeline.samples_of_photo(photo, recipe, executor=parallel.Here())
+    recipe = sampling.Recipe(estimator="default", count=4)
+    here = sampling.samples_of_photo(photo, recipe, executor=parallel.Here())
     with ThreadPoolExecutor(2) as threads:
-        beside = pipeline.samples_of_photo(photo, recipe, executor=threads)
-    sent = pipeline.samples_of_bytes(photo.name, photo.read_bytes(), recipe)
+        beside = sampling.samples_of_photo(photo, recipe, executor=threads)
+    sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), recipe)
 
     np.testing.assert_array_equal(stacked(beside), stacked(here))
     np.testing.assert_array_equal(stacked(sent), stacked(here))
@@ -91,7 +91,7 @@ def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) ->
 def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.dng"
     broken.write_bytes(photo.read_bytes()[:2000])
-    events: list[pipeline.CalibrationEvent] = []
+    events: list[sampling.CalibrationEvent] = []
 
     with ThreadPoolExecutor(2) as threads:
         lens = lensmodel.calibrate(
@@ -99,7 +99,7 @@ def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path)
         )
 
     assert [event.stage for event in events] == ["counted", "skipped", "skipped"]
-    assert {sample.photo for sample in lens.samples} == {pipeline.photo_id(photo)}
+    assert {sample.photo for sample in lens.samples} == {sampling.photo_id(photo)}
 
 
 @pytest.mark.slow
@@ -132,7 +132,7 @@ def test_a_cluster_that_does_not_answer_is_said(
     photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("lensmodel.cli.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("lensmodel.cli.calibrate.CONNECT_S", 0.5)
 
     result = CliRunner().invoke(
         app,

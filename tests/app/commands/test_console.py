@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from lensmodel.cli.console import progress_lines
-from lensmodel.cli.console.progress_lines import Pace, ProgressLines, clock
-from lensmodel.cli.console.table import aligned
-from lensmodel.cli.words import mtf50_words
+from lensmodel.cli import console
+from lensmodel.cli.console import Pace, ProgressLines, aligned, clock, mtf50_words
 
 
 @pytest.mark.parametrize(
@@ -46,7 +44,7 @@ def test_without_a_terminal_progress_is_told_in_lines() -> None:
 def test_time_left_is_told_by_the_pace_of_the_stage_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     clock_s = iter((0.0, 60.0, 61.0, 64.0, 67.0))
-    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock_s))
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock_s))
     lines = ProgressLines(said.append, every_s=0.0)
     task = lines.add_task("estimating", total=8)
     for done in (8, 0, 1, 2):  # a minute of one stage, then a photo each three seconds

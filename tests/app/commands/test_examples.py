@@ -37,11 +37,11 @@ from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep.migrate import upgrade
 from lab import targets
-from lensmodel.cli.console.on_demand import OnDemand
 from lensmodel.cli.main import app, main
+from lensmodel.cli.on_demand import OnDemand
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.estimation.measure.page import TargetPage
+from lensmodel.measured.page import TargetPage
 from lensmodel.model import LensModel, LensProfile, save_profile
 
 HERE = Path(__file__).parents[1]

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from lensmodel.cli.console import extras
+from lensmodel.cli import ending
 
 COMMANDS = ["serve", "doctor", "keys list", "calibrate gone.dng --profile new.lensprofile"]
 WITHOUT = """
@@ -30,7 +30,7 @@ for command in {commands!r}:
 def ended() -> dict[str, tuple[int, str]]:
     """Exit status and standard error of each command, of one process without what the extra brings."""
     # typer may bring pydantic
-    missing = [name for name in extras.EXTRAS["service"] if name != "pydantic"]
+    missing = [name for name in ending.EXTRAS["service"] if name != "pydantic"]
     code = WITHOUT.format(missing=missing, commands=COMMANDS)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -57,8 +57,8 @@ def test_commands_on_files_do_without_the_service(ended: dict[str, tuple[int, st
 
 @pytest.mark.parametrize(("module", "where"), [("app", "container image"), ("lab", "source tree")])
 def test_a_command_that_is_no_part_of_the_wheel_says_where_it_runs(module: str, where: str) -> None:
-    assert where in str(extras.remedy(ModuleNotFoundError("no", name=module)))
+    assert where in str(ending.remedy(ModuleNotFoundError("no", name=module)))
 
 
 def test_a_module_that_no_extra_brings_is_no_extra() -> None:
-    assert extras.remedy(ModuleNotFoundError("no", name="nonsense")) is None
+    assert ending.remedy(ModuleNotFoundError("no", name="nonsense")) is None

@@ -13,14 +13,14 @@ import pytest
 from in_process import lensmodel
 from running import SMALL, write_photo
 
-from lensmodel.cli.grouping import Shot, groups
+from lensmodel.cli.folder import Shot, groups
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.model.profile import Camera
 from lensmodel.photo.tags.xmp import read_xmp
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
-from lensmodel.workflow.pipeline import photo_id
+from lensmodel.workflow.sampling import photo_id
 
 AUTO = (
     "correct",

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from app.client import Client
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 from lensmodel.cli.main import app
 from lensmodel.core.errors import InvalidInputError
 

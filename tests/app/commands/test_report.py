@@ -14,7 +14,7 @@ import tifffile
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 from lensmodel.cli.main import app
 from lensmodel.cli.report import details_of, name_of
 from lensmodel.core.codec import from_json

@@ -15,7 +15,7 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.access.owners import ANY_OWNER
 from app.ways import configured_way
-from lensmodel.workflow.ways import WAYS
+from lensmodel.workflow.sampling import WAYS
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(3_000)

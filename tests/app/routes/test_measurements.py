@@ -23,10 +23,10 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, NoiseModel, ignore_step
-from lensmodel.estimation.measure import MeasuredPsf
+from lensmodel.measured import MeasuredPsf
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import sampling
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
@@ -84,7 +84,7 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
         encoding=Encoding(),
         pipeline="test",
     )
-    pipeline.save_developed(shot, tmp_path / "developed")
+    sampling.save_developed(shot, tmp_path / "developed")
     monkeypatch.setattr(tasks.lens_measure, "methods", Registry("way of measuring", {"quick": AtTwoPlaces}))
     settings = {"aperture": 2.8, "focal_mm": None, "focus_m": -1.0}
     arguments = {"developed": [str(tmp_path / "developed")], "photo": "p1", "settings": settings}

@@ -39,7 +39,7 @@ def test_event_that_the_main_thread_waits_for_can_be_set(number: signal.Signals)
 SERVES = """
 import sys, types
 from pathlib import Path
-from lensmodel.cli.console import interrupt
+from lensmodel.cli import ending
 from app.runtime import server
 from app.runtime.settings import Settings
 

@@ -28,7 +28,7 @@ from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import MAX_SAID, Sandbox
-from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.ending import UsageError
 
 OWN = Path(__file__).parent
 HERE = OWN.parent

@@ -13,7 +13,7 @@ import pytest
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import Camera, LensModel, LensProfile, load_profile, save_profile
-from lensmodel.workflow.identity import Identity, difference
+from lensmodel.workflow.calibrating import Identity, difference
 
 CANON = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
 BODY = Camera("Canon", "Canon EOS 5D", "0123")

@@ -39,12 +39,12 @@ from lab.cases import (
     psf_half,
     scene_of,
 )
+from lensmodel.blind import PsfEstimate
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, Kernel, NoiseModel, Plane, StepHook, ignore_step
-from lensmodel.estimation import PsfEstimate
-from lensmodel.estimation.patches import Patch
+from lensmodel.patches import Patch
 
 SMALL = {"patch": 128, "cases": 3, "half": "all"}
 
@@ -61,15 +61,12 @@ def small_photos(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def answer(kernel: Kernel, seconds: float = 0.0) -> PsfEstimate:
+def answer(kernel: Kernel) -> PsfEstimate:
     return PsfEstimate(
         kernel=kernel,
         confidence=0.5,
-        reliability=np.ones(4),
         predicted_error=0.3,
         diagnostics={},
-        seconds=seconds,
-        no_blur=False,
     )
 
 
@@ -88,7 +85,6 @@ class Fake:
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
-        rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         self.asked.append(len(patches))

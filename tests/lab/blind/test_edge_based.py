@@ -10,9 +10,9 @@ from scipy import signal
 
 from lab.blind.methods import compared
 from lab.scenes import dead_leaves
+from lensmodel.blind import PsfEstimator
 from lensmodel.core.psf import as_kernel, centred, delta, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.estimation import PsfEstimator
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

@@ -54,7 +54,7 @@ from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, P
 from lensmodel.photo import develop
 from lensmodel.quality.images import as_shown
 from lensmodel.simulate import LENS_KINDS, edge_chart
-from lensmodel.workflow.ways import Way
+from lensmodel.workflow.sampling import Way
 
 
 def case(**changes: Any) -> Case:

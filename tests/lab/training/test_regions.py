@@ -9,7 +9,7 @@ import pytest
 
 from lab.training.train_regions import Labelled, _arrays, fit, judged, read_table
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble
+from lensmodel.patches.good_regions import FEATURES, TreeEnsemble
 
 pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
 

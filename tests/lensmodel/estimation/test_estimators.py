@@ -8,7 +8,8 @@ from scipy import signal
 
 from lab.blind.methods import compared
 from lab.scenes import dead_leaves
-from lensmodel import estimation
+from lensmodel import blind
+from lensmodel.blind.patch_recurrence import blend, normal_equations, recur
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import (
@@ -19,8 +20,6 @@ from lensmodel.core.psf import (
     rms_width,
 )
 from lensmodel.core.types import NoiseModel, Plane
-from lensmodel.estimation.methods.patch_recurrence import normal_equations
-from lensmodel.estimation.steps.recurrence import blend, recur
 from lensmodel.simulate import demo_scene, edge_area
 
 SIGMA = 0.01
@@ -102,22 +101,22 @@ def test_impossible_input_is_refused_by_name(name: str) -> None:
     "name",
     [
         pytest.param(name, marks=[pytest.mark.slow] if name == "michaeli-irani" else [])
-        for name in estimation.estimators
+        for name in blind.estimators
     ],
 )
 def test_every_registered_estimator_gives_kernels_of_55_pixels(name: str) -> None:
     y = patch(gaussian(15, 1.5 * np.eye(2)))
-    found = estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=55)
+    found = blind.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=55)
 
     assert found.kernel.shape == (55, 55)
     assert found.kernel.sum() == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("name", list(estimation.estimators))
+@pytest.mark.parametrize("name", list(blind.estimators))
 def test_kernels_of_57_pixels_are_refused_with_the_range(name: str) -> None:
     y = patch(gaussian(15, np.eye(2)))
     with pytest.raises(InvalidInputError, match=r"odd and in 3\.\.55, got 57"):
-        estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=57)
+        blind.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=57)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -134,7 +133,7 @@ def test_cancelling_stops_the_work(name: str) -> None:
 def test_a_wider_blur_gives_a_wider_kernel() -> None:
     widths = [
         rms_width(
-            estimation.estimators.create("default")
+            blind.estimators.create("default")
             .estimate(
                 [photo_patch(gaussian(21, s * s * np.eye(2)), 300, 500, side=96)], [NoiseModel.white(SIGMA)]
             )
@@ -150,7 +149,7 @@ def test_default_comes_nearer_to_the_truth_than_no_kernel_at_all() -> None:
     truth = gaussian(21, [[2.6, 1.0], [1.0, 1.4]])
     patches = [photo_patch(truth, row, col, side=128) for row, col in ((300, 500), (420, 700))]
 
-    found = estimation.estimators.create("default").estimate(patches, [NoiseModel.white(SIGMA)] * 2, size=21)
+    found = blind.estimators.create("default").estimate(patches, [NoiseModel.white(SIGMA)] * 2, size=21)
 
     nothing = distance(delta(21), truth).rel_l2
     assert distance(found.kernel, truth).rel_l2 < 0.4 * nothing
@@ -204,7 +203,7 @@ def test_a_sharp_step_recurs_as_itself() -> None:
 
 def test_turning_the_patch_turns_the_kernel() -> None:
     y, noise = patch(gaussian(15, [[2.0, 0.8], [0.8, 1.0]])), NoiseModel.white(SIGMA)
-    method = estimation.PatchRecurrence(levels=2, iterations=2, support=15)
+    method = blind.PatchRecurrence(levels=2, iterations=2, support=15)
     upright = method.estimate([y], [noise], size=15).kernel
     turned = method.estimate([np.ascontiguousarray(np.rot90(y))], [noise], size=15).kernel
 

@@ -9,11 +9,10 @@ from scipy import ndimage
 
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Plane, ignore_step
-from lensmodel.estimation.patches import select
-from lensmodel.estimation.patches.blocks import measure_blocks
-from lensmodel.estimation.patches.details import Details, joined_details, look_at
-from lensmodel.estimation.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
-from lensmodel.estimation.patches.windows import Windows, windows_of
+from lensmodel.patches import select
+from lensmodel.patches.checks import Details, joined_details, look_at
+from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
+from lensmodel.patches.windows import Windows, measure_blocks, windows_of
 
 SIGMA = 0.004
 NOISE = NoiseModel.white(SIGMA)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
-from lensmodel.estimation.steps.gram import window_products
+from lensmodel.blind.patch_recurrence import window_products
 
 
 @pytest.mark.parametrize(("shape", "side"), [((40, 30), 7), ((3, 25), 9), ((1, 4), 5), ((20, 20), 1)])

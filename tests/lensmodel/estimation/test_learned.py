@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lensmodel import estimation
+from lensmodel import blind
+from lensmodel.blind.learned import LearnedEstimator
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
-from lensmodel.estimation.methods.learned import LearnedEstimator
-from lensmodel.estimation.patches.even import spread_evenly
+from lensmodel.patches.spread import spread_evenly
 from lensmodel.photo import Encoding, LinearPhoto, PhotoInfo
 from lensmodel.simulate import demo_scene
 
@@ -98,5 +98,5 @@ def test_files_are_told_apart_by_how_their_pixels_were_made() -> None:
 
 
 def test_it_reads_whole_photos_and_others_do_not() -> None:
-    assert isinstance(estimation.estimators.create("default"), estimation.PhotoEstimator)
-    assert not isinstance(estimation.estimators.create("michaeli-irani"), estimation.PhotoEstimator)
+    assert isinstance(blind.estimators.create("default"), blind.PhotoEstimator)
+    assert not isinstance(blind.estimators.create("michaeli-irani"), blind.PhotoEstimator)

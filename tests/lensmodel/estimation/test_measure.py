@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,26 +15,23 @@ from PIL import Image
 from scipy import signal
 
 from lab import targets
+from lensmodel import measured as measure
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel
-from lensmodel.estimation import measure
-from lensmodel.estimation.measure.diffraction import diffraction_otf
-from lensmodel.estimation.measure.edges import SlantedEdges, constrained
-from lensmodel.estimation.measure.page import TargetPage
-from lensmodel.estimation.measure.pair import AperturePair
-from lensmodel.estimation.measure.placed_page import PlacedPage
-from lensmodel.estimation.measure.point_detection import find_lights, isolated_lights
-from lensmodel.estimation.measure.points import Points
-from lensmodel.estimation.measure.solve import solve
-from lensmodel.estimation.measure.target import Target
-from lensmodel.estimation.measure.warp import homography_of, match
+from lensmodel.measured.edges import SlantedEdges, constrained
+from lensmodel.measured.page import TargetPage
+from lensmodel.measured.pair import AperturePair, diffraction_otf
+from lensmodel.measured.points import Points, find_lights, isolated_lights
+from lensmodel.measured.registration import homography_of, match
+from lensmodel.measured.solve import solve
+from lensmodel.measured.target import PlacedPage, Target
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
 from lensmodel.quality.edge import slanted_edge
-from lensmodel.workflow.joining import joined
+from lensmodel.workflow.calibrating import joined
 from lensmodel.workflow.measuring import samples_of_developed
 
 SHAPE = (360, 540)
@@ -143,23 +142,24 @@ def test_the_page_passes_through_its_samples() -> None:
     assert np.median(np.abs(seen - page.samples[80:110, 120:160])) < 0.02
 
 
-@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+@pytest.mark.parametrize("suffix", ["png", "pdf"])
 def test_a_target_is_written_to_print(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"target.{suffix}"
     page = TargetPage(300)
     measure.print_target(path, page, paper="a4")
     data = path.read_bytes()
-    if suffix == "png":
-        with Image.open(path) as picture:
-            assert picture.size == page.raster.shape[::-1]
+    if suffix == "pdf":
+        box = re.search(rb"/MediaBox \[ 0 0 (\S+) (\S+) \]", data)
+        assert box is not None
+        assert [float(side) for side in box.groups()] == pytest.approx([841.89, 595.28], rel=0.002)  # points
+        start = data.index(b"stream\n", data.index(b"/DCTDecode")) + len(b"stream\n")
+        data = data[start:]
+    with Image.open(io.BytesIO(data)) as picture:
+        assert picture.size == page.raster.shape[::-1]
+        greys = np.asarray(picture, dtype=float) / 255.0
+        assert np.abs(greys - page.raster)[page.border * 2 : -page.border * 2].max() < 0.02
+        if suffix == "png":
             assert picture.info["dpi"][0] == pytest.approx(600 / (297 / 25.4), rel=0.01)
-    elif suffix == "pdf":
-        assert data.startswith(b"%PDF-1.4")
-        assert b"/MediaBox [0 0 841.890 595.276]" in data
-        start = int(data.split(b"startxref\n")[1].split(b"\n")[0])
-        assert data[start : start + 4] == b"xref"
-    else:
-        assert b'width="297.0mm"' in data
 
 
 def test_a_target_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
@@ -253,11 +253,6 @@ def test_lights_beside_others_are_left_out() -> None:
     assert [(round(one.row), round(one.col)) for one in isolated_lights(lights, 21)] == [(80, 120)]
 
 
-def test_an_unknown_detector_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="auto, sep, photutils, own"):
-        find_lights(np.zeros((64, 64)), "eyes")
-
-
 def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     rng = np.random.default_rng(5)
     height, width = (n + 2 * targets.MARGIN for n in PAIR_SHAPE)
@@ -291,7 +286,7 @@ def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
         return float(np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]))
 
     now = error()
-    monkeypatch.setattr("lensmodel.estimation.measure.pair._ALIASED", 0.0)
+    monkeypatch.setattr("lensmodel.measured.pair._ALIASED", 0.0)
     before = error()
     assert now < 0.8 * before
 

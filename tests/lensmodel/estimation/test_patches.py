@@ -13,20 +13,19 @@ from scipy import ndimage
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, NoiseModel, Plane, ignore_step
-from lensmodel.estimation.patches import (
+from lensmodel.patches import (
     REASONS,
     Patch,
     Selection,
-    blocks,
     r_map,
     require_enough,
     select,
     selectors,
 )
-from lensmodel.estimation.patches.details import look_at
-from lensmodel.estimation.patches.enough import part_of
-from lensmodel.estimation.patches.select import EVIDENCE_FLOOR
-from lensmodel.estimation.patches.windows import windows_of
+from lensmodel.patches import windows as blocks
+from lensmodel.patches.checks import look_at, part_of
+from lensmodel.patches.select import EVIDENCE_FLOOR
+from lensmodel.patches.windows import windows_of
 
 NOISE = NoiseModel.white(0.003)
 

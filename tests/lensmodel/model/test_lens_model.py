@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, distance, gaussian, second_moments
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.model import LensModel, ModelSettings, smoothers
+from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model import variables as va
-from lensmodel.model.field.index import SampleIndex
-from lensmodel.model.field.local_frame import Answers, LocalKernels
-from lensmodel.model.field.transport import WidthField
+from lensmodel.model.answer import MODES
+from lensmodel.model.local_frame import LocalKernels
+from lensmodel.model.neighbours import Answers, Neighbourhood
+from lensmodel.model.widths import WidthField
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)
@@ -50,13 +50,10 @@ def difference(a: Kernel, b: Kernel) -> float:
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
 
 
-METHODS = sorted(smoothers)
-
-
-@pytest.mark.parametrize("method", METHODS)
-class TestEveryMethod:
-    def test_answers_a_centred_kernel_of_sum_one(self, method: str) -> None:
-        model = LensModel.fit(photos(1), ModelSettings(method=method))
+@pytest.mark.parametrize("mode", MODES)
+class TestEveryMode:
+    def test_answers_a_centred_kernel_of_sum_one(self, mode: str) -> None:
+        model = LensModel.fit(photos(1), ModelSettings(mode=mode))
 
         kernel = model.query(FieldPosition(0.6, 1.0), GREEN, 33).kernel
 
@@ -65,28 +62,29 @@ class TestEveryMethod:
         assert kernel.sum() == pytest.approx(1.0)
         assert np.hypot(*centroid(kernel)) < 2e-3
 
-    def test_returns_the_one_psf_of_a_constant_round_family(self, method: str) -> None:
+    def test_returns_the_one_psf_of_a_constant_round_family(self, mode: str) -> None:
         same = gaussian(SIZE, np.eye(2) * 1.5)
         model = LensModel.fit(
-            [PsfSample(same, p, GREEN, photo="a") for p in places(24, 3)], ModelSettings(method=method)
+            [PsfSample(same, p, GREEN, photo="a") for p in places(24, 3)], ModelSettings(mode=mode)
         )
 
         answer = model.query(FieldPosition(0.5, -2.0), GREEN, SIZE)
 
         assert difference(answer.kernel, same) < 5e-3
 
-    def test_follows_the_ring_family(self, method: str) -> None:
-        model = LensModel.fit(photos(3), ModelSettings(method=method))
-        errors = [distance(model.query(p, GREEN, SIZE).kernel, ring_kernel(p)).rel_l2 for p in places(12, 99)]
-
-        assert float(np.median(errors)) < 0.08
-
-    def test_does_not_depend_on_the_order_of_samples(self, method: str) -> None:
+    def test_does_not_depend_on_the_order_of_samples(self, mode: str) -> None:
         samples, where = photos(2), FieldPosition(0.7, 0.4)
-        forward = LensModel.fit(samples, ModelSettings(method=method)).query(where, GREEN, SIZE)
-        backward = LensModel.fit(samples[::-1], ModelSettings(method=method)).query(where, GREEN, SIZE)
+        forward = LensModel.fit(samples, ModelSettings(mode=mode)).query(where, GREEN, SIZE)
+        backward = LensModel.fit(samples[::-1], ModelSettings(mode=mode)).query(where, GREEN, SIZE)
 
         assert difference(forward.kernel, backward.kernel) < 1e-5
+
+
+def test_follows_the_ring_family() -> None:
+    model = LensModel.fit(photos(3))
+    errors = [distance(model.query(p, GREEN, SIZE).kernel, ring_kernel(p)).rel_l2 for p in places(12, 99)]
+
+    assert float(np.median(errors)) < 0.08
 
 
 def seen_from(kernel: Kernel, own: float, here: float) -> Kernel:
@@ -137,7 +135,7 @@ def test_angles_on_both_sides_of_pi_are_neighbours() -> None:
 
 
 def test_samples_added_one_by_one_answer_as_all_at_once() -> None:
-    fixed = ModelSettings(r=0.1, phi=0.4, method="nadaraya-watson", robust=False, mirror=0.0)
+    fixed = ModelSettings(r=0.1, phi=0.4, mode="paper")
     samples = photos(4)
     grown = LensModel.fit(samples[:40], fixed)
     for sample in samples[40:]:
@@ -151,12 +149,11 @@ def test_samples_added_one_by_one_answer_as_all_at_once() -> None:
 
 
 def test_older_model_is_untouched_by_samples_added_later() -> None:
-    old = LensModel.fit(photos(2))
+    old = LensModel.fit(photos(2), ModelSettings(robust=False))
     before = old.query(FieldPosition(0.5, 0.5), GREEN, SIZE).kernel
-    left = old.added([PsfSample(delta(SIZE), FieldPosition(0.5, 0.5), GREEN, photo="left")])
-    right = old.added(
-        [PsfSample(gaussian(SIZE, np.eye(2) * 6), FieldPosition(0.5, 0.5), GREEN, photo="right")]
-    )
+    narrow, wide = delta(SIZE), gaussian(SIZE, np.eye(2) * 6)
+    left = old.added([PsfSample(narrow, FieldPosition(0.5, 0.5), GREEN, photo="left")])
+    right = old.added([PsfSample(wide, FieldPosition(0.5, 0.5), GREEN, photo="right")])
 
     assert np.array_equal(old.query(FieldPosition(0.5, 0.5), GREEN, SIZE).kernel, before)
     assert left.samples[-1].photo == "left"
@@ -187,7 +184,7 @@ def test_colours_hardly_mix() -> None:
     narrow, wide = gaussian(SIZE, np.eye(2) * 0.8), gaussian(SIZE, np.eye(2) * 5.0)
     samples = [PsfSample(narrow, p, GREEN, photo="a") for p in places(20, 1)]
     samples += [PsfSample(wide, p, GREEN.with_channel("r"), photo="a") for p in places(20, 2)]
-    model = LensModel.fit(samples, ModelSettings(method="nadaraya-watson"))
+    model = LensModel.fit(samples, ModelSettings(mode="paper"))
 
     assert difference(model.query(FieldPosition(0.5, 0.0), GREEN, SIZE).kernel, narrow) < 0.05
 
@@ -204,7 +201,7 @@ def test_weight_scales_the_vote() -> None:
 def test_widths_are_carried_into_the_corner() -> None:
     model = LensModel.fit([s for i in range(4) for s in photo(f"p{i}", i) if s.position.r < 0.85])
     where = FieldPosition(1.0, 0.3)
-    plain = LensModel.fit(model.samples, ModelSettings(method="nadaraya-watson"))
+    plain = LensModel.fit(model.samples, ModelSettings(mode="paper"))
 
     carried = distance(model.query(where, GREEN, SIZE).kernel, ring_kernel(where)).rel_l2
     faded = distance(plain.query(where, GREEN, SIZE).kernel, ring_kernel(where)).rel_l2
@@ -226,9 +223,9 @@ def test_no_samples_is_said_as_such() -> None:
         LensModel.fit([])
 
 
-def test_unknown_method_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(UnknownMethodError, match="nadaraya-watson"):
-        ModelSettings(method="magic")
+def test_unknown_mode_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(UnknownMethodError, match="paper"):
+        ModelSettings(mode="magic")
 
 
 @pytest.mark.parametrize("bad", [{"r": 0.0}, {"phi": math.nan}, {"mirror": 2.0}])
@@ -243,28 +240,16 @@ def test_even_sizes_are_refused(size: int) -> None:
         LensModel.fit(photos(1)).query(FieldPosition(0.0, 0.0), GREEN, size)
 
 
-class TestIndex:
-    def points(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        points = np.random.default_rng(seed).random((count, 4))
-        points[::7, 2] = np.nan
-        return points
+@pytest.mark.parametrize("known", [True, False])
+def test_tree_finds_what_a_direct_search_finds(known: bool) -> None:
+    points = np.random.default_rng(0).random((700, 7))
+    points[::7, 5] = np.nan
+    scale = np.array([0.1, 0.2, 0.2, 0.3, 0.4, 0.2, 0.3])
+    asked = np.array([0.4, 0.5, 0.5, 0.5, 0.6, 0.5, 0.5 if known else np.nan])
+    gap = np.nan_to_num((points - asked) / scale, nan=0.0)
+    direct = np.flatnonzero((gap**2).sum(axis=1) <= 1.5**2)
 
-    @pytest.mark.parametrize("known", [True, False])
-    def test_finds_what_a_direct_search_finds(self, known: bool) -> None:
-        points, scale = self.points(700), np.array([0.1, 0.2, 0.3, 0.2])
-        index = SampleIndex.of(points[:100])
-        for start in range(100, 700, 30):
-            index = index.extended(points[start : start + 30])
-        asked = np.array([0.4, 0.5, 0.6 if known else np.nan, 0.5])
+    inside = Neighbourhood(points, np.ones(700), scale).within(asked, 1.5)
 
-        for stretch in (1.0, 0.7, 0.3, 2.0):
-            gap = np.nan_to_num((points - asked) / (scale * stretch), nan=0.0)
-            direct = np.flatnonzero((gap**2).sum(axis=1) <= 1.5**2)
-            assert np.array_equal(index.near(asked, 1.5, scale * stretch), direct)
-
-    def test_keeps_few_trees_as_it_grows(self) -> None:
-        index = SampleIndex.of(self.points(64))
-        for i in range(60):
-            index = index.extended(self.points(64, i))
-
-        assert len(index.blocks) <= 8
+    assert 0 < len(direct) < len(inside) < 700
+    assert np.isin(direct, inside).all()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
+from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
 
 finite = {"allow_nan": False, "allow_infinity": False}
 

@@ -104,7 +104,7 @@ def test_factorised_sum_equals_the_sum_over_all_pairs() -> None:
 
 def test_canonical_path_is_within_two_hundredths_of_the_exact_sum() -> None:
     samples = photo("a", 0)
-    fixed = ModelSettings(r=0.1, phi=0.5, stops=0.5, method="nadaraya-watson", robust=False)
+    fixed = ModelSettings(r=0.1, phi=0.5, stops=0.5, mode="paper")
     model = LensModel.fit(samples, fixed)
     for where in places(4, 5):
         exact = factorised(samples, where, GREEN, SIZE, pixel=0.3, widths=WIDTHS)
@@ -129,7 +129,7 @@ def test_bandwidths_are_those_of_green_in_whatever_order_channels_come(
     green = merged(good[:3])
     noisy = merged([photo(f"p{i}", i, noise=0.5) for i in range(3)])
     blue = [replace(s, settings=s.settings.with_channel("b")) for s in noisy]
-    plain = ModelSettings(method="nadaraya-watson", robust=False)
+    plain = ModelSettings(mode="paper")
     of_green = LensModel.fit(green, plain).bandwidth
 
     for samples in ([*green, *blue], [*blue, *green]):
@@ -151,7 +151,7 @@ class TestOutliers:
         self, good: list[tuple[PsfSample, ...]]
     ) -> None:
         clean, bad = merged(good), photo("shaken", 50, blur=16.0)
-        fixed = {"r": 0.12, "phi": 0.5, "mirror": 0.0, "method": "nadaraya-watson"}
+        fixed = {"r": 0.12, "phi": 0.5, "mirror": 0.0}
 
         def moved(robust: bool) -> float:
             settings = ModelSettings(robust=robust, **fixed)  # type: ignore[arg-type] # values of one dict
@@ -259,7 +259,7 @@ class TestProfile:
         "change",
         [
             {"format": 99},
-            {"model": {"method": "magic"}},
+            {"model": {"mode": "magic"}},
             {"model": {"unknown": 1}},
             {"samples": []},
             {"lens": 7},

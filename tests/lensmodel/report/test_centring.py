@@ -54,9 +54,7 @@ def true_samples(
 
 def quick(samples: list[PsfSample]) -> LensModel:
     """A model that is made fast: the centring is judged by the samples, whatever smooths them."""
-    return LensModel.fit(
-        samples, ModelSettings(r=0.2, phi=0.5, mirror=0.0, method="nadaraya-watson", robust=False)
-    )
+    return LensModel.fit(samples, ModelSettings(r=0.2, phi=0.5, mode="paper"))
 
 
 def aligned(kind: str, seed: int = 1000, decentred: tuple[float, float] = (0.0, 0.0)) -> SimulatedLens:

@@ -27,7 +27,7 @@ from lensmodel.report.documents import comparison_html, to_csv, to_html, zone_ta
 from lensmodel.report.places import grid, half_sides, ring
 from lensmodel.report.plots import charts, comparison_page, pages, save, to_pdf
 
-QUICK = ModelSettings(r=0.3, phi=0.8, mirror=0.0, method="nadaraya-watson", robust=False)
+QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
 SIZE = 15
 
 

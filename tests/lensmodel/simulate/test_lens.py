@@ -16,8 +16,7 @@ from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import centroid, distance, rms_width, second_moments
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.simulate import LENS_KINDS, Aberrations, SimulatedLens, draw_lens
-from lensmodel.simulate.aberrations import WaveError
-from lensmodel.simulate.pupil import PixelOtf, disc, pixel_otf
+from lensmodel.simulate.lens import PixelOtf, WaveError, disc, pixel_otf
 
 PITCH = 4.5
 ANGLES = (0.0, 0.7, 1.9, -2.6, -1.2)

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
+import rawpy
 
 import lensmodel
 from lensmodel import photo
+from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
 from lensmodel.core.psf import PsfSample, gaussian
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import FieldPosition, LensSettings, Plane
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.workflow import calibrating, pipeline
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.lens import Lens
+
+Admit = Callable[[photo.PhotoMetadata], None]
 
 
 def samples_of(name: str) -> list[PsfSample]:
@@ -30,22 +40,18 @@ def samples_of(name: str) -> list[PsfSample]:
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two files that pass for photos; their samples are made up."""
 
-    def estimated(path: Path, recipe: pipeline.Recipe, **options: object) -> list[PsfSample]:
-        return samples_of(pipeline.photo_id(path))
-
-    def inspected(path: Path) -> photo.PhotoInfo:
-        aperture = None if path.stem == "unknown" else 2.8
-        return photo.PhotoInfo("dng", 6, 4, photo.PhotoMetadata(aperture=aperture))
+    def estimated(path: Path, recipe: object, *, key: str, admit: Admit, **_: object) -> list[PsfSample]:
+        admit(photo.PhotoMetadata(aperture=None if path.stem == "unknown" else 2.8))
+        return samples_of(key)
 
     monkeypatch.setattr(calibrating, "samples_of_photo", estimated)
-    monkeypatch.setattr(calibrating.photo, "inspect", inspected)
     paths = [tmp_path / "a.dng", tmp_path / "b.dng"]
     for path in paths:
         path.write_bytes(path.name.encode())
     return paths
 
 
-class Noting(pipeline.InMemory):
+class Noting(calibrating.InMemory):
     """Notes how many samples a lens has whenever it is kept."""
 
     def __init__(self, lens: Lens | None = None) -> None:
@@ -59,7 +65,7 @@ class Noting(pipeline.InMemory):
 
 def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
     keeper = Noting()
-    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
+    calibration = calibrating.Calibration(keeper, sampling.Recipe())
 
     verdicts = list(calibration.learn([*photos, photos[0]]))
     lens = calibration.known
@@ -71,9 +77,9 @@ def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
-    key = pipeline.photo_id(photos[0])
+    key = sampling.photo_id(photos[0])
     keeper = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
-    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
+    calibration = calibrating.Calibration(keeper, sampling.Recipe())
 
     assert calibration.add(photos[0]) is None
     assert calibration.known is keeper.lens()
@@ -82,7 +88,7 @@ def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
 
 def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
     keeper = Noting()
-    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
+    calibration = calibrating.Calibration(keeper, sampling.Recipe())
     calibration.add(photos[0])
     kept = keeper.lens()
     assert kept is not None
@@ -102,7 +108,7 @@ def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
 def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
     photos: list[Path], tmp_path: Path
 ) -> None:
-    calibration = pipeline.Calibration(Noting(), pipeline.Recipe())
+    calibration = calibrating.Calibration(Noting(), sampling.Recipe())
     for name in ("a-corrected.dng", "unknown.dng"):
         (tmp_path / name).write_bytes(name.encode())
 
@@ -114,49 +120,60 @@ def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
     assert calibration.known is None
 
 
-class Written:
-    """Steps that only say that they were taken."""
+@dataclass(frozen=True)
+class Round:
+    """An estimator of kernels that needs no work."""
 
-    def __init__(self, *, goes_on: bool) -> None:
-        self.taken: list[str] = []
-        self._goes_on = goes_on
+    name: str = "round"
+    version: int = 1
 
-    def inspect(self) -> bool:
-        self.taken.append("inspect")
-        return self._goes_on
+    def estimate(self, patches: Sequence[Plane], noise: object, *, size: int) -> lensmodel.PsfEstimate:
+        return lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3, {})
 
-    def enter(self, stage: pipeline.Stage) -> None:
-        self.taken.append(stage)
-
-    def develop(self) -> None:
-        self.taken.append("develop")
-
-    def select(self) -> None:
-        self.taken.append("select")
-
-    def estimate(self) -> None:
-        self.taken.append("estimate")
-
-    def count(self) -> None:
-        self.taken.append("count")
+    def estimate_channel(
+        self, patches: object, noise: object, reference: lensmodel.PsfEstimate, first: object, *, size: int
+    ) -> lensmodel.PsfEstimate:
+        return reference
 
 
-def test_a_photo_takes_its_steps_in_order_and_none_after_a_refusal() -> None:
-    counted, refused = Written(goes_on=True), Written(goes_on=False)
+def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: Counter[str] = Counter()
 
-    pipeline.take(counted)
-    pipeline.take(refused)
+    class Raw(rawpy.RawPy):
+        def open_file(self, path: str) -> None:
+            counts["opened"] += 1
+            super().open_file(path)
 
-    assert counted.taken == [
-        *("inspect", "developing", "develop", "selecting", "select", "estimating", "estimate", "count")
-    ]
-    assert refused.taken == ["inspect"]
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, count: int, **_: object) -> None:
+            counts["pools"] += 1
+            super().__init__(count)
+
+    def hashed(file: BinaryIO, name: str) -> hashlib._Hash:
+        counts["hashed"] += 1
+        return hashlib.new(name, file.read())
+
+    monkeypatch.setattr(rawpy, "RawPy", Raw)
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(hashlib, "file_digest", hashed)
+    blocks = np.random.default_rng(0).integers(700, 14000, (2, 110, 160))
+    for name, squares in zip("ab", blocks, strict=True):
+        mosaic = np.kron(squares, np.ones((7, 7))).astype(np.uint16)[:768, :1120]
+        shot = ShotInfo(aperture=2.8)
+        write_bayer_dng(tmp_path / f"{name}.dng", mosaic, black=512, white=15872, shot=shot)
+
+    lens = lensmodel.calibrate(sorted(tmp_path.glob("*.dng")), estimator=Round(), kernel_size=15, patches=24)
+
+    assert len(lens.profile.photos) == 2
+    assert counts == {"opened": 2, "hashed": 2, "pools": 1}
 
 
 def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
     photos: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def cancelled(path: Path, recipe: pipeline.Recipe, **options: object) -> list[PsfSample]:
+    def cancelled(path: Path, recipe: sampling.Recipe, **options: object) -> list[PsfSample]:
         raise CancelledError("enough")
 
     monkeypatch.setattr(calibrating, "samples_of_photo", cancelled)

@@ -18,7 +18,7 @@ from lensmodel import correction, photo, simulate
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.model import LensModel
 from lensmodel.quality import to_srgb
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import correcting, sampling
 
 pytestmark = pytest.mark.slow
 
@@ -69,11 +69,11 @@ def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(
     known, asked = shot(lens, f_number, "city"), shot(lens, f_number, "colosseum")
     simulate.write_photo(tmp_path / "known.dng", known)
     simulate.write_photo(tmp_path / "asked.dng", asked)
-    model = LensModel.fit(pipeline.samples_of_photo(tmp_path / "known.dng", workers=1))
+    model = LensModel.fit(sampling.samples_of_photo(tmp_path / "known.dng", workers=1))
     developed = photo.develop(tmp_path / "asked.dng")
-    lateral = pipeline.lateral_of(developed)
+    lateral = correcting.lateral_of(developed)
 
-    made = pipeline.correct_photo(developed, model, settings, lateral=lateral).planes
+    made = correcting.correct_photo(developed, model, settings, lateral=lateral).planes
 
     with_the_truth = correction.correct_planes(
         developed.planes,

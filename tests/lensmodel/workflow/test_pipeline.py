@@ -13,8 +13,8 @@ from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEn
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
-from lensmodel.estimation.patches import Patch, Selection
 from lensmodel.model import LensModel
+from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import (
     BlurOptions,
@@ -25,7 +25,7 @@ from lensmodel.simulate import (
     photograph,
     write_photo,
 )
-from lensmodel.workflow import correcting, pipeline
+from lensmodel.workflow import correcting, sampling
 
 LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
 CAMERA = SimulatedCamera(height=320, width=480, pitch_um=9.0)
@@ -54,8 +54,8 @@ def city(photos: dict[str, tuple[Path, SimulatedPhoto]]) -> LinearPhoto:
 
 
 def test_developed_photo_comes_back_from_disk_as_it_was(city: LinearPhoto, tmp_path: Path) -> None:
-    pipeline.save_developed(city, tmp_path)
-    back = pipeline.load_developed(tmp_path)
+    sampling.save_developed(city, tmp_path)
+    back = sampling.load_developed(tmp_path)
 
     assert np.array_equal(back.planes, city.planes)
     assert back.planes.flags.writeable is False
@@ -67,7 +67,7 @@ def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:
     (tmp_path / "photo.json").write_text("{}", encoding="utf-8")
 
     with pytest.raises(InvalidInputError, match="develop it again"):
-        pipeline.load_developed(tmp_path)
+        sampling.load_developed(tmp_path)
 
 
 def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
@@ -76,9 +76,9 @@ def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
     def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("lensmodel.workflow.developed.save_array", full_disk)
+    monkeypatch.setattr("lensmodel.workflow.sampling.save_array", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        pipeline.save_developed(city, tmp_path)
+        sampling.save_developed(city, tmp_path)
 
     assert [path.name for path in tmp_path.iterdir()] == ["photo.json"]
 
@@ -88,15 +88,15 @@ def test_lateral_colour_does_not_hang_on_the_level_of_white(
 ) -> None:
     brighter = replace(city, planes=4.0 * city.planes, clip=(4.0, 4.0, 4.0))
 
-    assert pipeline.lateral_of(city).red_points > 0
-    assert pipeline.lateral_of(brighter).red_points == pipeline.lateral_of(city).red_points
+    assert correcting.lateral_of(city).red_points > 0
+    assert correcting.lateral_of(brighter).red_points == correcting.lateral_of(city).red_points
 
 
 def test_cells_hold_every_patch_once_largest_first() -> None:
     place = FieldPosition(0.1, 0.0)
     patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))
 
-    groups = pipeline.patches_by_cell(Selection(patches, ()))
+    groups = sampling.patches_by_cell(Selection(patches, ()))
 
     assert [len(group) for group in groups] == [3, 2, 1]
     assert sorted(p.row for group in groups for p in group) == list(range(6))
@@ -106,7 +106,7 @@ def test_cells_hold_every_patch_once_largest_first() -> None:
 def test_calibrated_lens_makes_another_photo_sharper(
     method: str, photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path
 ) -> None:
-    events: list[pipeline.CalibrationEvent] = []
+    events: list[sampling.CalibrationEvent] = []
     city = photos["city"][0]
     lens = lensmodel.calibrate(city, on_event=events.append)
     path, shot = photos["lake"]
@@ -131,7 +131,7 @@ def test_a_patch_that_took_no_part_becomes_a_sample_all_the_same(city: LinearPho
     planes[:, :128, :128] = 0.4  # nothing is seen here
     group = [Patch(row, row, 128, city.frame.position(row, row), 1.0, 0) for row in (0, 192)]
 
-    found = pipeline.estimate_cell(
+    found = sampling.estimate_cell(
         replace(city, planes=planes),
         group,
         settings=SETTINGS,
@@ -147,7 +147,7 @@ def test_a_patch_that_took_no_part_becomes_a_sample_all_the_same(city: LinearPho
 def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:
     text = tmp_path / "notes.jpg"
     text.write_text("not a photo", encoding="utf-8")
-    events: list[pipeline.CalibrationEvent] = []
+    events: list[sampling.CalibrationEvent] = []
 
     with pytest.raises(NotEnoughEvidenceError, match=r"notes\.jpg"):
         lensmodel.calibrate(text, on_event=events.append)
@@ -162,7 +162,7 @@ def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)).save(path)
 
     with pytest.raises(MetadataMissingError, match="--aperture"):
-        pipeline.samples_of_photo(path)
+        sampling.samples_of_photo(path)
 
 
 def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
@@ -176,7 +176,7 @@ def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
         pipeline="test",
     )
 
-    chosen = pipeline.settings_of(developed, LensSettings(aperture=4.0, focus_m=2.0))
+    chosen = sampling.settings_of(developed, LensSettings(aperture=4.0, focus_m=2.0))
 
     assert (chosen.aperture, chosen.focal_mm, chosen.focus_m) == (2.8, 35.0, 2.0)
 
@@ -209,7 +209,7 @@ def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.
     model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
 
     for method, warped in (("paper", True), ("standard", False)):
-        pipeline.correct_photo(developed, model, LensSettings(), method=method, lateral="shift")  # type: ignore[arg-type]
+        correcting.correct_photo(developed, model, LensSettings(), method=method, lateral="shift")  # type: ignore[arg-type]
 
         assert bool(np.asarray(seen["planes"]).any()) is warped
         assert seen["lateral"] == (None if warped else "shift")
@@ -222,10 +222,10 @@ def test_the_photo_that_is_corrected_joins_the_samples_once(
     model = lensmodel.calibrate(paths["city"]).model
     lake, city = (photo.develop(paths[name]) for name in ("lake", "city"))
 
-    other = pipeline.psfs_for(lake, model, SETTINGS, photo=pipeline.photo_id(paths["lake"]))
-    same = pipeline.psfs_for(city, model, SETTINGS, photo=pipeline.photo_id(paths["city"]))
+    other = correcting.psfs_for(lake, model, SETTINGS, photo=sampling.photo_id(paths["lake"]))
+    same = correcting.psfs_for(city, model, SETTINGS, photo=sampling.photo_id(paths["city"]))
 
     assert len(other.model.samples) > len(model.samples)
-    assert {sample.photo for sample in other.model.samples} == {pipeline.photo_id(p) for p in paths.values()}
+    assert {sample.photo for sample in other.model.samples} == {sampling.photo_id(p) for p in paths.values()}
     assert same.model is model
     assert 0.0 < other.error_at(FieldPosition(0.5, 0.3), "g") <= 1.0

@@ -16,7 +16,7 @@ from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import edge_chart
-from lensmodel.workflow import pipeline
+from lensmodel.workflow import correcting
 
 FRAME = Frame(900, 1200)
 SMALL = Frame(480, 720)  # large enough for a chart still
@@ -56,8 +56,8 @@ def test_corrected_chart_has_a_measured_gain_in_each_zone_and_its_part_in_the_zo
     noise = np.random.default_rng(1).normal(0.0, 0.003, (3, *scene.shape))
     chart = developed((scene + noise).astype(np.float32))
 
-    whole = pipeline.correct_photo(chart, measured, LensSettings(), method="fast")
-    part = pipeline.correct_photo(chart, measured, LensSettings(), method="fast", roi=(0, 700, 420, 500))
+    whole = correcting.correct_photo(chart, measured, LensSettings(), method="fast")
+    part = correcting.correct_photo(chart, measured, LensSettings(), method="fast", roi=(0, 700, 420, 500))
 
     for report in whole.zones.values():
         assert report.measured is not None
@@ -72,7 +72,7 @@ def test_corrected_photo_without_a_chart_has_no_measured_gain(model: LensModel) 
     rng = np.random.default_rng(2)
     grain = ndimage.gaussian_filter(rng.random((3, SMALL.height, SMALL.width)), (0, 2, 2)).astype(np.float32)
 
-    found = pipeline.correct_photo(
+    found = correcting.correct_photo(
         developed(grain), model, LensSettings(), method="fast", roi=(120, 160, 200, 300)
     )
 

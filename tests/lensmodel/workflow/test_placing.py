@@ -19,11 +19,11 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
 from lensmodel.model import LensModel
-from lensmodel.model.circle import circle_mm, on_one_circle
+from lensmodel.model.bodies import circle_mm, on_one_circle
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.lateral import LateralColour
-from lensmodel.workflow import correcting, pipeline
-from lensmodel.workflow.placing import placed
+from lensmodel.workflow import correcting
+from lensmodel.workflow.correcting import placed
 
 WHOLE, CROPPED, PITCH = Frame(480, 720), Frame(320, 480), 6.0
 
@@ -112,11 +112,13 @@ def test_a_frame_in_crop_mode_is_corrected_by_the_kernels_of_the_middle(
 
     monkeypatch.setattr(correcting.correction, "correct_planes", recorded)
     own = LateralColour((0.0, 0.0, 1e-3, 1.0), (0.0, 0.0, 0.0, 1.0), CROPPED.half_diagonal)
-    done = pipeline.correct_photo(developed_of(CROPPED), model, LensSettings(2.8), method="fast", lateral=own)
+    done = correcting.correct_photo(
+        developed_of(CROPPED), model, LensSettings(2.8), method="fast", lateral=own
+    )
 
     place = asked["frame"].position(0.0, 0.0)
     assert place.r == pytest.approx(2.0 / 3.0, abs=0.01)
-    of_whole = pipeline.psfs_for(developed_of(WHOLE, kind="jpeg"), model, LensSettings(2.8))
+    of_whole = correcting.psfs_for(developed_of(WHOLE, kind="jpeg"), model, LensSettings(2.8))
     same = of_whole.kernel_at(WHOLE.position(80.0, 120.0), "g", 15)
     assert asked["field"].kernel_at(place, "g", 15) == pytest.approx(same, abs=1e-3)
     assert rms_width(same) < 0.9 * rms_width(of_whole.kernel_at(WHOLE.position(0.0, 0.0), "g", 15))
@@ -128,7 +130,7 @@ def test_a_frame_larger_than_all_that_is_known_is_refused_by_both_sizes() -> Non
     model = LensModel.fit(samples_on(CROPPED))
 
     with pytest.raises(OutsideSupportError, match=r"5\.2 mm diagonal.*3\.5 mm"):
-        pipeline.correct_photo(developed_of(WHOLE), model, LensSettings(2.8), method="fast")
+        correcting.correct_photo(developed_of(WHOLE), model, LensSettings(2.8), method="fast")
 
 
 def test_what_a_program_cut_is_refused_by_both_sizes() -> None:

@@ -1,0 +1,21 @@
+"""Blind estimation: one PSF from the patches of one field position, or from all patches of a photo."""
+
+from lensmodel.blind.estimator import PhotoEstimator, PsfEstimate, PsfEstimator
+from lensmodel.blind.learned import LearnedEstimator
+from lensmodel.blind.patch_recurrence import PatchRecurrence
+from lensmodel.core.registry import Registry
+
+estimators: Registry[PsfEstimator] = Registry(
+    "estimator",
+    {"default": LearnedEstimator, "michaeli-irani": PatchRecurrence},
+    "lensmodel.estimators",
+)
+
+__all__ = [
+    "LearnedEstimator",
+    "PatchRecurrence",
+    "PhotoEstimator",
+    "PsfEstimate",
+    "PsfEstimator",
+    "estimators",
+]

@@ -1,0 +1,222 @@
+"""What every blind estimator takes and gives, and what it refuses.
+
+From a raw kernel to an estimate: the last steps that several blind methods share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.psf import PsfSample, centred, resized, rms_width
+from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.patches.checks import repeats
+from lensmodel.patches.windows import Patch, Selection
+from lensmodel.photo.values import LinearPhoto
+
+_MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
+_CONTRAST_IN_NOISE = 3.0  # standard deviations: less contrast is noise (chosen)
+_CLIPPED_SHARE = 0.02  # of the pixels: a few clipped ones spoil no estimate (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfEstimate:
+    """One estimated PSF and the evidence for it.
+
+    Parameters
+    ----------
+    kernel : Kernel, float64, shape (size, size)
+        Of sum 1, on the pixel grid of the patches.
+    confidence : float
+        0..1; ranks estimates by their true error.
+    predicted_error : float
+        Expected relative L2 distance to the true kernel.
+    diagnostics : mapping of str to float
+        What the estimator reports of itself.
+    """
+
+    kernel: Kernel
+    confidence: float
+    predicted_error: float
+    diagnostics: Mapping[str, float]
+
+
+class PsfEstimator(Protocol):
+    """A blind estimator: patches of one field position in, one kernel out [1]_.
+
+    Name and version are stored with each sample.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 5.
+    """
+
+    @property
+    def name(self) -> str:
+        """As in the registry."""
+
+    @property
+    def version(self) -> int | str:
+        """Grows, or changes, when results change."""
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that all patches share.
+
+        Parameters
+        ----------
+        patches : sequence of Plane, float32, each of shape (h, w)
+            Windows of 64 to 512 px of one color plane, linear light.
+        noise : sequence of NoiseModel
+            One for each patch.
+        size : int
+            Odd side of the kernel, up to 55.
+        on_step : StepHook
+            Progress; raising `CancelledError` there stops the work.
+
+        Returns
+        -------
+        PsfEstimate
+            Its kernel is float64 of shape (size, size), with sum 1 and its center of mass in the middle.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If no patch determines a kernel: flat, clipped, or noise only.
+        InvalidInputError
+            For values that no photo has.
+        """
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel of the same patches, starting from the result of the first.
+
+        Parameters
+        ----------
+        patches : sequence of Plane, float32, each of shape (h, w)
+            The windows in this channel, linear light.
+        noise : sequence of NoiseModel
+            One for each patch.
+        reference : PsfEstimate
+            What `estimate` gave for the first channel.
+        reference_patches : sequence of Plane, float32, each of shape (h, w)
+            The same windows in the first channel.
+        size, on_step
+            As of `estimate`.
+
+        Returns
+        -------
+        PsfEstimate
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If no patch determines a kernel in this channel.
+        InvalidInputError
+            For values that no photo has.
+        """
+
+
+@runtime_checkable
+class PhotoEstimator(Protocol):
+    """An estimator that chooses windows of a whole photo and learns from each beside the others."""
+
+    def select(self, developed: LinearPhoto, *, count: int) -> Selection:
+        """Choose at most `count` windows."""
+
+    def samples(
+        self,
+        developed: LinearPhoto,
+        patches: Sequence[Patch],
+        *,
+        settings: LensSettings,
+        photo: str,
+        size: int,
+        on_step: StepHook = ignore_step,
+    ) -> list[PsfSample]:
+        """Return the samples of the windows, three of each in the order of `CHANNELS`."""
+
+
+LARGEST: Final = 55
+"""Side of the largest kernel that is estimated, the paper's: a larger one leaves too little of a patch."""
+
+
+def require_size(size: int) -> None:
+    """Refuse kernel sizes that cannot be estimated."""
+    if size % 2 == 0 or not 3 <= size <= LARGEST:
+        raise InvalidInputError(f"the size of kernels must be odd and in 3..{LARGEST}, got {size}")
+
+
+def usable(
+    patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
+) -> list[tuple[Plane, NoiseModel]]:
+    """Check patches at the door and keep those that carry signal."""
+    require_size(size)
+    if len(patches) != len(noise) or not patches:
+        raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
+    kept, reasons = [], []
+    for patch, model in zip(patches, noise, strict=True):
+        if patch.ndim != 2 or min(patch.shape) < _MIN_SIDE:
+            raise InvalidInputError(f"a patch must be a plane of at least {_MIN_SIDE} px, got {patch.shape}")
+        if not np.isfinite(patch).all():
+            raise InvalidInputError("a patch must be finite; mask or replace NaN and infinity first")
+        reason = _unfit(patch, model)
+        if reason is None:
+            kept.append((patch, model))
+        else:
+            reasons.append(reason)
+    if not kept:
+        raise NotEnoughEvidenceError(
+            f"no patch determines a kernel ({', '.join(sorted(set(reasons)))}); choose parts with fine detail"
+        )
+    return kept
+
+
+def _unfit(patch: Plane, model: NoiseModel) -> str | None:
+    sigma = model.sigma_at(float(patch.mean()))
+    if float(patch.std()) <= _CONTRAST_IN_NOISE * sigma or float(np.ptp(patch)) < 1e-6:
+        return "flat"
+    if float((patch >= 0.995).mean()) > _CLIPPED_SHARE:
+        return "clipped"
+    # White noise has as much power between neighbours as anywhere; a picture has far less.
+    steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
+    if steps > 1.4 * float(patch.var()):
+        return "noise"
+    if repeats(patch):
+        return "periodic"
+    return None
+
+
+_HALF_CONFIDENT = 0.4
+"""Relative error at which a kernel's weight is a half: that of a usual blind one (chosen)."""
+
+
+def confidence_of(error: float) -> float:
+    """Confidence of an estimate with an expected relative L2 error; 1/2 at 0.4."""
+    return 1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2)
+
+
+def finished(kernel: Kernel, *, size: int, error: float, diagnostics: Mapping[str, float]) -> PsfEstimate:
+    """Centre a kernel of any odd side and say how sure it is by its expected relative L2 error."""
+    final = resized(centred(kernel), size)
+    error = min(max(error, 0.0), 1.0) if math.isfinite(error) else 1.0
+    return PsfEstimate(final, confidence_of(error), error, {"width": rms_width(final), **diagnostics})

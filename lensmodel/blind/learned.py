@@ -1,0 +1,193 @@
+"""The default: patches of a whole photo, encoded beside each other by a network that knows many lenses.
+
+photo -> windows all over it -> statistics -> tokens, by attention within the photo -> a kernel of each
+
+Kernels of single patches are the samples of the paper: to be looked at, exported, and averaged by its
+regression. The model attends to the tokens themselves (`lensmodel.model.learned_field`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.blind.estimator import PsfEstimate, confidence_of, finished, usable
+from lensmodel.core.psf import EncodedPatch, PatchKind, PsfSample, centred, resized
+from lensmodel.core.types import (
+    CHANNELS,
+    FieldPosition,
+    LensSettings,
+    NoiseModel,
+    Plane,
+    StepHook,
+    ignore_step,
+)
+from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
+from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
+from lensmodel.patches.spread import spread_evenly
+from lensmodel.patches.windows import Patch, Selection
+from lensmodel.photo.values import LinearPhoto
+
+_DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)
+"""Of planes that a converter or a camera made: what their noise became no model tells, and the network was
+trained with this."""
+
+_HELD: Final = 0.999
+"""Share of its light that the array of a sample's kernel holds (chosen)."""
+
+_LEAST_SIDE: Final = 15  # pixels: of a sample's kernel (chosen)
+_ANYWHERE: Final = FieldPosition(0.5, 0.6)
+"""Place of patches of which nobody says where they lie (chosen: between center and corner)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedEstimator:
+    """Encodes the patches of whole photos; of patches without a photo it gives one kernel, as others do."""
+
+    name: str = "default"
+
+    @property
+    def version(self) -> str:
+        """Fingerprint of the weights."""
+        return FieldNetwork.load().name
+
+    def select(self, developed: LinearPhoto, *, count: int) -> Selection:
+        """Choose windows all over a photo, see `spread_evenly`."""
+        return spread_evenly(developed, count=count, size=WINDOW)
+
+    def samples(
+        self,
+        developed: LinearPhoto,
+        patches: Sequence[Patch],
+        *,
+        settings: LensSettings,
+        photo: str,
+        size: int,
+        on_step: StepHook = ignore_step,
+    ) -> list[PsfSample]:
+        """Encode patches of a photo beside each other."""
+        network, kind = FieldNetwork.load(), _kind_of(developed)
+        conditions = Conditions.of(settings, developed.info.metadata.pixel_pitch_um, kind)
+        xy = np.array([patch.position.xy for patch in patches])
+        rows = []
+        for done, patch in enumerate(patches, start=1):
+            rows.append(_statistics(developed, patch))
+            on_step(done, len(patches))
+        # rounded as they are stored, so that what is encoded anew from storage is the same
+        statistics = to_octant(np.stack(rows), xy).astype(np.float16)
+        tokens = network.encode(statistics.astype(np.float32), xy, conditions).astype(np.float16)
+        samples = []
+        for patch, own, token, place in zip(patches, statistics, tokens, xy, strict=True):
+            encoded = EncodedPatch(own, token, kind)
+            answer = _alone(network, token, place, conditions)
+            side = _side(answer.kernels, size)
+            for channel, kernel, error in zip(CHANNELS, answer.kernels, answer.error, strict=True):
+                samples.append(
+                    PsfSample(
+                        kernel=centred(resized(kernel, side)),
+                        position=patch.position,
+                        settings=settings.with_channel(channel),
+                        weight=confidence_of(float(error)),
+                        photo=photo,
+                        pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
+                        estimator=f"{self.name}/{self.version}",
+                        encoded=encoded,
+                        error=min(float(error), 1.0),
+                        half_diagonal_px=developed.frame.half_diagonal,
+                    )
+                )
+        return samples
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that patches of one plane share, as if all colors of a mosaic were that plane.
+
+        The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image. See
+        `PsfEstimator.estimate`.
+        """
+        kept = usable(patches, noise, size)
+        network, conditions = FieldNetwork.load(), Conditions()
+        colours = _colours(((0, 1), (1, 2)), 0, 0)
+        xy = np.tile(_ANYWHERE.xy, (len(kept), 1))
+        rows = [
+            patch_statistics(_middle(plane), colours, math.sqrt(model.read), model.shot)
+            for plane, model in kept
+        ]
+        tokens = network.encode(to_octant(np.stack(rows), xy), xy, conditions)
+        memory = network.memory(tokens, xy, [conditions] * len(kept))
+        answer = network.query(memory, xy[0], conditions)
+        on_step(1, 1)
+        return finished(answer.kernels[1], size=size, error=float(answer.error[1]), diagnostics={})
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel for itself; see `PsfEstimator.estimate_channel`."""
+        del reference, reference_patches
+        return self.estimate(patches, noise, size=size, on_step=on_step)
+
+
+def _alone(
+    network: FieldNetwork, token: NDArray[np.float16], place: NDArray[np.float64], conditions: Conditions
+) -> FieldAnswer:
+    """What the network says of the place of a patch from that patch alone."""
+    memory = network.memory(token[None].astype(np.float32), place[None], [conditions])
+    return network.query(memory, place, conditions)
+
+
+def _kind_of(developed: LinearPhoto) -> PatchKind:
+    """How the network is to take the pixels: only a Bayer mosaic holds the samples of the sensor."""
+    if developed.info.kind == "jpeg":
+        return "jpeg"
+    return "raw" if developed.cfa is not None else "tiff"
+
+
+def _statistics(developed: LinearPhoto, patch: Patch) -> NDArray[np.float32]:
+    """Statistics of the samples of a mosaic in a window: the sensor's, or else planes sampled by one."""
+    rows, cols = slice(patch.row, patch.row + WINDOW), slice(patch.col, patch.col + WINDOW)
+    planes = developed.planes[:, rows, cols]
+    colours = _colours(developed.cfa or ((0, 1), (1, 2)), patch.row, patch.col)
+    mosaic = np.take_along_axis(planes, colours[None].astype(np.intp), axis=0)[0]
+    noise = developed.sensor_noise[1] if developed.cfa and developed.sensor_noise else _DEVELOPED_NOISE
+    return patch_statistics(np.ascontiguousarray(mosaic), colours, math.sqrt(noise.read), noise.shot)
+
+
+def _colours(pattern: Sequence[Sequence[int]], row: int, col: int) -> NDArray[np.int8]:
+    """Color of each sample of a window that begins at a pixel."""
+    cell = np.roll(np.asarray(pattern, dtype=np.int8), (-(row % 2), -(col % 2)), axis=(0, 1))
+    return np.tile(cell, (WINDOW // 2, WINDOW // 2))
+
+
+def _middle(plane: Plane) -> Plane:
+    missing = [max(WINDOW - side, 0) for side in plane.shape]
+    padded = np.pad(plane, [(short // 2, short - short // 2) for short in missing], "symmetric")
+    top, left = ((side - WINDOW) // 2 for side in padded.shape)
+    return np.ascontiguousarray(padded[top : top + WINDOW, left : left + WINDOW], dtype=np.float32)
+
+
+def _side(kernels: NDArray[np.float64], most: int) -> int:
+    """Odd side that holds nearly all light of kernels."""
+    whole = kernels.shape[-1]
+    for side in range(_LEAST_SIDE, min(whole, most), 2):
+        cut = (whole - side) // 2
+        if kernels[:, cut : cut + side, cut : cut + side].sum(axis=(1, 2)).min() >= _HELD:
+            return side
+    return min(whole, most)

@@ -1,0 +1,454 @@
+"""Blind deblurring by internal patch recurrence, `michaeli-irani`: the paper's estimator.
+
+Michaeli and Irani, ECCV 2014, with one addition without which it collapses on photos in linear
+light: the noise of y is in the latent image too, so the normal equations of the kernel step get a
+spike that pulls k to a delta (errors in variables). Its expectation is known and taken off.
+
+Pieces of internal patch recurrence: pyramids, matching across scales, the image step.
+
+In a sharp picture small patches recur unchanged in a smaller copy of it; blur breaks that, and the
+smaller copy is sharper in its own pixels. Its patches are examples of what the sharp picture looks
+like. Source: T. Michaeli and M. Irani, "Blind deblurring using internal patch recurrence",
+ECCV 2014, section 3.
+
+Products of all shifted windows of an image, without writing the windows out.
+
+The normal equations of a kernel step are sums over pixels p of x(p + a) x(p + b), for all offsets a and b
+in the kernel's square. Sums that differ by a shift of both offsets share all rows but a few at their ends, so
+that the work grows with the third power of the side and not with the fourth.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, TypeAlias
+
+import numpy as np
+import scipy
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.blind.estimator import PsfEstimate, finished, usable
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.files import fitted
+from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.psf import as_kernel, centred, distance, otf, resized
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+
+log = logging.getLogger(__name__)
+
+_BORDER = 3
+"""Pixels left out along the rim: fewer patches overlap there, so that the latent picture is worse
+(chosen)."""
+_ERROR: Final[Mapping[str, float]] = fitted("blind")["recurrence_error"]
+"""Expected relative L2 error by the disagreement of the halves of the patches: a line through 24 patches,
+whose halves lie 0.14 apart and whose mean error is 0.61, see `data/README.md`. It ranks patches weakly (rank
+correlation 0.28)."""
+
+ALPHA = 4.0 / 3.0
+"""Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
+
+SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
+_COMPONENTS = 10
+"""Principal ones by which neighbours are found: they hold nearly all of a patch's power, more slow the search
+(chosen)."""
+_NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
+
+_STRIDE = 2  # pixels from patch to patch: every pixel is in several (chosen)
+_TOLERANCE = 0.5  # by what share a match may be farther than the nearest one: exact search is slower (chosen)
+
+Image = NDArray[np.float64]
+
+
+def resized_image(image: Image, shape: tuple[int, int]) -> Image:
+    """Resize by cubic splines, anti-aliased when it shrinks (Gaussian of sigma (ratio - 1) / 2)."""
+    if image.shape == shape:
+        return image
+    ratios = [have / want for have, want in zip(image.shape, shape, strict=True)]
+    sigma = [max(ratio - 1.0, 0.0) / 2.0 for ratio in ratios]
+    smooth = ndimage.gaussian_filter(image, sigma, mode="mirror") if max(sigma) > 0 else image
+    places = [(np.arange(want) + 0.5) * ratio - 0.5 for want, ratio in zip(shape, ratios, strict=True)]
+    coefficients = ndimage.spline_filter(smooth, order=3, mode="mirror")
+    grid = np.meshgrid(*places, indexing="ij")
+    return ndimage.map_coordinates(coefficients, grid, order=3, mode="mirror", prefilter=False)
+
+
+def level_shape(shape: tuple[int, int], level: int) -> tuple[int, int]:
+    """Shape of a pyramid level; 0 is the finest."""
+    factor = ALPHA**-level
+    return max(round(shape[0] * factor), 24), max(round(shape[1] * factor), 24)
+
+
+@lru_cache(maxsize=256)
+def noise_gain(shape: tuple[int, int], target: tuple[int, int]) -> float:
+    """Standard deviation that white noise of unit variance keeps when resampled."""
+    white = np.random.default_rng(0).standard_normal(shape)
+    return float(resized_image(white, target)[4:-4, 4:-4].std())
+
+
+def recur(x: Image, noise: float, bandwidth: float) -> Image:
+    """Replace every patch by the mean of its best matches in the smaller copy of the picture.
+
+    z = (1/M²) sum_j Q_j' sum_i w_ij R_i x^a,  w_ij ~ exp(-|Q_j x - R_i x^a|² / (2 h²))
+
+    Patches are compared without their mean, which is kept. Flat ones become their mean.
+    """
+    smaller = resized_image(x, (round(x.shape[0] / ALPHA), round(x.shape[1] / ALPHA)))
+    examples = sliding_window_view(smaller, (SIDE, SIDE)).reshape(-1, SIDE * SIDE)
+    examples = (examples - examples.mean(axis=1, keepdims=True)).astype(np.float32)
+    flat = max(2.0 * noise * noise, 1e-5)
+    examples = examples[(examples**2).mean(axis=1) > 0.5 * flat]
+
+    windows = sliding_window_view(x, (SIDE, SIDE))[::_STRIDE, ::_STRIDE]
+    rows, cols = windows.shape[:2]
+    wanted = windows.reshape(-1, SIDE * SIDE)
+    mean = wanted.mean(axis=1, keepdims=True)
+    wanted = (wanted - mean).astype(np.float32)
+    textured = (wanted**2).mean(axis=1) > flat
+    matches = np.zeros_like(wanted)
+    if examples.shape[0] > 4 * _NEIGHBOURS and textured.any():
+        matches[textured] = _matches(wanted[textured], examples, bandwidth)
+    matches += mean
+
+    total, count = np.zeros_like(x), np.zeros_like(x)
+    patches = matches.reshape(rows, cols, SIDE, SIDE)
+    for i in range(SIDE):
+        for j in range(SIDE):
+            place = (slice(i, i + _STRIDE * rows, _STRIDE), slice(j, j + _STRIDE * cols, _STRIDE))
+            total[place][:rows, :cols] += patches[:, :, i, j]
+            count[place][:rows, :cols] += 1.0
+    return np.where(count > 0, total / np.maximum(count, 1.0), x)
+
+
+def _matches(
+    wanted: NDArray[np.float32], examples: NDArray[np.float32], bandwidth: float
+) -> NDArray[np.float32]:
+    _, basis = np.linalg.eigh(examples.T @ examples)
+    basis = basis[:, -_COMPONENTS:]
+    tree = scipy.spatial.cKDTree(examples @ basis, leafsize=32, balanced_tree=False, compact_nodes=False)
+    index = tree.query(wanted @ basis, k=_NEIGHBOURS, eps=_TOLERANCE)[1]
+    near = examples[index]
+    gap = ((near - wanted[:, None, :]) ** 2).sum(axis=2)
+    weight = np.exp(-(gap - gap.min(axis=1, keepdims=True)) / (2.0 * bandwidth**2))
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.einsum("nk,nkp->np", weight, near)
+
+
+def blend(y: Image, kernel: NDArray[np.float64], z: Image, beta: float) -> tuple[Image, Image]:
+    """Image step: x = argmin |y - k * x|² + beta |x - z|², by Fourier on a mirrored frame.
+
+    X = (conj(K) Y + beta Z) / (|K|² + beta)
+
+    Returns
+    -------
+    x : ndarray, shape (H, W)
+    filter : ndarray, shape (n, n)
+        Impulse response of conj(K) / (|K|² + beta), by which the noise of y enters x; origin at [0, 0].
+    """
+    pad = kernel.shape[0]
+    rows, cols = (int(fft.next_fast_len(n + 2 * pad, real=True)) for n in y.shape)
+    shape = (rows, cols)
+    after = [(pad, n - m - pad) for n, m in zip(shape, y.shape, strict=True)]
+    transfer = otf(kernel, shape)
+    power = np.abs(transfer) ** 2 + beta
+    spectrum = np.conj(transfer) * fft.rfft2(np.pad(y, after, mode="symmetric"))
+    spectrum += beta * fft.rfft2(np.pad(z, after, mode="symmetric"))
+    x = fft.irfft2(spectrum / power, s=shape)[pad : pad + y.shape[0], pad : pad + y.shape[1]]
+    side = int(fft.next_fast_len(4 * kernel.shape[0], real=True))
+    small = otf(kernel, (side, side))
+    return x, fft.irfft2(np.conj(small) / (np.abs(small) ** 2 + beta), s=(side, side))
+
+
+def window_products(
+    x: NDArray[np.float64], y: NDArray[np.float64], side: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums of products of windows of x with one another and with y, means taken off.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n + side - 1, m + side - 1)
+        About zero mean: sums are of single precision.
+    y : ndarray, shape (n, m)
+    side : int
+
+    Returns
+    -------
+    gram : ndarray, shape (side², side²)
+        sum_p (x(p + a) - mean)(x(p + b) - mean), offsets a and b in reading order.
+    cross : ndarray, shape (side²,)
+        sum_p (x(p + a) - mean)(y(p) - mean).
+    """
+    n, m = y.shape
+    values = x.astype(np.float32)
+    windows = np.ascontiguousarray(sliding_window_view(values, side, axis=1))  # (n + side - 1, m, side)
+    gram = np.empty((side, side, side, side))
+    for lag in range(side):
+        for row, products in enumerate(_of_rows(windows, lag, n)):
+            gram[row, :, row + lag, :] = products
+            gram[row + lag, :, row, :] = products.T
+    target = (y - y.mean()).astype(np.float32).ravel()
+    cross = np.stack([target @ windows[row : row + n].reshape(-1, side) for row in range(side)])
+    by_column = np.add.accumulate(windows.sum(axis=1, dtype=np.float64), axis=0)
+    means = by_column[n - 1 :].copy()
+    means[1:] -= by_column[: side - 1]
+    flat = means.ravel() / (n * m)
+    return gram.reshape(side * side, -1) - n * m * np.outer(flat, flat), cross.astype(np.float64).ravel()
+
+
+def _of_rows(windows: NDArray[np.float32], lag: int, n: int) -> NDArray[np.float64]:
+    """Sums over the n rows from t on of windows[t]' windows[t + lag], shape (side - lag, side, side)."""
+    side = windows.shape[2]
+    starts = side - lag
+    if n < starts:  # no row that all sums share
+        all_rows = np.matmul(
+            windows[: n + starts - 1].transpose(0, 2, 1), windows[lag : n + starts - 1 + lag]
+        )
+        up_to = np.add.accumulate(np.pad(all_rows.astype(np.float64), ((1, 0), (0, 0), (0, 0))), axis=0)
+        return np.asarray(up_to[n:] - up_to[:-n])
+    inner = windows[starts - 1 : n].reshape(-1, side)
+    shared = inner.T @ windows[starts - 1 + lag : n + lag].reshape(-1, side)
+    tops = np.matmul(windows[: starts - 1].transpose(0, 2, 1), windows[lag : starts - 1 + lag])
+    ends = np.matmul(windows[n : n + starts - 1].transpose(0, 2, 1), windows[n + lag : n + lag + starts - 1])
+    sums = np.empty((starts, side, side))
+    sums[:] = shared
+    # From the first row of a sum on, down to the rows that all sums share; and beyond those.
+    sums[:-1] += np.add.accumulate(tops[::-1].astype(np.float64), axis=0)[::-1]
+    sums[1:] += np.add.accumulate(ends.astype(np.float64), axis=0)
+    return sums
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scaled:
+    """A patch with its mean taken off and its 1 to 99 percent range scaled to 1."""
+
+    y: Image
+    noise: float
+
+    @classmethod
+    def of(cls, patch: Plane, model: NoiseModel) -> _Scaled:
+        values = patch.astype(np.float64)
+        low, high = np.quantile(values, (0.01, 0.99))
+        span = max(float(high - low), 1e-9)
+        return cls((values - values.mean()) / span, model.sigma_at(float(values.mean())) / span)
+
+    def at(self, level: int) -> _Scaled:
+        shape = level_shape(self.y.shape, level)
+        if shape == self.y.shape:
+            return self
+        return _Scaled(resized_image(self.y, shape), self.noise * noise_gain(self.y.shape, shape))
+
+
+@dataclass(frozen=True, slots=True)
+class PatchRecurrence:
+    """Kernel for which undoing the blur makes patches recur across scales.
+
+    min over x, k of |y - k * x|² + lambda1 rho(x, x^a) + lambda2 |k|²: alternating the match of
+    patches, a Wiener-like image step and a least-squares kernel step, coarse to fine. All patches
+    of a set share k: their normal equations are summed with weights 1/noise².
+
+    Parameters
+    ----------
+    levels : int
+        Levels of the pyramid, each 4/3 smaller.
+    iterations : int
+        Alternations on each level.
+    beta : float
+        Weight of the matched image in the image step; too large makes kernels too wide.
+    bandwidth : float
+        h of the match, in ranges of the patch; at least twice the noise.
+    ridge : float
+        lambda2 over the mean diagonal of the normal matrix.
+    support : int or None
+        Odd side of the estimated kernel; None takes it from `size`.
+    """
+
+    levels: int = 6
+    iterations: int = 4
+    beta: float = 0.2
+    bandwidth: float = 0.03
+    ridge: float = 2.5e-2
+    support: int | None = None
+
+    name = "michaeli-irani"
+    version = 1
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `PsfEstimator`."""
+        return self._run(patches, noise, size, None, self.levels, on_step)
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel: the finest level alone, from the reference kernel on."""
+        return self._run(patches, noise, size, reference.kernel, 1, on_step)
+
+    def _run(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        size: int,
+        start: Kernel | None,
+        levels: int,
+        on_step: StepHook,
+    ) -> PsfEstimate:
+        kept = usable(patches, noise, size)
+        scaled = [_Scaled.of(patch, model) for patch, model in kept]
+        widest = self.support or size
+        while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
+            levels -= 1
+        kernel, latent = start, [view.y for view in (s.at(levels - 1) for s in scaled)]
+        total, done = levels * self.iterations, 0
+        state: _Equations | None = None
+        for level in reversed(range(levels)):
+            side = max(5, _odd(widest / ALPHA**level))
+            views = [s.at(level) for s in scaled]
+            kernel = _start(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
+            latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
+            for _ in range(self.iterations):
+                state = self._step(views, latent, kernel, side)
+                kernel = state.kernel
+                done += 1
+                on_step(done, total)
+        if state is None:
+            raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
+        apart = self._disagreement(state, views, latent)
+        error = _ERROR["at_agreement"] + _ERROR["by_disagreement"] * apart
+        report = {"support": float(widest), "levels": float(levels), "disagreement": apart}
+        return finished(state.kernel, size=size, error=error, diagnostics=report)
+
+    def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> _Equations:
+        parts, responses = [], []
+        for i, view in enumerate(views):
+            z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise))
+            latent[i], response = blend(view.y, kernel, z, self.beta)
+            parts.append(normal_equations(latent[i], view.y, side, view.noise, response))
+            responses.append(response)
+        return _Equations(self._solved(parts, views, np.asarray(resized(kernel, side))), responses)
+
+    def _solved(self, parts: Sequence[Part], views: Sequence[_Scaled], begin: NDArray[np.float64]) -> Kernel:
+        """Kernel of the normal equations of all patches together."""
+        votes = [1.0 / max(view.noise**2, 1e-6) for view in views]
+        a = np.asarray(sum(vote * part[0] for vote, part in zip(votes, parts, strict=True)))
+        b = np.asarray(sum(vote * part[1] for vote, part in zip(votes, parts, strict=True)))
+        ridge = self.ridge * np.trace(a) / a.shape[0]
+        a[np.diag_indices_from(a)] += ridge
+        taken = sum(vote * part[2] for vote, part in zip(votes, parts, strict=True))
+        solved = nonnegative_least_squares(a, b, begin.ravel(), smallest=ridge - taken)
+        solved[solved < 0.01 * solved.max()] = 0.0
+        if not solved.max() > 0:
+            raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
+        return as_kernel(solved.reshape(begin.shape))
+
+    def _disagreement(self, state: _Equations, views: Sequence[_Scaled], latent: Sequence[Image]) -> float:
+        """Relative L2 distance of the kernels that the left and the right halves of the patches give alone.
+
+        1 where the halves are too narrow for a kernel.
+        """
+        begin, halves = np.asarray(state.kernel), []
+        if latent[0].shape[1] // 2 < 2 * (_BORDER + begin.shape[0] // 2) + begin.shape[0]:
+            return 1.0
+        middle = latent[0].shape[1] // 2
+        for half in (slice(None, middle), slice(middle, None)):
+            parts = [
+                normal_equations(x[:, half], view.y[:, half], begin.shape[0], view.noise, response)
+                for x, view, response in zip(latent, views, state.responses, strict=True)
+            ]
+            try:
+                halves.append(centred(self._solved(parts, views, begin)))
+            except NotEnoughEvidenceError:
+                return 1.0
+        return min(distance(*halves).rel_l2, 1.0)
+
+
+Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], float]
+"""Normal equations of one patch: A, b, and the most by which an eigenvalue of A can be below zero."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    kernel: Kernel
+    responses: list[NDArray[np.float64]]
+
+
+def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]) -> Part:
+    """Normal equations of y = k * x over the interior, the noise that x took from y taken off.
+
+    With h the filter by which y entered x, s the noise of y and N interior pixels::
+
+        A(u, v) = sum_p x(p - u) x(p - v) - N s² sum_i h(i) h(i + u - v)
+        b(u)    = sum_p y(p) x(p - u)     - N s² h(-u)
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (H, W)
+        Latent and observed, zero mean.
+    side : int
+        Odd side of the kernel.
+    noise : float
+        s.
+    response : ndarray, shape (n, n)
+        h, origin at [0, 0], n at least 2 side.
+
+    Returns
+    -------
+    A : ndarray, shape (side², side²)
+    b : ndarray, shape (side²,)
+    taken : float
+        The largest eigenvalue of what was taken off A is no larger: N s² max |H|², as of a circulant matrix.
+    """
+    half = side // 2
+    margin = _BORDER
+    inner = x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
+    reach = margin + half
+    target = y[reach : y.shape[0] - reach, reach : y.shape[1] - reach]
+    n = target.size
+    gram, cross = window_products(inner, target, side)
+    a, b = gram[::-1, ::-1].copy(), cross[::-1].copy()
+    power = np.abs(fft.rfft2(response)) ** 2
+    acf = n * noise**2 * fft.irfft2(power, s=response.shape)
+    lags = np.arange(1 - side, side)
+    # [i, j, k, l] is acf(i - k, j - l): windows of all lags, the second offset counted backwards
+    apart = sliding_window_view(acf[np.ix_(lags, lags)], (side, side))[:, :, ::-1, ::-1]
+    a.reshape((side,) * 4)[...] -= apart
+    offsets = half - np.arange(side)
+    b -= n * noise**2 * response[np.ix_(offsets, offsets)].ravel()
+    return a, b, n * noise**2 * float(power.max())
+
+
+def _odd(value: float) -> int:
+    return 2 * round((value - 1) / 2) + 1
+
+
+def _start(kernel: Kernel | None, side: int) -> Kernel:
+    if kernel is None:
+        delta = np.zeros((side, side))
+        delta[side // 2, side // 2] = 1.0
+        return as_kernel(delta)
+    return resized(kernel, side)
+
+
+def _upscaled(kernel: Kernel | None, side: int) -> Kernel:
+    """Stretch a kernel to the next finer level."""
+    if kernel is None:
+        return _start(None, side)
+    grown = round(kernel.shape[0] * ALPHA)
+    fine = np.maximum(resized_image(np.asarray(kernel), (grown + 1 - grown % 2,) * 2), 0.0)
+    return resized(as_kernel(fine), side)

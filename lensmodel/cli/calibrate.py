@@ -1,0 +1,308 @@
+"""`lensmodel calibrate`: learn the blur of one lens from photos, here or on a cluster, into a profile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from lensmodel.blind import estimators
+from lensmodel.cli import files
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import (
+    AnyLens,
+    Aperture,
+    Json,
+    Photos,
+    Profile,
+    Quiet,
+    Verbose,
+    Workers,
+    choice,
+)
+from lensmodel.core import processes
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import ZONE_WORDS, LensSettings
+from lensmodel.model import LensProfile, save_profile
+from lensmodel.patches import selectors
+from lensmodel.photo.endings import ENDINGS
+from lensmodel.workflow import calibrating, sampling
+from lensmodel.workflow.calibrating import AHEAD
+from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.sampling import WAYS, way_of
+
+Estimator = Annotated[str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}.")]
+Selector = Annotated[
+    str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
+]
+
+
+def calibrate(
+    context: typer.Context,
+    photos: Photos,
+    profile: Profile,
+    aperture: Aperture = None,
+    model: Annotated[
+        str | None,
+        choice(
+            "--model",
+            tuple(WAYS),
+            "paper: learn the paper's own way, kernels by Michaeli and Irani and nothing but their "
+            "regression, and correct by Richardson-Lucy; to compare with. Kept from then on.",
+        ),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}; default: that of the model."
+        ),
+    ] = None,
+    kernel_size: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PIXELS",
+            help="Side of the kernels, an odd number from 3 to 55; default: 31, with --model paper 55.",
+        ),
+    ] = None,
+    selector: Selector = "r-map",
+    workers: Workers = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Address of a Dask cluster that estimates the photos."),
+    ] = None,
+    any_lens: AnyLens = False,
+    force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
+    json_output: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Learn the blur of one lens from photos, into a profile.
+
+    An existing profile is added to. Photos that it has seen are skipped, and it is saved after
+    each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
+    beside a RAW file of the same name are passed over, and so are corrected photos. --scheduler lets
+    a Dask cluster do the work; give its address, such as tcp://10.0.0.1:8786.
+
+    Examples:
+
+        lensmodel calibrate holiday --profile my-24mm.lensprofile
+
+        lensmodel calibrate 'holiday/*.dng' one-more.dng --profile my-24mm.lensprofile --workers 1
+
+        lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
+
+    Exit status: 0 all photos counted, 1 some did not, 2 called wrongly.
+    """
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    run(
+        photos,
+        profile,
+        CalibrationOptions(
+            aperture,
+            estimator,
+            workers,
+            any_lens=any_lens,
+            force=force,
+            model=model,
+            kernel_size=kernel_size,
+            scheduler=scheduler,
+            selector=selector,
+        ),
+        shown,
+        as_json=json_output,
+    )
+
+
+_ZIP: Final = b"PK"
+"""First bytes of a profile, damaged or not: the signature of a ZIP file."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """The options of the command."""
+
+    aperture: float | None
+    estimator: str | None
+    workers: int | None
+    any_lens: bool
+    force: bool
+    scheduler: str | None = None
+    selector: str = "r-map"
+    model: str | None = None
+    kernel_size: int | None = None
+
+
+def run(
+    names: Sequence[str], target: Path, options: CalibrationOptions, display: Display, *, as_json: bool
+) -> None:
+    """Add photos to a profile, one after the other, and save it after each."""
+    paths = files.photos(names)
+    _refuse(target, paths)
+    with files.as_usage():
+        _recipe(options).check()
+    results: list[dict[str, Any]] = []
+    with display.progress() as bars:
+        task = bars.add_task("", total=len(paths))
+
+        def on_event(event: sampling.CalibrationEvent) -> None:
+            share = event.done / event.total if event.total else 0.0
+            bars.update(
+                task, description=f"{event.photo.name}: {event.stage}", completed=len(results) + share
+            )
+
+        with (
+            executor_of(options.scheduler) as (executor, ahead),
+            processes.pool(None, options.workers) as pool,
+        ):
+            calibration = calibration_of(target, options, pool)
+            for verdict in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
+                result = _result(verdict, display)
+                results.append({"photo": str(verdict.photo), **result})
+                bars.update(task, completed=len(results))
+    lens = calibration.known
+    coverage = {} if lens is None else lens.model.coverage()
+    summary = {
+        "profile": str(target) if lens else None,
+        "photos": len(lens.profile.photos) if lens else 0,
+        "samples": len(lens.samples) if lens else 0,
+        "coverage": coverage,
+        "model": way_of(lens.model).name if lens else None,
+        "results": results,
+    }
+    if as_json:
+        display.document(summary)
+    elif lens is not None and any(result["state"] != "failed" for result in results):
+        cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
+        display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
+    if lens is None:
+        display.error(
+            "no photo could be used, so there is no profile; the lines above say what each photo needs"
+        )
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def calibration_of(target: Path, options: CalibrationOptions, pool: Executor) -> calibrating.Calibration:
+    """Return the work on a profile, which may be there already, by the processes of a pool."""
+    keeper = ProfileFile(target, options)
+    return calibrating.Calibration(keeper, _recipe(options), any_lens=options.any_lens, pool=pool)
+
+
+def _recipe(options: CalibrationOptions) -> sampling.Recipe:
+    return sampling.Recipe(
+        LensSettings(aperture=options.aperture),
+        model=options.model,
+        estimator=options.estimator,
+        kernel_size=options.kernel_size,
+        selector=options.selector,
+    )
+
+
+def _result(verdict: calibrating.PhotoVerdict, display: Display) -> dict[str, Any]:
+    """Say what became of a photo, at once and in the document."""
+    if verdict.error is not None:
+        result = files.failed(verdict.error)
+        display.error(f"{verdict.photo}: {result['reason']}")
+        return result
+    if verdict.samples is None:
+        display.note(f"{verdict.photo}: the profile has it already")
+        return {"state": "known"}
+    return {"state": "counted", "samples": verdict.samples}
+
+
+def _refuse(target: Path, photos: Sequence[Path]) -> None:
+    """Refuse to replace a folder or a photo."""
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; give the file of a lens profile")
+    # a shell expands `--profile holiday/*.dng` to a profile and photos
+    if target.suffix.lower() in ENDINGS or any(files.same(target, path) for path in photos):
+        raise UsageError(
+            f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
+        )
+
+
+class ProfileFile:
+    """The keeper of a lens in a file.
+
+    Another run may add to the same file meanwhile: the profile is read again whenever the file has
+    changed, so that no run drops what another one learned.
+    """
+
+    def __init__(self, target: Path, options: CalibrationOptions) -> None:
+        self._target, self._options = target, options
+        self._lens: Lens | None = None
+        self._stamp_read = _stamp(target) if options.force else None
+
+    def lens(self) -> Lens | None:
+        """Return the lens, read anew if another run changed the file."""
+        stamp = _stamp(self._target)
+        if stamp not in {None, self._stamp_read}:
+            profile = _opened(self._target)
+            learned, asked = way_of(profile.model).name, self._options.model
+            if asked not in {None, learned}:  # its kernels are the other model's: the two would be mixed
+                raise InvalidInputError(
+                    f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "
+                    "after --profile and give its photos again, or replace the file with --force"
+                )
+            self._lens, self._stamp_read = Lens(profile), stamp
+        return self._lens
+
+    def keep(self, lens: Lens) -> None:
+        """Save the lens."""
+        self._target.parent.mkdir(parents=True, exist_ok=True)
+        save_profile(self._target, lens.profile)
+        self._lens, self._stamp_read = lens, _stamp(self._target)
+
+
+def _opened(target: Path) -> LensProfile:
+    try:
+        return files.profile_at(target)
+    except InvalidInputError as error:
+        with target.open("rb") as file:
+            damaged = file.read(len(_ZIP)) == _ZIP
+        remedy = "--force replaces the file" if damaged else "name a new file after --profile"
+        raise InvalidInputError(f"{error}; {remedy}") from error
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return inode, size and time of a file, which change when it is replaced; None without file."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+CONNECT_S = 10.0
+"""Seconds to reach the scheduler of a cluster (chosen): one in the same network answers at once."""
+
+
+@contextmanager
+def executor_of(scheduler: str | None) -> Iterator[tuple[Executor | None, int]]:
+    """Give the executor of a cluster, and how many photos to send ahead; None without a cluster.
+
+    Only the bytes of photos and the samples travel: the machines need lensmodel, and none of the files.
+    """
+    if scheduler is None:
+        yield None, AHEAD
+        return
+    try:
+        dask: Any = import_module("distributed")  # an extra, loaded only where it is asked for
+    except ImportError as error:
+        raise UsageError("--scheduler needs Dask: pip install 'lensmodel[cluster]'") from error
+    try:
+        client = dask.Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--scheduler {scheduler}: no cluster answers there ({error})") from error
+    with client, client.get_executor(pure=False) as executor:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise UsageError(f"--scheduler {scheduler}: it has no workers; start some by `dask worker`")
+        yield executor, 2 * threads

@@ -1,0 +1,285 @@
+"""What a command says: results on standard output, all else on standard error.
+
+Progress as bars and as plain lines, and when a time left can be told.
+
+Tables of plain text: columns in line in a terminal, words that `grep` and `awk` find in a pipe.
+
+Words that command line, pages and reports share.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.text import Text
+
+from lensmodel.core.codec import to_json
+
+REMARKS = "lensmodel.remarks"
+"""Logs what was left out of a photo or replaced in it."""
+
+COMPILING = "lensmodel.correction.engine.first_use"
+"""Logs when loops are compiled, once on a machine."""
+
+
+class _Lines(logging.Formatter):
+    """What is told of a photo reads as all that a command tells."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        return f"lensmodel: {record.getMessage()}" if record.name == REMARKS else super().format(record)
+
+
+@dataclass(frozen=True, slots=True)
+class Display:
+    """How much is said.
+
+    Parameters
+    ----------
+    quiet : bool
+        Only errors; and results where they were asked for as JSON.
+    verbose : int
+        0 warnings, 1 what happens, 2 all that is logged.
+    """
+
+    quiet: bool = False
+    verbose: int = 0
+
+    @classmethod
+    def of(cls, context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Display:
+        """Return the display of a subcommand, whose options add to those of the program."""
+        base = context.find_object(Display) or Display()
+        display = Display(base.quiet or quiet, max(base.verbose, verbose))
+        display.configure()
+        return display
+
+    def configure(self) -> None:
+        """Let the log lines of this process through to standard error."""
+        level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(self.verbose, 2)]
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(_Lines("%(levelname)s %(name)s: %(message)s"))
+        logging.basicConfig(level=logging.ERROR if self.quiet else level, handlers=[handler], force=True)
+        if not self.quiet and sys.stderr.isatty():  # so long a silence looks like a fault
+            logging.getLogger(COMPILING).setLevel(logging.INFO)
+
+    def result(self, text: str) -> None:
+        """Print what was asked for."""
+        if not self.quiet:
+            typer.echo(text)
+
+    def document(self, value: Any) -> None:  # noqa: ANN401 - any value that the codec knows
+        """Print a result as JSON, the only thing on standard output."""
+        typer.echo(json.dumps(to_json(value), indent=2))
+
+    def note(self, text: str) -> None:
+        """Tell what a person may want to know."""
+        if not self.quiet:
+            self.error(text)
+
+    def detail(self, text: str) -> None:
+        """Tell what only who asks for more with -v wants to know."""
+        if self.verbose and not self.quiet:
+            self.error(text)
+
+    def progress_line(self, text: str, seconds: float, left: float | None = None) -> None:
+        """Tell a step of long work, with the time since its start and the time left, on standard error."""
+        if not self.quiet:
+            ahead = "" if left is None else f", ETA {clock(left)}"
+            typer.echo(f"[{clock(seconds):>5}{ahead}] {text}", err=True)
+
+    def error(self, text: str) -> None:
+        """Tell what went wrong."""
+        typer.echo(f"lensmodel: {text}", err=True)
+
+    @contextmanager
+    def progress(self) -> Iterator[Progress]:
+        """Bars with counts and the time left; plain lines now and then where no terminal can show them."""
+        if not self.quiet and not sys.stderr.isatty():
+            with ProgressLines() as lines:
+                yield lines
+            return
+        bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeLeft(),
+            console=Console(file=sys.stderr),
+            disable=self.quiet,
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
+        )
+        with bars:
+            yield bars
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[None]:
+        """Show that something goes on whose end cannot be foretold, with the time since its start."""
+        bars = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            console=Console(file=sys.stderr),
+            disable=self.quiet or not sys.stderr.isatty(),
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        with bars:
+            bars.add_task(text, total=None)
+            yield
+
+
+EVERY_S: Final = 10.0
+"""At most one line in so many seconds (chosen): a night's log stays readable, and quick commands silent."""
+
+SURE_AFTER_S: Final = 4.0  # of work (chosen): before, what is read and compiled once hides the pace
+AGREE: Final = 2.0
+"""Ratio of the paces of the earlier and the later half of the time from which on nothing is told: one of them
+is wrong by as much."""
+
+LEAST_SHARE, LEAST_COUNT = 0.05, 3.0
+"""Of a task, whichever comes first, before its pace is believed (chosen): of one photo what comes before its
+tiles, of many the first ones."""
+
+_MARKS: Final = 512  # of a task's past (chosen): enough to halve any time
+
+
+class Pace:
+    """What the past of a task tells of its time left."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._done: list[float] = []
+        self._total: float | None = None
+
+    def mark(self, now: float, done: float, total: float | None) -> None:
+        """Take note of how far a task is; a new count begins where it falls, or its total changes."""
+        if self._done and (done < self._done[-1] or total != self._total):
+            self._times.clear()
+            self._done.clear()
+        self._total = total
+        if self._done and done == self._done[-1]:
+            return
+        self._times.append(now)
+        self._done.append(done)
+        if len(self._times) > _MARKS:
+            del self._times[1:-1:2], self._done[1:-1:2]
+
+    def left(self, now: float) -> float | None:
+        """Seconds left; None before both halves of the time agree on the pace within a factor of two."""
+        if not self._total or not self._times or now - self._times[0] < SURE_AFTER_S:
+            return None
+        start, end, first, last = self._times[0], self._times[-1], self._done[0], self._done[-1]
+        middle = self._done[bisect_right(self._times, (start + end) / 2.0) - 1]
+        earlier, later = middle - first, last - middle
+        if last < min(LEAST_SHARE * self._total, LEAST_COUNT) or min(earlier, later) <= 0.0:
+            return None
+        if max(earlier, later) > AGREE * min(earlier, later):
+            return None
+        return max((end - start) * (self._total - last) / (last - first) - (now - end), 0.0)
+
+
+class TimeLeft(ProgressColumn):
+    """Column of a bar: the time left, once it can be told."""
+
+    max_refresh = 0.5
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._paces: dict[TaskID, Pace] = {}
+
+    def render(self, task: Task) -> Text:
+        """Return the text of a task."""
+        pace, now = self._paces.setdefault(task.id, Pace()), task.get_time()
+        pace.mark(now, task.completed, task.total)
+        left = pace.left(now)
+        return Text("" if left is None else f"ETA {clock(left)}")
+
+
+class ProgressLines(Progress):
+    """Stands in for bars: keeps count of tasks as they do, and prints a line now and then."""
+
+    def __init__(self, say: Callable[[str], None] | None = None, *, every_s: float = EVERY_S) -> None:
+        super().__init__(disable=True)
+        self._say = say or _to_standard_error
+        self._every_s = every_s
+        self._began = self._last = time.monotonic()
+        self._paces: dict[TaskID, Pace] = {}
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:  # noqa: ANN401 - as there
+        """Change a task as `Progress.update` does; tell it if it is time."""
+        super().update(task_id, **changes)
+        now, task = time.monotonic(), self._tasks[task_id]
+        pace = self._paces.setdefault(task_id, Pace())
+        pace.mark(now, task.completed, task.total)
+        if now - self._last >= self._every_s:
+            self._last = now
+            self._say(line(task, now - self._began, pace.left(now)))
+
+
+def line(task: Task, seconds: float, left: float | None) -> str:
+    """Say how far a task is: time since the start, share, what is in work, time left if it can be told."""
+    done = f" {task.percentage:3.0f} %" if task.total else ""
+    ahead = "" if left is None else f", about {clock(left)} left"
+    return f"[{clock(seconds)}]{done} {task.description or 'working'}{ahead}"
+
+
+def clock(seconds: float) -> str:
+    """Write a time as 4:07, or 1:04:07 from an hour on."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _to_standard_error(text: str) -> None:
+    typer.echo(text, err=True)
+
+
+def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Container[int] = ()) -> str:
+    """Write rows under a head, columns two blanks apart; those in `numbers` are set to the right."""
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    lines = [head, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if i in numbers else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+NYQUIST: Final = 0.5
+"""Cycles/pixel: the Nyquist frequency, the finest detail that a grid of pixels can hold."""
+
+
+def mtf50_words(frequency: float) -> str:
+    """Write an MTF50 in cycles/pixel: a lower bound where contrast has not halved at the pixels' limit."""
+    return f"at least {NYQUIST:g}" if frequency >= NYQUIST else f"{frequency:.3f}"
+
+
+def gain_words(gain: float | None) -> str:
+    """Say what gain is expected, in decibels; None is not known."""
+    if gain is None:
+        return "not known"
+    return f"{gain:+.1f} dB" if abs(gain) >= 0.05 else "no change"

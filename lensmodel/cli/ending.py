@@ -1,0 +1,112 @@
+"""How a command ends when it cannot do what was asked.
+
+Ctrl-C and SIGTERM end a command at once and leave nothing half done.
+
+The signal becomes an exception in the main thread, so that each `with` and `finally` on the way
+removes what is unfinished. Worker processes are killed first: pools wait for what they began.
+
+Which extra of the package brings a module that is missing.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from types import FrameType
+from typing import Final
+
+from lensmodel.core.errors import InvalidInputError
+
+
+class UsageError(InvalidInputError):
+    """The command was called wrongly: nothing was begun; exit status 2."""
+
+
+class InterruptedByUser(BaseException):
+    """Ctrl-C or SIGTERM. Carries the number of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_PATIENCE_S: Final = 10.0
+"""Cleaning up takes far less; after this the process ends all the same."""
+
+
+def workers_ignore_it() -> None:
+    """In a worker process, leave Ctrl-C to the process of the command, which ends its workers."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def install() -> None:
+    """Handle the signals in the process of the command."""
+    for number in _SIGNALS:
+        signal.signal(number, _stop)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    del frame
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)  # cleaning up is not to be interrupted
+    threading.Thread(target=_end_workers, args=(number,), daemon=True).start()
+    raise InterruptedByUser(number)
+
+
+def _end_workers(number: int) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < end:
+        for child in multiprocessing.active_children():
+            child.kill()
+        time.sleep(0.05)
+    os._exit(128 + number)
+
+
+EXTRAS: Final = {
+    "service": (
+        "alembic",
+        "dbos",
+        "fastapi",
+        "httpx2",
+        "jinja2",
+        "obstore",
+        "prometheus_client",
+        "pydantic",
+        "pydantic_settings",
+        "python_multipart",
+        "sqlalchemy",
+        "sse_starlette",
+        "starlette",
+        "structlog",
+        "uvicorn",
+    ),
+    "report": ("matplotlib",),
+}
+"""Modules by extra, as far as commands import them."""
+
+_WHAT: Final = {
+    "service": "the service",
+    "report": "drawing",
+}
+
+
+def remedy(missing: ModuleNotFoundError) -> str | None:
+    """Say what to install for a missing module; None where no extra brings it."""
+    name = missing.name or ""
+    if name.partition(".")[0] in {"app", "lab"}:
+        return "this command is no part of the package: it runs in the source tree" + (
+            " or in the container image" if name.partition(".")[0] == "app" else ""
+        )
+    top = name.partition(".")[0]
+    for extra, modules in EXTRAS.items():
+        if top in modules:
+            return (
+                f"this command needs {_WHAT[extra]}, which is not installed ({top} is missing): "
+                f"pip install 'lensmodel[{extra}]'"
+            )
+    return None

@@ -1,0 +1,111 @@
+"""From the words of a command line to photos and profiles."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from lensmodel.cli.ending import UsageError
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.model import LensProfile, load_profile
+from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS
+
+_PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
+"""What phones add to the names of the files of one shot."""
+
+
+def photos(names: Iterable[str]) -> list[Path]:
+    """Turn files, folders and patterns into a list of photos without repeats.
+
+    Of one shot the RAW file counts, and no other picture of it. Of folders and patterns, corrected photos are
+    left out.
+    """
+    unique: dict[Path, None] = {}
+    for name in names:
+        path = Path(name).expanduser()
+        if path.is_dir():
+            inside = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+            matches = _originals(inside)
+            if not matches:
+                raise UsageError(
+                    f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
+                )
+        elif path.is_file():
+            matches = [path]
+        else:
+            matches = _originals(Path(p) for p in glob.glob(_pattern(path), recursive=True))  # noqa: PTH207 - absolute patterns too
+            if not matches:
+                raise UsageError(f"no photo called {name}; check the name and the folder")
+        unique.update(dict.fromkeys(matches))
+    raw = {_shot(p) for p in unique if p.suffix.lower() in RAW_ENDINGS}
+    return [p for p in unique if p.suffix.lower() in RAW_ENDINGS or _shot(p) not in raw]
+
+
+def _originals(paths: Iterable[Path]) -> list[Path]:
+    return sorted(p for p in paths if p.is_file() and not p.stem.endswith(CORRECTED))
+
+
+def _pattern(path: Path) -> str:
+    """Take the part of a pattern that is there, such as a folder "[2024] trip", by its letters."""
+    there = next(parent for parent in (path, *path.parents) if parent.is_dir() or parent == parent.parent)
+    rest = path.relative_to(there)
+    return str(Path(glob.escape(str(there))) / rest)
+
+
+def _shot(path: Path) -> tuple[Path, str]:
+    """Name the shot of a file: IMG_1.DNG and img_1.jpg, x.RAW-02.ORIGINAL.dng and x.RAW-01.COVER.jpg."""
+    stem = path.stem
+    if Path(stem).suffix.lower() in RAW_ENDINGS:  # IMG_1.CR2.jpg
+        stem = Path(stem).stem
+    return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
+
+
+def same(first: Path, second: Path) -> bool:
+    """Tell whether two names are of one file."""
+    return first.exists() and second.exists() and first.samefile(second)
+
+
+def profile_at(path: Path) -> LensProfile:
+    """Open a profile."""
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; give the file of a lens profile")
+    if not path.exists():
+        raise UsageError(
+            f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
+        )
+    return load_profile(path)
+
+
+def refuse_existing(*paths: Path | None, force: bool) -> None:
+    """Make sure, before any work, that nothing is replaced that the user did not give up."""
+    for path in paths:
+        if path is not None and not force and path.exists():
+            raise UsageError(f"{path} is there already; --force replaces it")
+
+
+@contextmanager
+def as_usage() -> Iterator[None]:
+    """Turn a refused value into wrong usage: nothing was begun."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise UsageError(str(error)) from error
+
+
+def reason(error: Exception) -> str:
+    """Say why a file could not be used; the system's errors in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return (
+            f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the file, its folder and their rights"
+        )
+    return str(error)
+
+
+def failed(error: LensModelError | OSError) -> dict[str, Any]:
+    """Say in a command's document that a photo could not be used, and why."""
+    code = error.code if isinstance(error, LensModelError) else "unreadable"
+    return {"state": "failed", "code": code, "reason": reason(error)}

@@ -1,0 +1,220 @@
+"""`lensmodel measure` and `lensmodel target`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from lensmodel.cli import files
+from lensmodel.cli.console import Display
+from lensmodel.cli.ending import UsageError
+from lensmodel.cli.options import (
+    AnyLens,
+    Aperture,
+    Force,
+    Json,
+    Photos,
+    Profile,
+    Quiet,
+    Verbose,
+    choice,
+)
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.types import LensSettings
+from lensmodel.model import save_profile
+from lensmodel.photo import PhotoInfo, develop
+from lensmodel.photo.endings import ENDINGS
+from lensmodel.workflow import measuring, sampling
+from lensmodel.workflow.calibrating import Identity, difference, grown, joined
+from lensmodel.workflow.lens import Lens
+
+KINDS: Final = ("target", "pair", "points", "edges")
+PAPERS: Final = ("a2", "a3", "a4")
+USUAL_DETAIL: Final = 4000
+"""Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementOptions:
+    """The options of the command."""
+
+    kind: str
+    aperture: float | None
+    size: int
+    replace: bool
+    any_lens: bool
+
+
+def measure(
+    context: typer.Context,
+    kind: Annotated[
+        str,
+        typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show."),
+    ],
+    photos: Photos,
+    profile: Profile,
+    aperture: Aperture = None,
+    size: Annotated[
+        int, typer.Option(min=9, max=101, metavar="N", help="Side of a PSF in pixels, an odd number.")
+    ] = 31,
+    replace_blind: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Drop what was learned blindly at the same aperture and focal length."
+        ),
+    ] = False,
+    any_lens: AnyLens = False,
+    json_output: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Measure the blur of a lens from photos made for the purpose, into a profile.
+
+    An existing profile is added to: measured samples stand beside the blind ones and count for more.
+
+    - target: the page that `lensmodel target` prints, photographed flat, nearly filling the frame.
+
+    - pair: one scene from a tripod, wide open and at about f/8. Photos are given in pairs.
+
+    - points: stars, or pinholes in front of a lamp; not saturated.
+
+    - edges: an ISO 12233 chart or a checkerboard tilted by 5 degrees.
+
+    Examples:
+
+        lensmodel measure target page.dng --profile my-24mm.lensprofile
+
+        lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
+
+    Exit status: 0 all photos were used, 1 some were not, 2 called wrongly.
+    """
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    if kind not in KINDS:
+        raise UsageError(f"measure one of {', '.join(KINDS)}, not {kind!r}")
+    if size % 2 == 0:
+        raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
+    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens)
+    _run(photos, profile, options, shown, as_json=json_output)
+
+
+def _run(
+    names: list[str], target: Path, options: MeasurementOptions, shown: Display, *, as_json: bool
+) -> None:
+    paths = files.photos(names)
+    if target.is_dir() or target.suffix.lower() in ENDINGS:
+        raise UsageError(f"{target} is no lens profile; name one, for example my-24mm.lensprofile")
+    with files.as_usage():
+        groups = measuring.measurements_of(options.kind, paths)
+    results: list[dict[str, Any]] = []
+    with shown.progress() as bars:
+        task = bars.add_task("", total=len(groups))
+        for number, group in enumerate(groups):
+
+            def on_step(done: int, total: int, number: int = number, name: str = group[0].name) -> None:
+                bars.update(task, description=f"{name}: measuring", completed=number + done / total)
+
+            try:
+                result = _add(group, target, options, on_step)
+            except (LensModelError, OSError) as error:
+                result = {"state": "failed", "reason": files.reason(error)}
+                shown.error(f"{group[0]}: {result['reason']}")
+            results.append({"photos": [str(path) for path in group], **result})
+            bars.update(task, completed=number + 1)
+    if as_json:
+        shown.document({"profile": str(target) if target.exists() else None, "results": results})
+    for result in results:
+        if result["state"] == "measured" and not as_json:
+            shown.result(
+                f"{target}: {result['places']} places measured on {Path(result['photos'][0]).name} "
+                f"({result['estimator']}), usual error {result['error']:.2f}"
+            )
+        elif result["state"] == "known":
+            shown.note(f"{result['photos'][0]}: the profile has it already")
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Measure on the photos of one measurement and save the profile; say what became of it."""
+    path, key = group[0], sampling.photo_id(group[0])
+    known = Lens.load(target) if target.exists() else None
+    if known is not None and key in known.profile.photos:
+        return {"state": "known"}
+
+    def admit(info: PhotoInfo) -> None:
+        why = None
+        if known is not None and not options.any_lens:
+            why = difference(known.profile.lens, known.profile.cameras, Identity.of(info.metadata))
+        if why is not None:
+            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
+
+    photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
+    identity = Identity.of(photos[0].info.metadata)
+    samples = measuring.samples_of_developed(
+        options.kind,
+        photos,
+        photo_id=key,
+        settings=LensSettings(aperture=options.aperture),
+        size=options.size,
+        on_step=on_step,
+    )
+    if target.exists():  # another run may have added to it meanwhile
+        known = Lens.load(target)
+    model = joined(None if known is None else known.model, samples, replace=options.replace)
+    profile = grown(known, model, {key: path.name}, [identity], any_lens=options.any_lens).profile
+    left = {sample.photo for sample in model.samples}  # `--replace` may have taken all of a photo
+    profile = replace(profile, photos={name: label for name, label in profile.photos.items() if name in left})
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save_profile(target, profile)
+    green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
+    return {
+        "state": "measured",
+        "places": len({(s.position.r, s.position.phi) for s in samples}),
+        "samples": len(samples),
+        "estimator": samples[0].estimator,
+        "error": green[len(green) // 2],
+    }
+
+
+def target(
+    context: typer.Context,
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf or .png.")],
+    paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")] = "a3",
+    detail: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help="Samples along the long side: 1000, 1400, 2000, 2800, 4000 or 5600. Choose the one nearest "
+            "to the number of pixels that the page will span in the photo.",
+        ),
+    ] = USUAL_DETAIL,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Write the page to print for `lensmodel measure target`.
+
+    Print it at full size on matte paper, in grey, without sharpening; fix it flat.
+
+    Examples:
+
+        lensmodel target target.pdf
+
+        lensmodel target target.png --paper a4 --detail 2800
+
+    Exit status: 0 written, 1 failed, 2 called wrongly.
+    """
+    from lensmodel.measured import DETAILS, TargetPage, print_target  # noqa: PLC0415 - see `_run`
+
+    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    if detail not in DETAILS:
+        raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
+    if output.is_dir():
+        raise UsageError(f"{output} is a folder; name a file ending in .pdf or .png")
+    files.refuse_existing(output, force=force)
+    with files.as_usage():
+        print_target(output, TargetPage(detail), paper=paper)
+    shown.result(str(output))

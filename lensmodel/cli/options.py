@@ -1,0 +1,97 @@
+"""Options that several commands share, with one wording each."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+
+from lensmodel.cli.ending import UsageError
+from lensmodel.core import types
+
+
+def choice(name: str, kinds: Iterable[str], words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
+    """Return the option that takes one of some words; a refusal names the one that was probably meant."""
+    known = list(kinds)
+
+    def parsed(text: str) -> str:
+        if text in known:
+            return text
+        near = difflib.get_close_matches(text, known, n=len(known), cutoff=0.5)
+        likeness = {word: difflib.SequenceMatcher(None, text, word).ratio() for word in near}
+        hint = (
+            f"; did you mean {max(sorted(near, key=known.index), key=likeness.__getitem__)}?" if near else ""
+        )
+        raise UsageError(f"{name} must be {', '.join(known[:-1])} or {known[-1]}, got {text!r}{hint}")
+
+    return typer.Option(name, metavar=f"<{'|'.join(known)}>", parser=parsed, help=words)
+
+
+def f_number(text: str) -> float:
+    """Read an aperture as people write it: 2.8, f/2.8 or F2.8."""
+    number = str(text).strip().lower().removeprefix("f").removeprefix("/")
+    try:
+        return float(number)
+    except ValueError as error:
+        raise UsageError(f"--aperture must be an f-number such as 2.8 or f/2.8, got {text!r}") from error
+
+
+def _radians(angle: float | None) -> float | None:
+    if angle is not None and abs(angle) > math.tau:
+        raise UsageError(f"--phi is in radians; {angle:g} degrees are {math.radians(angle):.3f}")
+    return angle
+
+
+def _odd(side: int) -> int:
+    if side % 2 == 0:
+        raise UsageError(f"--size must be odd, got {side}; a PSF has one middle pixel")
+    return side
+
+
+def aperture_option(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
+    """Return the option of the f-number."""
+    return typer.Option("--aperture", "-a", metavar="N", parser=f_number, help=words)
+
+
+Photos = Annotated[
+    list[str], typer.Argument(metavar="PHOTO", help="Files, folders, or quoted patterns such as '*.dng'.")
+]
+Profile = Annotated[Path, typer.Option("--profile", "-p", metavar="FILE", help="The lens profile.")]
+ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
+Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
+AnyLens = Annotated[
+    bool, typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
+]
+Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
+RADIUS = typer.Option(
+    "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the centre: 0 centre, 1 corner."
+)
+ANGLE = typer.Option(
+    "--phi", metavar="RADIAN", callback=_radians, help="Angle of the place, counter-clockwise from the right."
+)
+Size = Annotated[
+    int, typer.Option(min=3, max=255, metavar="N", callback=_odd, help="Side in pixels, an odd number.")
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        "-j",
+        min=1,
+        metavar="N",
+        help="Processes that learn, threads that correct; default: one per core.",
+    ),
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only errors.")]
+Verbose = Annotated[
+    int,
+    typer.Option(
+        "--verbose", "-v", count=True, metavar="", help="More output; twice: everything.", show_default=False
+    ),
+]

@@ -1,1 +1,0 @@
-"""The blind estimators, one a file; `lensmodel.estimation.estimators` has them by name."""

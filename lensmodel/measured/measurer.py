@@ -1,0 +1,137 @@
+"""What every way of measuring takes and gives, and the names by which they are chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfSample, as_kernel
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, StepHook, ignore_step
+from lensmodel.photo import LinearPhoto
+
+PREFIX = "measured-"
+"""How the names of measuring estimators begin: blind ones never do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPsf:
+    """A PSF measured at one place of a photo.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+        Impulse response on the sensor's grid, centre of mass on the middle pixel.
+    position : FieldPosition
+        Middle of what it was measured on.
+    channel : {"r", "g", "b"}
+        Colour plane.
+    error : float
+        Relative L2 distance to the truth that the method expects.
+    pixel : tuple of float
+        Middle of what it was measured on, (row, col).
+    side : int
+        Side in pixels of the window that it was measured on.
+    """
+
+    kernel: Kernel
+    position: FieldPosition
+    channel: Channel
+    error: float
+    pixel: tuple[float, float]
+    side: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", as_kernel(self.kernel))
+        if not self.error >= 0.0:
+            raise InvalidInputError(f"the expected error must not be negative, got {self.error}")
+
+
+class Measurer(Protocol):
+    """One way to measure the PSF of a lens on photos made for it."""
+
+    name: ClassVar[str]
+    version: ClassVar[int]
+    photos: ClassVar[int]
+    """How many photos one measurement takes."""
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF wherever the photos show it.
+
+        Parameters
+        ----------
+        photos : sequence of LinearPhoto
+            As many as `photos` says; the first is the one whose PSF is measured.
+        size : int
+            Odd side of the kernels in pixels.
+        channels : sequence of {"r", "g", "b"}
+            Colour planes to measure.
+        on_step : StepHook
+            Called after each place.
+
+        Returns
+        -------
+        list of MeasuredPsf
+
+        Raises
+        ------
+        InvalidInputError
+            If the number of photos is wrong, or they do not fit each other.
+        NotEnoughEvidenceError
+            If they do not show what this way of measuring needs; the text says what is missing.
+        """
+
+
+def samples_of(
+    measured: Sequence[MeasuredPsf],
+    method: Measurer,
+    photo: LinearPhoto,
+    *,
+    photo_id: str,
+    settings: LensSettings,
+) -> list[PsfSample]:
+    """Make samples of measurements, as a `LensModel` takes them.
+
+    The estimator is called `measured-NAME/VERSION`; the vote is full, the error is the measurement's own.
+    """
+    return [
+        PsfSample(
+            kernel=psf.kernel,
+            position=psf.position,
+            settings=settings.with_channel(psf.channel),
+            weight=1.0,
+            photo=photo_id,
+            pixel_pitch_um=photo.info.metadata.pixel_pitch_um,
+            estimator=estimator_of(method),
+            error=psf.error,
+            half_diagonal_px=photo.frame.half_diagonal,
+        )
+        for psf in measured
+    ]
+
+
+def estimator_of(method: Measurer) -> str:
+    """Name and version as samples carry them."""
+    return f"{PREFIX}{method.name}/{method.version}"
+
+
+def is_measured(sample: PsfSample) -> bool:
+    """Whether a sample was measured, and not estimated from an ordinary photo."""
+    return sample.estimator.startswith(PREFIX)
+
+
+def require_photos(method: Measurer, photos: Sequence[LinearPhoto]) -> None:
+    """Refuse a wrong number of photos."""
+    if len(photos) != method.photos:
+        raise InvalidInputError(
+            f"measuring by {method.name} takes {method.photos} photo{'s' * (method.photos > 1)} at a time, "
+            f"got {len(photos)}"
+        )

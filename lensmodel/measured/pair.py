@@ -1,0 +1,426 @@
+"""PSFs from an aperture pair: the same scene from a tripod, wide open and well closed.
+
+The closed photo z is nearly sharp, and its own blur h is nearly known: diffraction and pixels. With the
+scene x,  z = h * x + n  and  y = k * x + n', so that x = z deconvolved by h is the sharp picture that the
+open photo y blurs, once it is laid under y to a part of a pixel. It keeps noise of its own, whose
+autocovariance is taken off where kernels are solved for.
+
+Of what a mosaic says of x at high frequencies much is light of others, f - s: green is sampled on a
+checkerboard, s = (1/2, 1/2), red and blue on every second row and column. With the power S of the picture,
+the part of it that is no picture has about  a sum_s S(f - s),  and a kernel is drawn towards nothing there as
+far as that outweighs the data; else it comes out with a checkerboard of its own.
+
+Closed lenses are not perfect. What they blur besides diffraction is missing in k, and `FLOOR` says how
+much that is as a rule.
+
+The transfer function of a lens that only diffracts, in front of square pixels.
+
+How strong noise can be at most: the finest detail of the quietest place of a photo.
+
+Where a scene has detail everywhere, as one for an aperture pair should, no flat place shows the noise, and
+detail passes for noise: of a simulated scene of leaves and grain `photo.estimate_noise` said sixty times too
+much. Noise is also in the finest detail of the quietest place, with whatever scene is there: the power there
+is an upper bound; a photo taken wide open, whose lens took the finest detail away, comes close to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
+from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.registration import Warp, match, matched
+from lensmodel.measured.solve import measured_pixels, quadratic, window_corners, window_psf
+from lensmodel.photo import LinearPhoto
+from lensmodel.photo.values import PlaneNoise
+
+FLOOR: Final = 0.05
+"""Error that no window shows of itself; chosen: a lens at f/8 is that far from
+diffraction at pixels of 4.5 um."""
+
+USUAL_F_NUMBER: Final = 8.0
+"""Aperture of the closed photo where it does not say: the sharpest of most lenses."""
+
+_USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
+_CLEAR: Final = 8.0  # standard deviations, as in `target`, for the same reason
+_SIDE: Final = 160
+"""Pixels of a window: the kernel changes within a larger one, a smaller one determines it too badly
+(chosen)."""
+_SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
+_DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
+_STOPS_APART: Final = 2.0
+"""Least difference of the apertures: blur that both photos share is missing in the kernel (chosen)."""
+_SURE: Final = 0.3
+"""Expected relative L2 from which on a window is dropped: a blind kernel is as good (chosen)."""
+_COARSE: Final = 4
+"""Factor by which photos are shrunk for the first match: a nudged tripod is within reach, and the blur is
+gone (chosen)."""
+_NOISE_GRID: Final = 128
+"""Frequencies along an axis: its lags have to hold two kernels, and the spectra are smooth (chosen)."""
+_RINGS: Final = 16
+"""Of frequency, 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)."""
+_ALIASED: Final = 0.03
+"""Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
+error for the lens of development (third order, 4). Measured once, no command repeats it."""
+_SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
+_FEWEST: Final = 64  # points that a fit of brightness takes: some ten for each of its six terms (chosen)
+
+
+@dataclass(frozen=True, slots=True)
+class AperturePair:
+    """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more.
+
+    Parameters
+    ----------
+    across, down : int
+        Cells of the frame, in each of which the window with most detail is taken.
+    side : int
+        Side of a window in pixels.
+    """
+
+    across: int = 8
+    down: int = 6
+    side: int = _SIDE
+
+    name: ClassVar[str] = "pair"
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 2
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF of the first photo; see `Measurer`."""
+        require_photos(self, photos)
+        _require_pair(*photos)
+        opened, closed = with_bounded_noise(list(photos))
+        warp = self.register(opened, closed)
+        corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
+        psfs = []
+        for done, corner in enumerate(corners, start=1):
+            for channel in channels:
+                psf = self._window(opened, closed, warp, corner, size, channel)
+                if psf is not None:
+                    psfs.append(psf)
+            on_step(done, len(corners))
+        if not psfs:
+            raise NotEnoughEvidenceError(
+                "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat "
+                "and in focus"
+            )
+        return psfs
+
+    def register(self, opened: LinearPhoto, closed: LinearPhoto) -> Warp:
+        """Lay the closed photo under the open one."""
+        plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
+        coarse = match(_shrunk(plane), _shrunk(reference))
+        if coarse.clarity < _CLEAR:
+            raise NotEnoughEvidenceError(
+                "the two photos do not show the same scene; take them from a tripod, one after the other"
+            )
+        start = np.eye(3)
+        start[:2, 2] = -_COARSE * np.array(coarse.shift)
+        warp = Warp.plain(start, opened.frame)
+
+        def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
+            places = bent(
+                *np.meshgrid(
+                    *(at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True)), indexing="ij"
+                )
+            )
+            return np.asarray(ndimage.map_coordinates(reference, places, order=3, mode="mirror"))
+
+        half = self.side // 2
+        corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
+        for degree in (1, 1, 3):
+            warp, _ = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
+        return warp
+
+    def _window(
+        self,
+        opened: LinearPhoto,
+        closed: LinearPhoto,
+        warp: Warp,
+        corner: tuple[int, int],
+        size: int,
+        channel: Channel,
+    ) -> MeasuredPsf | None:
+        """PSF of one window, or None where it does not determine one."""
+        around = size // 2
+        scene = _Scene(closed, warp, corner, self.side, around, channel)
+        try:
+            light = _falloff(opened, scene, corner, self.side, around, channel)
+        except NotEnoughEvidenceError:
+            return None
+
+        def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
+            cut = around - margin
+            whole = scene.moved(shift) * light
+            return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
+
+        try:
+            kernel, solved, _ = window_psf(
+                opened,
+                channel,
+                corner,
+                (self.side, self.side),
+                latent,
+                size,
+                latent_noise=scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size),
+            )
+        except NotEnoughEvidenceError:
+            return None
+        error = float(np.hypot(solved.error, FLOOR))
+        pixel = corner[0] + (self.side - 1) / 2.0, corner[1] + (self.side - 1) / 2.0
+        if error >= _SURE:
+            return None
+        return MeasuredPsf(kernel, opened.frame.position(*pixel), channel, error, pixel, self.side)
+
+
+def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
+    if opened.frame != closed.frame:
+        raise InvalidInputError(
+            f"the photos of a pair must have one size, got {opened.frame.width} x {opened.frame.height} and "
+            f"{closed.frame.width} x {closed.frame.height}"
+        )
+    n, m = opened.info.metadata.aperture, closed.info.metadata.aperture
+    if n is not None and m is not None and 2.0 * np.log2(m / n) < _STOPS_APART:
+        raise InvalidInputError(
+            f"the second photo is at f/{m:g} and the first at f/{n:g}; close the lens by two stops or more "
+            "for the second, best to f/8"
+        )
+
+
+class _Scene:
+    """The sharp picture around one window, on the pixels of the open photo.
+
+    The cosine transform filters as if the picture were mirrored at its rim, which suits a transfer
+    function that is real and even.
+    """
+
+    def __init__(
+        self,
+        closed: LinearPhoto,
+        warp: Warp,
+        corner: tuple[int, int],
+        side: int,
+        around: int,
+        channel: Channel,
+    ) -> None:
+        self._warp = warp
+        self._rows = corner[0] - around + np.arange(side + 2 * around)
+        self._cols = corner[1] - around + np.arange(side + 2 * around)
+        known = closed.info.metadata
+        self._f_number = known.aperture or USUAL_F_NUMBER
+        self._pitch_um, self._channel = known.pixel_pitch_um or _USUAL_PITCH_UM, channel
+        self._mosaic = closed.cfa is not None
+        index = CHANNELS.index(channel)
+        rows, cols = self._places((0.0, 0.0))
+        top, left = (max(int(at.min()) - _SPARE, 0) for at in (rows, cols))
+        bottom, right = int(rows.max()) + _SPARE + 1, int(cols.max()) + _SPARE + 1
+        region = np.asarray(closed.planes[index, top:bottom, left:right], dtype=np.float64)
+        self._corner = top, left
+        height, width = region.shape
+        filtered = fft.dctn(region, norm="ortho") * self._inverse(
+            np.arange(height)[:, None] / (2.0 * height), np.arange(width)[None, :] / (2.0 * width)
+        )
+        sharp = fft.idctn(filtered, norm="ortho")
+        self._spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
+        self._variance = float(closed.noise[index].variance(np.array([region.mean()]))[0])
+
+    def moved(self, shift: tuple[float, float]) -> NDArray[np.float64]:
+        """Return the picture moved down and right by `shift` pixels."""
+        rows, cols = self._places(shift)
+        places = np.stack([rows - self._corner[0], cols - self._corner[1]])
+        picture = ndimage.map_coordinates(self._spline, places, order=5, prefilter=False, mode="mirror")
+        return np.asarray(picture, dtype=np.float64)
+
+    def noise(self, size: int) -> NDArray[np.float64]:
+        """Autocovariance of what noise the deconvolution leaves in it, shape (2 size - 1, 2 size - 1)."""
+        f = fft.fftfreq(_NOISE_GRID)
+        return _covariance(np.square(self._inverse(f[:, None], f[None, :])) * self._variance, size)
+
+    def alias(self, window: NDArray[np.floating], size: int) -> NDArray[np.float64]:
+        """Autocovariance of what demosaicing made up in a window of it, shape (2 size - 1, 2 size - 1)."""
+        if not self._mosaic:
+            return np.zeros((2 * size - 1, 2 * size - 1))
+        f = np.abs(fft.fftfreq(_NOISE_GRID))
+        power_at = _power_by_frequency(window)
+        shifts = ((0.5, 0.5),) if self._channel == "g" else ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5))
+        others = [np.hypot((down - f)[:, None], (right - f)[None, :]) for down, right in shifts]
+        return _covariance(_ALIASED * np.sum([power_at(other) for other in others], axis=0), size)
+
+    def _places(self, shift: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._warp(*np.meshgrid(self._rows - shift[0], self._cols - shift[1], indexing="ij"))
+
+    def _inverse(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Wiener's inverse of the closed lens's blur."""
+        h = diffraction_otf(rows, cols, self._f_number, self._pitch_um, self._channel)
+        return np.asarray((1.0 + _DAMPING) * h / (h * h + _DAMPING))
+
+
+def _covariance(power: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Autocovariance by lag of what has a power spectrum, shape (2 size - 1, 2 size - 1)."""
+    lags = np.arange(-(size - 1), size)
+    return np.asarray(fft.ifft2(power).real[np.ix_(lags, lags)])
+
+
+def _power_by_frequency(
+    window: NDArray[np.floating],
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Mean power of a window by frequency in cycles/pixel; of white noise its variance."""
+    side = min(window.shape)
+    taper = np.outer(np.hanning(side), np.hanning(side))
+    part = (window[:side, :side] - window[:side, :side].mean()) * taper
+    power = np.square(np.abs(fft.fft2(part))) / np.square(taper).sum()
+    modulus = np.hypot(*np.meshgrid(fft.fftfreq(side), fft.fftfreq(side), indexing="ij"))
+    edges = np.linspace(0.0, 0.5, _RINGS + 1)
+    ring = np.digitize(modulus.ravel(), edges) - 1
+    inside = ring < _RINGS
+    total = np.bincount(ring[inside], power.ravel()[inside], minlength=_RINGS)
+    mean = np.maximum(total / np.bincount(ring[inside], minlength=_RINGS), 1e-12)
+    at = np.log(0.5 * (edges[1:] + edges[:-1]))
+    return lambda f: np.exp(np.interp(np.log(np.maximum(f, 1e-3)), at, np.log(mean)))
+
+
+def _falloff(
+    opened: LinearPhoto, scene: _Scene, corner: tuple[int, int], side: int, around: int, channel: Channel
+) -> NDArray[np.float64]:
+    """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
+    row, col = corner
+    t = (np.arange(-around, side + around) - (side - 1) / 2.0) / side
+    basis = quadratic(t[:, None], t[None, :])
+    # smoothed, the two differ by the light alone, however one of them is blurred
+    smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
+    inner = slice(around, around + side)
+    good = measured_pixels(opened, channel, row, col, (side, side))
+    plane = opened.planes[CHANNELS.index(channel), row : row + side, col : col + side]
+    if good.sum() < _FEWEST:
+        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+    columns = (basis[inner, inner] * smooth[inner, inner, None])[good]
+    terms, *_ = np.linalg.lstsq(columns, np.asarray(plane[good], dtype=np.float64), rcond=None)
+    light = basis @ terms
+    level = float(light[inner, inner].mean())
+    if not level > 0.0:
+        raise NotEnoughEvidenceError("a window of the open photo is black")
+    return np.asarray(np.maximum(light / level, 0.1))
+
+
+def _detailed(
+    opened: LinearPhoto, closed: LinearPhoto, side: int, across: int, down: int, margin: int
+) -> list[tuple[int, int]]:
+    """Corners of the windows with most fine detail, one in each cell of the frame."""
+    step = side // 4
+    plane = np.asarray(closed.planes[1])
+    fine = np.square(plane - ndimage.gaussian_filter(plane, 1.5))
+    clipped = (plane >= closed.clip[1]) | (np.asarray(opened.planes[1]) >= opened.clip[1])
+    fine[ndimage.maximum_filter(clipped, 5)] = 0.0
+    energy = ndimage.uniform_filter(np.minimum(fine, 20.0 * float(fine.mean())), side, mode="constant")
+    height, width = plane.shape
+    corners = []
+    for i in range(down):
+        for j in range(across):
+            rows = np.arange(max(i * height // down - side // 4, margin), (i + 1) * height // down, step)
+            cols = np.arange(max(j * width // across - side // 4, margin), (j + 1) * width // across, step)
+            rows, cols = rows[rows + side + margin <= height], cols[cols + side + margin <= width]
+            if rows.size and cols.size:
+                nearby = energy[np.ix_(rows + side // 2, cols + side // 2)]
+                k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
+                corners.append((int(rows[k]), int(cols[l])))
+    return list(dict.fromkeys(corners))
+
+
+def _shrunk(plane: NDArray[np.floating]) -> NDArray[np.float64]:
+    rows, cols = (n // _COARSE for n in plane.shape)
+    part = np.asarray(plane[: rows * _COARSE, : cols * _COARSE], dtype=np.float64)
+    return part.reshape(rows, _COARSE, cols, _COARSE).mean(axis=(1, 3))
+
+
+def diffraction_otf(
+    rows: NDArray[np.floating], cols: NDArray[np.floating], f_number: float, pitch_um: float, channel: Channel
+) -> NDArray[np.float64]:
+    """Transfer function of a round pupil and a pixel's box.
+
+    With v = f lambda N / p, f in cycles/pixel::
+
+        OTF = 2 / pi (arccos v - v sqrt(1 - v²)) sinc(f_row) sinc(f_col)
+
+    Source: J. W. Goodman, "Introduction to Fourier Optics", eq. 6-32 of the third edition.
+    """
+    v = np.hypot(rows, cols) * WAVELENGTH_NM[channel] / 1000.0 * f_number / pitch_um
+    v = np.minimum(v, 1.0)
+    round_pupil = 2.0 / np.pi * (np.arccos(v) - v * np.sqrt(1.0 - v * v))
+    return np.asarray(round_pupil * np.sinc(rows) * np.sinc(cols), dtype=np.float64)
+
+
+_BLOCK: Final = 64
+"""Pixels, side of a place: a larger one is nowhere without detail, a smaller one by chance too quiet
+(chosen)."""
+_FINE: Final = (0.4, 0.5)
+"""Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more."""
+
+_DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
+
+
+def with_bounded_noise(photos: list[LinearPhoto]) -> list[LinearPhoto]:
+    """Return photos whose noise is no stronger than their quietest places show.
+
+    Photos of one camera at one ISO share the bound, since they share the sensor's noise.
+    """
+    bounds = [[quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos]
+    bounded = []
+    for photo in photos:
+        alike = [bounds[i] for i, other in enumerate(photos) if _one_sensitivity(photo, other)]
+        least = np.min(alike, axis=0)
+        sensor = None if photo.sensor_noise is None else _all_bounded(photo.sensor_noise, least)
+        bounded.append(replace(photo, noise=_all_bounded(photo.noise, least), sensor_noise=sensor))
+    return bounded
+
+
+def quietest(photo: LinearPhoto, channel: int) -> float:
+    """Least power of fine detail over the level of light, of all blocks of a plane; inf where none is lit."""
+    plane = photo.planes[channel]
+    window = np.hanning(_BLOCK)[:, None] * np.hanning(_BLOCK)
+    f = fft.fftfreq(_BLOCK)
+    radius = np.hypot(f[:, None], f[None, :])
+    fine = (radius >= _FINE[0]) & (radius < _FINE[1])
+    least = np.inf
+    for row in range(0, plane.shape[0] - _BLOCK + 1, _BLOCK // 2):
+        for col in range(0, plane.shape[1] - _BLOCK + 1, _BLOCK // 2):
+            block = np.asarray(plane[row : row + _BLOCK, col : col + _BLOCK], dtype=np.float64)
+            level = float(block.mean())
+            if level > _DARK and float(block.max()) < photo.clip[channel]:
+                least = min(least, _power(block - level, window, fine) / level)
+    return least
+
+
+def _power(block: NDArray[np.float64], window: NDArray[np.float64], fine: NDArray[np.bool_]) -> float:
+    power = np.square(np.abs(fft.fft2(block * window))) / np.square(window).sum()
+    return float(power[fine].mean())
+
+
+def _all_bounded(noise: PlaneNoise, least: Sequence[float]) -> PlaneNoise:
+    r, g, b = (_bounded(of_plane, shot) for of_plane, shot in zip(noise, least, strict=True))
+    return r, g, b
+
+
+def _bounded(noise: NoiseModel, shot: float) -> NoiseModel:
+    if noise.shot <= shot:
+        return noise
+    return NoiseModel(shot, noise.read * shot / noise.shot)
+
+
+def _one_sensitivity(first: LinearPhoto, second: LinearPhoto) -> bool:
+    a, b = first.info.metadata, second.info.metadata
+    return (a.camera_model, a.iso) == (b.camera_model, b.iso)

@@ -1,0 +1,320 @@
+"""PSFs from photos of points: stars, pinholes, sparks on a steel ball.
+
+Sampled at the pixels, a point between them is a sinc centred on its place. The kernel k of a cell of the
+field turns all its points, each at its own phase, into the pixels that were measured:
+
+    y_i(p) = f_i sum_u k(u) sinc(p - u - c_i) + b_i
+
+So points at many phases are stacked without interpolating a photo, and pixels of a mosaic that saw another
+colour are left out. Places c_i and fluxes f_i are refined between two solutions for k. A point with one
+saturated pixel is refused whole: its neighbours hold what ran over. Each pixel is weighted by its own noise,
+from the sky and the light that the previous kernel predicts there: most pixels of a point are dark, so that
+the mean noise is right for none of them.
+
+Points of light in a photo: by SEP where installed, else by our own search.
+
+Both only say where lights may be; which of them are isolated, unsaturated and single is decided here,
+alike for both, and places are refined when the PSF is solved for.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import centred
+from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
+from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.solve import NEAR_CLIP, Solved, measured_pixels, photo_noise, solve
+from lensmodel.photo import LinearPhoto
+
+FLOOR: Final = 0.1
+"""Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by
+over a dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals."""
+
+_FEWEST: Final = 2
+"""Lights a cell must have: one alone may be a double star."""
+_MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
+_ROUNDS: Final = 3
+"""Of stacking at improved centres: each stack is sharper by the centres before it, and soon they rest
+(chosen)."""
+_SURE: Final = 0.45
+"""Expected relative error beyond which a kernel helps no model, whose blind ones are no worse (chosen)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """PSFs from isolated, unsaturated points of light.
+
+    Parameters
+    ----------
+    across, down : int
+        Cells of the frame; the points of a cell are stacked.
+    detector : str
+        "auto" or "own", see `find_lights`.
+    """
+
+    across: int = 7
+    down: int = 5
+    detector: str = "auto"
+
+    name: ClassVar[str] = "points"
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 1
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF wherever there are points; see `Measurer`."""
+        require_photos(self, photos)
+        photo = photos[0]
+        plane = np.asarray(photo.planes[1], dtype=np.float64)
+        lights = isolated_lights(find_lights(plane, self.detector), size)
+        usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
+        cells: dict[tuple[int, int], list[PointLight]] = {}
+        for light in usable:
+            row = int(light.row * self.down / photo.frame.height)
+            col = int(light.col * self.across / photo.frame.width)
+            cells.setdefault((row, col), []).append(light)
+        good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
+        if not good:
+            raise NotEnoughEvidenceError(
+                f"{len(lights)} isolated points of light, {len(usable)} of them unsaturated and whole, and "
+                f"no part of the frame with {_FEWEST}; expose less, or photograph more points"
+            )
+        skies = {
+            c: sky_of(np.asarray(photo.planes[CHANNELS.index(c)], dtype=np.float64))[0] for c in channels
+        }
+        psfs = []
+        for done, cell in enumerate(good, start=1):
+            for channel in channels:
+                psf = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
+                if psf is not None:
+                    psfs.append(psf)
+            on_step(done, len(good))
+        if not psfs:
+            raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
+        return psfs
+
+
+def _whole(light: PointLight, photo: LinearPhoto, size: int) -> bool:
+    half = size // 2 + 1
+    return half <= light.row < photo.frame.height - half and half <= light.col < photo.frame.width - half
+
+
+def _saturated(light: PointLight, photo: LinearPhoto) -> bool:
+    row, col = round(light.row), round(light.col)
+    near = np.asarray(photo.planes[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4])
+    return any(bool((plane >= NEAR_CLIP * clip).any()) for plane, clip in zip(near, photo.clip, strict=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stamp:
+    """One light: its window without sky, which pixels count, where it is in it, and the sky's level."""
+
+    observed: NDArray[np.float64]
+    measured: NDArray[np.bool_]
+    place: tuple[float, float]
+    flux: float
+    pixel: tuple[float, float]
+    sky: float
+
+    def latent(self, size: int) -> NDArray[np.float64]:
+        """The light as a sinc, on the window with a margin of half a kernel."""
+        side = self.observed.shape[0] + 2 * (size // 2)
+        t = np.arange(side) - size // 2
+        return self.flux * np.outer(np.sinc(t - self.place[0]), np.sinc(t - self.place[1]))
+
+
+def _cell_psf(
+    photo: LinearPhoto, channel: Channel, lights: Sequence[PointLight], size: int, sky: NDArray[np.float64]
+) -> MeasuredPsf | None:
+    stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
+    stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.measured.sum() > size]
+    if len(stamps) < _FEWEST:
+        return None
+    try:
+        solved = _stacked(photo, channel, stamps, size, None)
+        for _ in range(_ROUNDS - 1):
+            kernel = np.asarray(solved.kernel)
+            stamps = [_refined(stamp, kernel) for stamp in stamps]
+            solved = _stacked(photo, channel, stamps, size, kernel)
+    except NotEnoughEvidenceError:
+        return None
+    error = float(np.hypot(solved.error, FLOOR))
+    if error >= _SURE:
+        return None
+    votes = np.array([stamp.flux for stamp in stamps])
+    middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=votes)
+    pixel = float(middle[0]), float(middle[1])
+    return MeasuredPsf(centred(solved.kernel), photo.frame.position(*pixel), channel, error, pixel, size)
+
+
+def _stamp(
+    photo: LinearPhoto, channel: Channel, light: PointLight, size: int, sky: NDArray[np.float64]
+) -> _Stamp:
+    half = size // 2
+    top, left = round(light.row) - half, round(light.col) - half
+    index = CHANNELS.index(channel)
+    box = slice(top, top + size), slice(left, left + size)
+    observed = np.asarray(photo.planes[index][box], dtype=np.float64) - sky[box]
+    measured = measured_pixels(photo, channel, top, left, (size, size))
+    flux = float(observed.sum())
+    place, level = (light.row - top, light.col - left), max(float(sky[box].mean()), 0.0)
+    return _Stamp(observed, measured, place, flux, (light.row, light.col), level)
+
+
+def _stacked(
+    photo: LinearPhoto,
+    channel: Channel,
+    stamps: Sequence[_Stamp],
+    size: int,
+    kernel: NDArray[np.float64] | None,
+) -> Solved:
+    """Solve for the kernel of all stamps at once: they stand below each other, apart by what pads them.
+
+    `kernel` is that of the round before, by which the noise of each pixel is known.
+    """
+    high = 2 * size - 1
+    shot, read = photo_noise(photo, channel)
+    latent = np.concatenate([stamp.latent(size) for stamp in stamps])
+    observed = np.zeros((latent.shape[0] - size + 1, size))
+    measured = np.zeros(observed.shape, dtype=bool)
+    variance = np.ones(observed.shape)
+    for number, stamp in enumerate(stamps):
+        rows = slice(number * high, number * high + size)
+        observed[rows], measured[rows] = stamp.observed, stamp.measured
+        if kernel is None:
+            light = np.full((size, size), max(stamp.flux, 0.0) / size**2)
+        else:
+            light = np.maximum(scipy.signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
+        variance[rows] = shot * (stamp.sky + light) + read
+    return solve(observed, latent, measured, variance, size, even=True)
+
+
+def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
+    """Move and scale a light so that the kernel explains its pixels best: one Gauss-Newton step."""
+    size = kernel.shape[0]
+    step = 0.05
+
+    def rendered(row: float, col: float) -> NDArray[np.float64]:
+        moved = replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
+        return np.asarray(scipy.signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
+
+    predicted = rendered(0.0, 0.0)
+    by_row = (rendered(step, 0.0) - rendered(-step, 0.0)) / (2 * step)
+    by_col = (rendered(0.0, step) - rendered(0.0, -step)) / (2 * step)
+    good = stamp.measured
+    basis = np.stack([predicted[good], by_row[good], by_col[good], np.ones(int(good.sum()))], axis=-1)
+    terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
+    if not terms[0] > 0.0:
+        return stamp
+    row, col = np.clip(terms[1:3] / terms[0], -0.5, 0.5)
+    place = stamp.place[0] + float(row), stamp.place[1] + float(col)
+    return replace(stamp, place=place, flux=stamp.flux * float(terms[0]))
+
+
+logger = logging.getLogger(__name__)
+
+_SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
+_NEIGHBOUR: Final = 0.1
+"""Of its flux, that another light beside it may have: a fainter one is an error like those of noise
+(chosen)."""
+_SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
+
+
+@dataclass(frozen=True, slots=True)
+class PointLight:
+    """A point of light: middle `(row, col)` in pixels, and its peak above the sky."""
+
+    row: float
+    col: float
+    peak: float
+
+
+def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """Smooth background of a plane, and how much its pixels scatter (1.48 times the median deviation)."""
+    rows, cols = (max(n // _SKY_CELL, 1) for n in plane.shape)
+    cells = np.empty((rows, cols))
+    for i in range(rows):
+        for j in range(cols):
+            part = plane[
+                i * plane.shape[0] // rows : (i + 1) * plane.shape[0] // rows,
+                j * plane.shape[1] // cols : (j + 1) * plane.shape[1] // cols,
+            ]
+            cells[i, j] = np.median(part)
+    cells = ndimage.median_filter(cells, 3, mode="nearest")
+    zoom = plane.shape[0] / rows, plane.shape[1] / cols
+    grid = np.meshgrid(
+        (np.arange(plane.shape[0]) + 0.5) / zoom[0] - 0.5,
+        (np.arange(plane.shape[1]) + 0.5) / zoom[1] - 0.5,
+        indexing="ij",
+    )
+    sky = ndimage.map_coordinates(cells, grid, order=1, mode="nearest")
+    left = plane - sky
+    scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+    return sky, max(scatter, 1e-7)
+
+
+def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[PointLight]:
+    """Find points of light, brightest first: by SEP where it is installed, unless `detector` is "own"."""
+    sky, scatter = sky_of(plane)
+    clean = np.ascontiguousarray(plane - sky, dtype=np.float64)
+    if detector == "auto" and importlib.util.find_spec("sep") is not None:
+        rows = importlib.import_module("sep").extract(clean, _SIGMAS / 2, err=scatter, minarea=4)
+        lights = [PointLight(float(r["y"]), float(r["x"]), float(r["peak"])) for r in rows]
+    else:
+        logger.info("pip install 'lensmodel[stars]' finds faint and crowded lights better")
+        lights = _by_maxima(clean, scatter)
+    return sorted(lights, key=lambda light: -light.peak)
+
+
+def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
+    """Lights that have no other beside them that would disturb, within `reach` pixels."""
+    places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
+    peaks = np.array([light.peak for light in lights])
+    kept = []
+    for number, light in enumerate(lights):
+        away = np.abs(places - places[number]).max(axis=1)
+        near = (away < reach) & (peaks > _NEIGHBOUR * light.peak)
+        if near.sum() == 1:
+            kept.append(light)
+    return kept
+
+
+def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[PointLight]:
+    """Highest of their 5 x 5 neighbours after a little smoothing, with the centroid of 5 x 5 pixels."""
+    smooth = ndimage.gaussian_filter(clean, 1.0)
+    # smoothing by sigma 1 leaves 1 / (2 sqrt(pi)) of the scatter of white noise
+    peaks = (smooth == ndimage.maximum_filter(smooth, 5)) & (
+        smooth > _SIGMAS * scatter / (2 * np.sqrt(np.pi))
+    )
+    peaks[:2] = peaks[-2:] = False
+    peaks[:, :2] = peaks[:, -2:] = False
+    lights = []
+    t = np.arange(-2, 3)
+    for row, col in np.argwhere(peaks):
+        part = np.maximum(smooth[row - 2 : row + 3, col - 2 : col + 3], 0.0)
+        total = float(part.sum())
+        lights.append(
+            PointLight(
+                row + float((part.sum(axis=1) * t).sum()) / total,
+                col + float((part.sum(axis=0) * t).sum()) / total,
+                float(clean[row - 1 : row + 2, col - 1 : col + 2].max()),
+            )
+        )
+    return lights

@@ -1,0 +1,636 @@
+"""The PSF of one window of a photo, by weighted least squares against the sharp picture that it shows.
+
+**Slow changes** of light that lie over a window beside the blurred picture are taken out before solving::
+
+    y(p) = sum_u k(u) x(p - u) + sum_j c_j q_j(p) + n(p)
+
+The c_j need not be known. What the terms q_j can explain of y and of each column x(. - u) is taken out of
+both by weighted least squares; k is then the solution of what is left (R. Frisch and F. Waugh, Econometrica
+1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well: there, a constant.
+
+**One kernel for a window** (`solve`). For the pixels p that the sensor measured in a window,
+
+    y(p) = sum_u k(u) x(p - u) + c(p) + n(p)          var n(p) = s(p)²
+
+so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing; c changes
+slowly over the window and is taken out of both sides (`Smooth`). Every
+value of the kernel has a prior, normal with mean 0, whose width falls with the distance d to the middle
+as the light of a lens does:
+
+    t(d) = T / (1 + (d / D)²)
+
+The kernel is the minimum of  sum_p (y - k * x - c)² / (q s²) + sum_u k(u)² / t(u)²  over all k >= 0 whose sum
+is that of the minimum over all k, where q >= 1 is the mean of the squared residuals over what the noise
+explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the other: hundreds of
+values around a small core then add up to a halo that is not there. (Where the latent picture has noise of its
+own, which is taken off, the free minimum is not determined, and k >= 0 is all.) Its expected error is
+
+    e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
+
+Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4 (known
+sharp picture, non-negative least squares); M. Delbracio et al., "The non-parametric sub-pixel local
+point spread function estimation is a well posed problem", IJCV 96, 2012, section 3.
+
+**A kernel that changes within the window** (`solve_varying`), at the phase between pixels that
+fits best. It is linear in the place, with u and v from -1 to 1 over rows and columns of the window:
+
+    y(p) = sum_t (k(t) + u k_u(t) + v k_v(t)) x(p - t) + c(p) + n(p)
+
+k_u and k_v have the prior of `solve` with `CHANGE` of its width. What they explain is taken out of the
+normal equations (Schur's complement), so that k is found as if it were the same everywhere.
+
+A kernel that is not negative on one grid of pixels is so on no other, if it has a peak as narrow as a
+pixel: moved by half a pixel, the peak rings along its row and column, k >= 0 cuts one half of that off, and
+the rest is explained by something else. So the grid is fitted as well: X S(d) k is compared with y, where
+S(d) moves a kernel by d pixels (by sinc, which is exact for a picture without frequencies beyond the
+pixels'), and d minimises the misfit. Where the kernel is smooth, any d will do, and a weak prior keeps its
+centre of mass in the middle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.psf import as_kernel, centred, centroid
+from lensmodel.core.types import CHANNELS, Channel, Kernel
+from lensmodel.photo import LinearPhoto
+
+
+def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Terms 1, r, c, r², rc, c² of a smooth change of light, last axis."""
+    r, c = np.broadcast_arrays(r, c)
+    return np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smooth:
+    """What slow changes explain of a window and of its latent picture.
+
+    Parameters
+    ----------
+    basis : ndarray, shape (H, W, n)
+        Terms that are orthonormal under the weight, as single precision.
+    of_y : ndarray, shape (n,)
+        Their share of what was observed.
+    of_x : ndarray, shape (n, k²)
+        Their share of x(p - u), for each u in the order of the kernel's values.
+    """
+
+    basis: NDArray[np.float32]
+    of_y: NDArray[np.float64]
+    of_x: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        observed: NDArray[np.floating],
+        latent: NDArray[np.floating],
+        weight: NDArray[np.float64],
+        size: int,
+        *,
+        even: bool = False,
+    ) -> Smooth:
+        """Project a window, shape (H, W), and its latent picture, with a margin of half a kernel.
+
+        With `even`, on a constant alone.
+        """
+        height, width = weight.shape
+        terms = quadratic(np.linspace(-1.0, 1.0, height)[:, None], np.linspace(-1.0, 1.0, width)[None, :])
+        if even:
+            terms = terms[..., :1]
+        gram = np.einsum("rci,rc,rcj->ij", terms, weight, terms, optimize=True)
+        # where few pixels count, what cannot be told apart is left in
+        values, vectors = np.linalg.eigh(gram)
+        determined = values > 1e-9 * values[-1]
+        basis = terms @ (vectors[:, determined] / np.sqrt(values[determined]))
+        weighted = basis * weight[..., None]
+        of_x = np.empty((basis.shape[-1], size, size))
+        for i in range(size):
+            for j in range(size):
+                part = latent[size - 1 - i : size - 1 - i + height, size - 1 - j : size - 1 - j + width]
+                of_x[:, i, j] = np.einsum("rci,rc->i", weighted, part)
+        return cls(
+            basis=basis.astype(np.float32),
+            of_y=np.einsum("rci,rc->i", weighted, np.asarray(observed, dtype=np.float64)),
+            of_x=of_x.reshape(len(of_x), -1),
+        )
+
+    def out_of_y(
+        self, values: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ) -> NDArray[np.float32]:
+        """Return the residual of observed values at some pixels."""
+        rest = np.asarray(values, dtype=np.float64) - self.basis[part] @ self.of_y
+        return np.asarray(rest, dtype=np.float32)
+
+    def out_of_x(
+        self, rows: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ) -> NDArray[np.float32]:
+        """Return the residual of rows of X, shape (n, k²), at some pixels."""
+        return np.asarray(rows - self.basis[part] @ self.of_x.astype(np.float32), dtype=np.float32)
+
+
+PEAK: Final = 0.5
+"""T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light."""
+REACH: Final = 2.5
+"""D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have."""
+
+_ROWS: Final = 2048  # of the design matrix at once: a whole window would take hundreds of megabytes (chosen)
+_STEPS: Final = 300
+"""Of the projected gradient, whose error falls with the square of their number: more only cost time
+(chosen)."""
+_STILL: Final = 1e-7  # of the light: no value moves by more
+_WORST: Final = 1.0  # an error beyond it says that nothing was measured
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A kernel and how well it explains its window.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+        Not centred.
+    light : float
+        Sum of the kernel before it was normalised: what the latent picture must be multiplied with.
+    offset : float
+        The mean of c.
+    shift : tuple of float
+        Its centre of mass, (row, col) pixels from the middle.
+    error : float
+        Expected relative L2.
+    misfit : float
+        Mean squared residual over that of the noise: q.
+    """
+
+    kernel: Kernel
+    light: float
+    offset: float
+    shift: tuple[float, float]
+    error: float
+    misfit: float
+
+
+def solve(
+    observed: NDArray[np.floating],
+    latent: NDArray[np.floating],
+    measured: NDArray[np.bool_],
+    variance: NDArray[np.floating],
+    size: int,
+    latent_noise: NDArray[np.floating] | None = None,
+    *,
+    even: bool = False,
+) -> Solved:
+    """Find the kernel that makes the latent picture the observed one.
+
+    Parameters
+    ----------
+    observed : ndarray, shape (H, W)
+        Linear light.
+    latent : ndarray, shape (H + size - 1, W + size - 1)
+        What the photo shows without blur, with a margin of half a kernel.
+    measured : ndarray of bool, shape (H, W)
+        Which pixels count.
+    variance : ndarray, shape (H, W)
+        Of the noise of `observed`.
+    size : int
+        Odd side of the kernel.
+    latent_noise : ndarray, shape (2 size - 1, 2 size - 1), optional
+        Autocovariance of the noise that the latent picture has itself; it is taken off the normal
+        equations, or noise would be taken for picture and the kernel come out too wide.
+    even : bool
+        Whether c is the same all over the window, as it has to be where that is hardly wider than the kernel.
+
+    Raises
+    ------
+    InvalidInputError
+        If the shapes do not fit each other.
+    NotEnoughEvidenceError
+        If fewer pixels count than the kernel has, or no kernel explains them.
+    """
+    require_fit(observed, latent, measured, size)
+    weight = weights_of(measured, variance)
+    a, b, power = _normal_equations(observed, latent, weight, size, even=even)
+    if latent_noise is not None:
+        a -= stationary(latent_noise, size) * weight.sum()
+    prior = np.diag(1.0 / prior_width(size) ** 2)
+    count = int(measured.sum())
+    misfit = 1.0
+    start = np.zeros(size * size)
+    for _ in range(2):  # the second time with the residuals of the first
+        if latent_noise is None:
+            k = bounded(a / misfit + prior, b / misfit, start)
+        else:  # less its noise a latent picture leaves directions open, and the free minimum's sum with them
+            k = nonnegative_least_squares(a / misfit + prior, b / misfit, start, _STEPS)
+        misfit = max((power - 2.0 * float(b @ k) + float(k @ a @ k)) / count, 1.0)
+        start = k
+    light = float(k.sum())
+    if not light > 0.0:
+        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
+    kernel = as_kernel(k.reshape(size, size))
+    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
+    return Solved(
+        kernel=kernel,
+        light=light,
+        offset=mean_y - float(mean_x @ k),
+        shift=centroid(kernel),
+        error=error_of(a / misfit + prior, k),
+        misfit=misfit,
+    )
+
+
+def require_fit(
+    observed: NDArray[np.floating], latent: NDArray[np.floating], measured: NDArray[np.bool_], size: int
+) -> None:
+    """Refuse shapes that do not fit each other, and too few pixels; see `solve`."""
+    if size < 3 or size % 2 == 0 or latent.shape != tuple(n + size - 1 for n in observed.shape):
+        raise InvalidInputError(
+            f"a latent picture of {latent.shape} does not fit a window of {observed.shape} and kernels of "
+            f"{size}"
+        )
+    if int(measured.sum()) < size * size:
+        raise NotEnoughEvidenceError(
+            f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"
+        )
+
+
+def weights_of(measured: NDArray[np.bool_], variance: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return one over the variance of each pixel, 0 where it does not count."""
+    return np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
+
+
+def bounded(
+    a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Minimise k'Ak/2 - b'k over k >= 0 of the free minimum's sum."""
+    eigenvalues = np.linalg.eigvalsh(a)
+    largest = float(eigenvalues[-1])
+    lift = max(1e-6 * largest - float(eigenvalues[0]), 0.0)  # single precision may leave it indefinite
+    a = a + lift * np.eye(len(b))
+    light = float(scipy.linalg.solve(a, b, assume_a="pos").sum())
+    if not light > 0.0:
+        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
+    return of_sum(a, b, start, light, largest + lift)
+
+
+def of_sum(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    start: NDArray[np.float64],
+    light: float,
+    largest: float,
+    steps: int = _STEPS,
+) -> NDArray[np.float64]:
+    """Minimise k'Ak/2 - b'k over k >= 0 of sum `light` by accelerated projected gradients.
+
+    `largest` bounds the eigenvalues of A.
+    """
+    step = 1.0 / largest
+    k, momentum, t = start.copy(), start.copy(), 1.0
+    for _ in range(steps):
+        after = _on_simplex(momentum - step * (a @ momentum - b), light)
+        t_next = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
+        momentum = after + (t - 1.0) / t_next * (after - k)
+        if float(np.abs(after - k).max()) < _STILL * light:
+            return after
+        k, t = after, t_next
+    return k
+
+
+def _on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:
+    """Nearest values that are not negative and have this sum.
+
+    Source: J. Duchi et al., "Efficient projections onto the l1-ball for learning in high dimensions",
+    ICML 2008, figure 1.
+    """
+    falling = np.sort(values)[::-1]
+    excess = (np.cumsum(falling) - total) / np.arange(1, len(values) + 1)
+    last = int(np.nonzero(falling > excess)[0][-1])
+    return np.asarray(np.maximum(values - excess[last], 0.0))
+
+
+def _normal_equations(
+    observed: NDArray[np.floating],
+    latent: NDArray[np.floating],
+    weight: NDArray[np.float64],
+    size: int,
+    *,
+    even: bool = False,
+    varying: bool = False,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """X'WX, X'Wy and y'Wy of k, or of k, k_u and k_v, after slow changes were taken out."""
+    smooth = Smooth.of(observed, latent, weight, size, even=even)
+    views = sliding_window_view(np.asarray(latent, dtype=np.float32), (size, size))[:, :, ::-1, ::-1]
+    u, v = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in weight.shape)
+    rows, cols = np.nonzero(weight)
+    n = (3 if varying else 1) * size * size
+    a, b, power = np.zeros((n, n)), np.zeros(n), 0.0
+    for first in range(0, rows.size, _ROWS):
+        part = rows[first : first + _ROWS], cols[first : first + _ROWS]
+        root = np.sqrt(weight[part]).astype(np.float32)
+        x = smooth.out_of_x(views[part].reshape(root.size, -1), part) * root[:, None]
+        if varying:
+            x = np.concatenate([x, x * u[part[0], None], x * v[part[1], None]], axis=1)
+        y = smooth.out_of_y(observed[part], part) * root
+        a += x.T @ x
+        b += x.T @ y
+        power += float(y @ y)
+    return a, b, power
+
+
+def weighted_mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
+    """Return the mean of values that count by their weight."""
+    return float((values * weight).sum() / weight.sum())
+
+
+def means_of_latent(
+    latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
+) -> NDArray[np.float64]:
+    """Return the weighted mean of x(p - u) for each u, in the order of the kernel's values."""
+    height, width = weight.shape
+    means = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            part = latent[size - 1 - i : size - 1 - i + height, size - 1 - j : size - 1 - j + width]
+            means[i, j] = np.vdot(part, weight)
+    return means.ravel() / weight.sum()
+
+
+def stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
+    """Return the covariance of all values of a window of `size` pixels, shape (k², k²)."""
+    rows, cols = np.divmod(np.arange(size * size), size)
+    return np.asarray(
+        covariance[rows[:, None] - rows + size - 1, cols[:, None] - cols + size - 1], dtype=np.float64
+    )
+
+
+def prior_width(size: int) -> NDArray[np.float64]:
+    """Return t(d), shape (k²,)."""
+    t = np.arange(size) - size // 2
+    return (PEAK / (1.0 + (t[:, None] ** 2 + t[None, :] ** 2) / REACH**2)).ravel()
+
+
+def error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
+    """Return the root of the posterior variance of all values over the norm of the kernel."""
+    try:
+        inverse = scipy.linalg.inv(precision, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        return _WORST
+    variance = float(np.maximum(np.diag(inverse), 0.0).sum())
+    return min(math.sqrt(variance / float(k @ k)), _WORST)
+
+
+CHANGE: Final = 0.3
+"""Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed;
+measured once, no command repeats it)."""
+
+CENTRED_PX: Final = 0.3
+"""How far from the middle the centre of mass is expected, where the misfit does not tell: the match before it
+is as sure; much more and the phase is left open (chosen)."""
+
+_STEPS_PX: Final = (0.25, 0.1, 0.04)
+"""Of the search for the phase, coarse to fine: the first crosses a pixel in four, each next one looks around
+where the last ended (chosen)."""
+_MOST_PX: Final = 1.0
+"""Largest phase along an axis: kernels come here centred, a whole pixel is another match (chosen)."""
+_MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
+_SEARCHED: Final = 100
+"""Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Equations:
+    """Normal equations of the kernel in the middle: k'Ak/2 - b'k, and y'Wy."""
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    power: float
+
+
+def solve_varying(
+    observed: NDArray[np.floating],
+    latent: NDArray[np.floating],
+    measured: NDArray[np.bool_],
+    variance: NDArray[np.floating],
+    size: int,
+) -> Solved:
+    """Find the kernel in the middle of a window; parameters, result and errors are those of `solve`.
+
+    The latent picture has no noise. The kernel needs no centring: it lies on the grid that fits best.
+    """
+    require_fit(observed, latent, measured, size)
+    weight = weights_of(measured, variance)
+    a, b, power = _normal_equations(observed, latent, weight, size, varying=True)
+    prior = 1.0 / prior_width(size) ** 2
+    count, misfit = int(measured.sum()), 1.0
+    values = np.zeros(size * size)
+    for _ in range(2):  # the second time with the residuals of the first
+        eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
+        values = bounded(eq.a + np.diag(prior), eq.b, values)
+        rest = eq.power - 2.0 * float(eq.b @ values) + float(values @ eq.a @ values)
+        misfit = max(misfit * rest / count, 1.0)
+    eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
+    values, moved = _on_its_grid(eq, prior, values, size)
+    light = float(values.sum())
+    if not light > 0.0:
+        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
+    kernel = as_kernel(values.reshape(size, size))
+    off = centroid(kernel)
+    offset = weighted_mean(observed, weight) - float(means_of_latent(latent, weight, size) @ values)
+    return Solved(
+        kernel=kernel,
+        light=light,
+        offset=offset,
+        shift=(off[0] + moved[0], off[1] + moved[1]),
+        error=error_of(eq.a + np.diag(prior), values),
+        misfit=misfit,
+    )
+
+
+def _without_change(
+    a: NDArray[np.float64], b: NDArray[np.float64], power: float, prior: NDArray[np.float64]
+) -> _Equations:
+    """Eliminate k_u and k_v."""
+    n = len(prior)
+    inner = a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
+    right = np.concatenate([a[n:, :n], b[n:, None]], axis=1)
+    solved = scipy.linalg.solve(inner, right, assume_a="sym", check_finite=False)
+    return _Equations(
+        a[:n, :n] - a[:n, n:] @ solved[:, :n],
+        b[:n] - a[:n, n:] @ solved[:, n],
+        power - float(b[n:] @ solved[:, n]),
+    )
+
+
+def _on_its_grid(
+    eq: _Equations, prior: NDArray[np.float64], start: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Kernel and phase (row, col) in pixels at which k >= 0 explains the window best."""
+    light = float(start.sum())
+    # moving a kernel by sinc lengthens none; the prior is the same for all
+    largest = 1.02 * float(
+        scipy.linalg.eigvalsh(eq.a + np.diag(prior), subset_by_index=(len(prior) - 1,) * 2)[0]
+    )
+    known: dict[tuple[float, float], tuple[float, NDArray[np.float64]]] = {}
+
+    def cost(phase: tuple[float, float], near: NDArray[np.float64]) -> float:
+        if phase not in known:
+            a, b = _moved(eq, phase, size)
+            k = of_sum(a + np.diag(prior), b, near, light, largest, _SEARCHED)
+            off = centroid(as_kernel(k.reshape(size, size)))
+            misfit = float(k @ a @ k) - 2.0 * float(b @ k) + float(prior @ (k * k))
+            known[phase] = misfit + (off[0] ** 2 + off[1] ** 2) / CENTRED_PX**2, k
+        return known[phase][0]
+
+    best = (0.0, 0.0)
+    cost(best, start)
+    for step in _STEPS_PX:
+        for _ in range(_MOST_MOVES):
+            around = [
+                (round(best[0] + i * step, 3), round(best[1] + j * step, 3))
+                for i, j in ((-1, 0), (1, 0), (0, -1), (0, 1))
+            ]
+            inside = [phase for phase in around if max(map(abs, phase)) <= _MOST_PX]
+            better = min(inside, key=lambda phase: cost(phase, known[best][1]))
+            if known[better][0] >= known[best][0]:
+                break
+            best = better
+    return known[best][1], best
+
+
+def _moved(
+    eq: _Equations, phase: tuple[float, float], size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """S'AS and S'b, axis by axis."""
+    down, across = _sinc(phase[0], size), _sinc(phase[1], size)
+    n = size * size
+
+    def left(m: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = (down.T @ m.reshape(size, -1)).reshape(size, size, -1)
+        return np.asarray(np.matmul(across.T, rows).reshape(n, -1))
+
+    return left(left(eq.a).T), left(eq.b[:, None])[:, 0]
+
+
+def _sinc(by: float, size: int) -> NDArray[np.float64]:
+    """Matrix that moves a row of a kernel by so many pixels."""
+    t = np.arange(size)
+    return np.asarray(np.sinc(t[:, None] - t[None, :] - by))
+
+
+Latent = Callable[[tuple[float, float], int], NDArray[np.floating]]
+"""`latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels."""
+
+SMALL: Final = 15
+"""Side of the kernel by which the middle is found: its wings hardly move it."""
+
+NEAR_CLIP: Final = 0.97
+"""Share of the clipping level above which a pixel is not believed: the sensor bends before it clips."""
+
+_MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
+
+
+def photo_noise(photo: LinearPhoto, channel: Channel) -> tuple[float, float]:
+    """Shot and read noise of the pixels that were measured."""
+    noise = (photo.sensor_noise or photo.noise)[CHANNELS.index(channel)]
+    return noise.shot, noise.read
+
+
+def measured_pixels(
+    photo: LinearPhoto, channel: Channel, row: int, col: int, shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Which pixels of a window the sensor measured in a channel, unclipped."""
+    index = CHANNELS.index(channel)
+    window = photo.planes[index, row : row + shape[0], col : col + shape[1]]
+    good = np.asarray(window < NEAR_CLIP * photo.clip[index])
+    if photo.cfa is not None:
+        rows = (row + np.arange(shape[0])) % 2
+        cols = (col + np.arange(shape[1])) % 2
+        good &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
+    return good
+
+
+def window_psf(
+    photo: LinearPhoto,
+    channel: Channel,
+    corner: tuple[int, int],
+    shape: tuple[int, int],
+    latent: Latent,
+    size: int,
+    *,
+    measured: NDArray[np.bool_] | None = None,
+    latent_noise: NDArray[np.floating] | None = None,
+) -> tuple[Kernel, Solved, tuple[float, float]]:
+    """Measure the PSF of one window.
+
+    First a small kernel, whose centre of mass says how far the photo lies beyond the latent picture; that
+    is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
+    would soften a peak as narrow as a pixel.
+    """
+    row, col = corner
+    height, width = shape
+    index = CHANNELS.index(channel)
+    observed = np.asarray(photo.planes[index, row : row + height, col : col + width], dtype=np.float64)
+    if measured is None:
+        measured = measured_pixels(photo, channel, row, col, shape)
+    variance = even_variance(photo, channel, observed, measured)
+    _, shift = roughly(observed, measured, variance, latent, min(SMALL, size))
+    sharp = latent(shift, size // 2)
+    if latent_noise is None:
+        solved = solve_varying(observed, sharp, measured, variance, size)
+        return solved.kernel, solved, shift
+    # less its noise a latent picture says too little of how the kernel changes, and of the best grid
+    solved = solve(observed, sharp, measured, variance, size, latent_noise)
+    return centred(solved.kernel), solved, shift
+
+
+def roughly(
+    observed: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    variance: NDArray[np.float64],
+    latent: Latent,
+    size: int = SMALL,
+) -> tuple[Solved, tuple[float, float]]:
+    """Find a small kernel of a window."""
+    shift = (0.0, 0.0)
+    for _ in range(2):
+        first = solve(observed, latent(shift, size // 2), measured, variance, size)
+        shift = shift[0] + first.shift[0], shift[1] + first.shift[1]
+        if max(map(abs, shift)) > _MOST_SHIFT:
+            raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
+        if max(map(abs, first.shift)) < 0.02:
+            break
+    return first, shift
+
+
+def even_variance(
+    photo: LinearPhoto, channel: Channel, observed: NDArray[np.float64], measured: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the variance of a window's noise, its mean for each pixel, in the photo's units squared.
+
+    By its own level a pixel that is dark by chance would count more than others.
+    """
+    shot, read = photo_noise(photo, channel)
+    variance = shot * np.maximum(observed, 0.0) + read
+    return np.full(observed.shape, float(variance[measured].mean()) if measured.any() else 1.0)
+
+
+def window_corners(
+    shape: tuple[int, int], side: int, across: int, down: int, margin: int
+) -> list[tuple[int, int]]:
+    """Top left corners of windows spread evenly over a frame, `margin` pixels away from its rim."""
+    last = shape[0] - side - margin, shape[1] - side - margin
+    if min(last) < margin:
+        return []
+    rows = np.unique(np.rint(np.linspace(margin, last[0], down)).astype(int))
+    cols = np.unique(np.rint(np.linspace(margin, last[1], across)).astype(int))
+    return [(int(row), int(col)) for row in rows for col in cols]

@@ -1,0 +1,476 @@
+"""PSFs from a photo of the known target: found, registered, its light and its tones fitted, solved.
+
+1. The four discs give a homography for each of the four ways to turn the page, and for each number of
+   samples that pages have; that whose noise is in the photo is the one.
+2. Windows all over the page are matched with it, and a polynomial takes what the lens bends.
+3. In each window, the light that falls on the page is a smooth function of the place, and the print has
+   tones: light = E(p) * (t1 R + t2 R² + t3 R³), where R is the page's reflectance.
+4. The kernel between that picture and the pixels that were measured: `solve`.
+
+A page where it lies in a photo: what its windows show, in what light, and in what tones it was printed.
+
+The light that falls on a window of the page, separated from the detail of the page itself.
+
+The mean of noise over a part of a window is not quite that of the page: a quadratic fitted to the photo
+alone follows the slow waves of the noise itself, and a hundredth of wrong light over a window becomes a tenth
+of wrong kernel in its wings. What is printed is known, so with a kernel k that is nearly right
+
+    y(p) = sum_j e_j (k * (q_j R))(p) + sum_j c_j q_j(p) + n(p)
+
+is linear in e_j, the light, and c_j, what the lens and its reflections lay over it; q_j are the terms of
+`quadratic`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import ClassVar, Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
+from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.page import DETAILS, MEAN, TargetPage
+from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
+from lensmodel.measured.solve import (
+    SMALL,
+    Latent,
+    Solved,
+    even_variance,
+    measured_pixels,
+    quadratic,
+    roughly,
+    window_corners,
+    window_psf,
+)
+from lensmodel.photo import LinearPhoto
+
+FLOOR: Final = 0.02
+"""Error that no window shows of itself: what the smooth models of light, tones and place leave out
+(chosen)."""
+
+EXPLAINED: Final = 1.15
+"""Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
+too low is no reason to cut it (chosen)."""
+
+_CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
+# Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
+_SIDE: Final = 144
+_SURE: Final = 0.3  # error beyond which a measurement is not worth having
+_SMALLER: Final = (2 / 3, 1 / 2)
+"""Shares of the side, tried where whole windows do not fit: a change of the kernel falls with the side
+(chosen)."""
+_LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
+_TONE_WINDOWS: Final = 6
+"""In the middle of the frame, where the lens is sharpest: more lie further out (chosen)."""
+_TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Non-blind PSFs from one photo of the printed target.
+
+    Parameters
+    ----------
+    across, down : int
+        Places along the sides of the frame; fewer where windows would overlap by more than a quarter.
+    side : int
+        Side of a window in pixels.
+    details : tuple of int
+        Pages that it may be, by the samples along their long side.
+    """
+
+    across: int = 9
+    down: int = 6
+    side: int = _SIDE
+    details: tuple[int, ...] = DETAILS
+
+    name: ClassVar[str] = "target"
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 1
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF all over the page; see `Measurer`."""
+        require_photos(self, photos)
+        photo = photos[0]
+        placed = self.find(photo)
+        height, width = photo.planes.shape[1:]
+        down = min(self.down, max(height // (3 * self.side // 4), 2))
+        across = min(self.across, max(width // (3 * self.side // 4), 2))
+        held = [
+            corner
+            for corner in window_corners((height, width), self.side, _TRIED * across, _TRIED * down, 0)
+            if placed.holds(*corner, self.side, size // 2)
+        ]
+        corners = _spread(held, across, down)
+        if not corners:
+            raise NotEnoughEvidenceError(
+                "the page is too small in the photo; go nearer until it nearly fills the frame"
+            )
+        middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
+        placed = replace(placed, tones=tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side))
+        psfs = []
+        for done, corner in enumerate(corners, start=1):
+            psfs += self._window(photo, placed, corner, size, channels)
+            on_step(done, len(corners))
+        if not psfs:
+            raise NotEnoughEvidenceError("no window of the page determines a PSF; is the photo in focus?")
+        return psfs
+
+    def find(self, photo: LinearPhoto) -> PlacedPage:
+        """Find the page in a photo and register it to a fraction of a pixel."""
+        plane = np.asarray(photo.planes[1])
+        marks = find_marks(plane)
+        placed = _identified(photo, plane, marks, self.details)
+        side = self.side
+        corners = [
+            corner for corner in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*corner, side, 0)
+        ]
+        warp = placed.warp
+        for degree in (1, 3, 5, 5):
+            warp, _ = matched(
+                warp,
+                partial(_light, placed.page),
+                plane,
+                corners,
+                side,
+                least_clarity=_CLEAR,
+                degree=degree,
+            )
+        return replace(placed, warp=warp)
+
+    def _window(
+        self,
+        photo: LinearPhoto,
+        placed: PlacedPage,
+        corner: tuple[int, int],
+        size: int,
+        channels: Iterable[Channel],
+    ) -> list[MeasuredPsf]:
+        psfs = []
+        for channel in channels:
+            try:
+                at, window = self._explained(photo, placed, channel, corner, size)
+            except NotEnoughEvidenceError:
+                continue
+            error = float(np.hypot(window.solved.error, FLOOR))
+            if error < _SURE:
+                pixel = at[0] + (window.side - 1) / 2.0, at[1] + (window.side - 1) / 2.0
+                position = photo.frame.position(*pixel)
+                psfs.append(MeasuredPsf(window.kernel, position, channel, error, pixel, window.side))
+        return psfs
+
+    def _explained(
+        self, photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], size: int
+    ) -> tuple[tuple[int, int], SolvedWindow]:
+        """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
+        best = corner, solve_window(photo, placed, channel, corner, self.side, size)
+        for part in _SMALLER:
+            side = round(self.side * part)
+            if best[1].solved.misfit <= EXPLAINED:
+                break
+            if _pixels(photo, channel, side) < _LEAST_PIXELS * size * size:
+                break
+            inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
+            best = inner, solve_window(photo, placed, channel, inner, side, size)
+        return best
+
+
+def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
+    """How many pixels of a window the sensor measures in a channel."""
+    if photo.cfa is None:
+        return float(side * side)
+    sites = sum(row.count(CHANNELS.index(channel)) for row in photo.cfa)
+    return side * side * sites / 4.0
+
+
+def _light(
+    page: TargetPage, warp: Warp, corner: tuple[int, int], shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    return PlacedPage(page, warp).window(*corner, shape)
+
+
+def _identified(
+    photo: LinearPhoto, plane: NDArray[np.floating], marks: NDArray[np.float64], details: Sequence[int]
+) -> PlacedPage:
+    """Say which page it is and which way up, by the noise near the middle of the page."""
+    best: tuple[float, PlacedPage] | None = None
+    middle = marks.mean(axis=0)
+    side = _SIDE
+    corner = round(middle[0] - side / 2), round(middle[1] - side / 2)
+    if min(corner) < 0 or corner[0] + side > plane.shape[0] or corner[1] + side > plane.shape[1]:
+        raise NotEnoughEvidenceError("the page is too small in the photo; go nearer until it fills the frame")
+    window = plane[corner[0] : corner[0] + side, corner[1] : corner[1] + side]
+    for detail in details:
+        page = TargetPage(detail)
+        for turn in range(4):
+            warp = Warp.plain(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
+            if not 0.3 < warp.scale(*middle) < 3.0:
+                break  # no turn makes noise visible that pixels do not resolve
+            placed = PlacedPage(page, warp)
+            matching = match(window, placed.window(*corner, (side, side)))
+            if best is None or matching.clarity > best[0]:
+                best = matching.clarity, placed
+    if best is None or best[0] < _CLEAR:
+        raise NotEnoughEvidenceError(
+            "four discs are seen, but between them not the noise of a target that is known; print it with "
+            "`lensmodel target`, unscaled in one direction, and photograph it in focus"
+        )
+    return best[1]
+
+
+def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tuple[int, int]]:
+    """Choose of all windows that show noise those nearest to an even grid over them."""
+    if not held:
+        return []
+    places = np.array(held)
+    first, last = places.min(axis=0), places.max(axis=0)
+    chosen = {
+        held[int(np.argmin(np.hypot(*(places - first - (last - first) * np.array([i, j])).T)))]
+        for i in _parts(down)
+        for j in _parts(across)
+    }
+    return sorted(chosen)
+
+
+def _parts(count: int) -> NDArray[np.float64]:
+    """From one end to the other, or the middle alone."""
+    return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+
+
+TONE_SPREAD: Final = 0.3
+"""Standard deviation of q and c, see `tones_of`: what tones a print of unknown making may have (chosen:
+a gamma of 1.3 has a q of 0.3)."""
+
+_POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
+"""z, z² and z³ of `tones_of` in powers of R, less their constants."""
+_TINY: Final = 1e-20  # keeps a division finite
+_FINE: Final = 2
+"""Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies: at 1, its dots
+would alias, more costs time (chosen)."""
+_SPARE: Final = 16
+"""Pixels around a window, where the taper is: half of the largest kernel comes nearly as far (chosen)."""
+_LIGHT_ROUNDS: Final = 2
+"""Of fitting light and tones in turn: the second corrects what the first took for the other (chosen)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedPage:
+    """A page where it lies in a photo.
+
+    Parameters
+    ----------
+    page : TargetPage
+    warp : Warp
+        Pixels of the photo to samples of the page.
+    tones : tuple of float
+        t1, t2, t3 of the print.
+    """
+
+    page: TargetPage
+    warp: Warp
+    tones: tuple[float, float, float] = (1.0, 0.0, 0.0)
+
+    def window(self, row: float, col: float, shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Light of the page as pixels would see it that are points; no frequency beyond theirs."""
+        # turned or aslant, a page has frequencies along the pixels' axes that pixels do not hold
+        high, wide = (fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape)
+        rows = row - _SPARE + np.arange(high * _FINE) / _FINE
+        cols = col - _SPARE + np.arange(wide * _FINE) / _FINE
+        light = self._toned(self.page.at(*self.warp(*np.meshgrid(rows, cols, indexing="ij"))))
+        spectrum = fft.rfft2((light - MEAN) * _taper(high * _FINE)[:, None] * _taper(wide * _FINE))
+        coarse = np.zeros((high, wide // 2 + 1), dtype=spectrum.dtype)
+        up, down, across = (high + 1) // 2, (high - 1) // 2, (wide + 1) // 2
+        coarse[:up, :across] = spectrum[:up, :across]
+        coarse[-down:, :across] = spectrum[-down:, :across]
+        plane = fft.irfft2(coarse, s=(high, wide)) / _FINE**2 + MEAN
+        return np.ascontiguousarray(
+            plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]], dtype=np.float32
+        )
+
+    def holds(self, row: int, col: int, side: int, margin: int) -> bool:
+        """Whether a window of the photo, with its margin, shows noise and nothing else."""
+        steps = np.linspace(-margin, side - 1 + margin, 9)
+        return self.page.holds_noise(*self.warp(*np.meshgrid(row + steps, col + steps, indexing="ij")))
+
+    def _toned(self, reflectance: NDArray[np.float32]) -> NDArray[np.float32]:
+        first, second, third = (np.float32(t) for t in self.tones)
+        toned = reflectance * (first + reflectance * (second + reflectance * third))
+        return np.asarray(toned, dtype=np.float32)
+
+
+@cache
+def _taper(length: int) -> NDArray[np.float32]:
+    """1 in the middle, falling to 0 within the spare samples at both ends: the rim makes no frequencies."""
+    return np.asarray(scipy.signal.windows.tukey(length, 2.0 * _SPARE * _FINE / length), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedWindow:
+    """A solved window: kernel, the solution it came from, how far the page was moved, and its light."""
+
+    kernel: NDArray[np.float64]
+    solved: Solved
+    shift: tuple[float, float]
+    light: Illumination
+    side: int
+
+
+def solve_window(
+    photo: LinearPhoto,
+    placed: PlacedPage,
+    channel: Channel,
+    corner: tuple[int, int],
+    side: int,
+    size: int,
+) -> SolvedWindow:
+    """Find the light and the kernel of size `size` of a window of the page."""
+    light = _light_on(photo, placed, channel, corner, side)
+    kernel, solved, shift = window_psf(
+        photo, channel, corner, (side, side), _lit(placed, light, corner, side), size
+    )
+    return SolvedWindow(kernel, solved, shift, light, side)
+
+
+def _light_on(
+    photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int
+) -> Illumination:
+    """Light and a small kernel of a window, each found with the other."""
+    row, col = corner
+    measured = measured_pixels(photo, channel, row, col, (side, side))
+    plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
+    observed = np.asarray(plane, dtype=np.float64)
+    variance = even_variance(photo, channel, observed, measured)
+    light, page = Illumination.even(side), _lit(placed, Illumination.even(side), corner, side)
+    for _ in range(_LIGHT_ROUNDS):
+        rough, shift = roughly(observed, measured, variance, _lit(placed, light, corner, side))
+        light = fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
+    return light
+
+
+def _lit(placed: PlacedPage, light: Illumination, corner: tuple[int, int], side: int) -> Latent:
+    """Return what a window shows without blur in some light."""
+
+    def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
+        shape = side + 2 * margin, side + 2 * margin
+        page = placed.window(corner[0] - margin - shift[0], corner[1] - margin - shift[1], shape)
+        return page * light(margin)
+
+    return latent
+
+
+def tones_of(
+    photo: LinearPhoto, placed: PlacedPage, corners: Sequence[tuple[int, int]], side: int
+) -> tuple[float, float, float]:
+    """Fit the tones of the print where the lens is sharpest: how the photo follows R.
+
+    With z = R - `MEAN`, tones are  a (z + q z² + c z³)  and a constant, which is light like any other that is
+    laid over a window. What windows say of (q, c) is joined by its precision, and with the prior: behind much
+    blur, z, z² and z³ look alike, and nothing is known.
+    """
+    precision, weighted = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
+    windows = 0
+    for corner in corners:
+        try:
+            information, bent = _tones_in(photo, placed, corner, side)
+        except NotEnoughEvidenceError:
+            continue
+        precision, weighted, windows = precision + information, weighted + information @ bent, windows + 1
+    if windows < 2:
+        raise NotEnoughEvidenceError("the page is too blurred to be measured; focus on it")
+    q, c = np.linalg.solve(precision, weighted)
+    return float(1.0 - 2.0 * q * MEAN + 3.0 * c * MEAN**2), float(q - 3.0 * c * MEAN), float(c)
+
+
+def _tones_in(
+    photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], side: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Precision (2, 2) and value (2,) of (q, c) in one window."""
+    half = 7
+    window = solve_window(photo, placed, "g", corner, side, 2 * half + 1)
+    light, kernel = window.light(half), window.kernel
+    start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
+    shape = side + 2 * half, side + 2 * half
+    columns = [
+        scipy.signal.fftconvolve(
+            replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid"
+        )
+        for tones in _POWERS
+    ]
+    t = np.linspace(-1.0, 1.0, side)
+    columns += list(np.moveaxis(quadratic(t[:, None], t[None, :]), -1, 0))
+    good = measured_pixels(photo, "g", *corner, (side, side))
+    plane = photo.planes[1, corner[0] : corner[0] + side, corner[1] : corner[1] + side]
+    basis = np.stack([column[good] for column in columns], axis=-1)
+    observed = np.asarray(plane[good], dtype=np.float64)
+    terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
+    if not terms[0] > 0.0:
+        raise NotEnoughEvidenceError("a window shows a negative of the page")
+    left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
+    # only the part of the two columns that the others cannot explain determines q and c
+    others = np.delete(basis, (1, 2), axis=1)
+    separable = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
+    return separable.T @ separable * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])
+
+
+_FEWEST: Final = 64  # pixels: five times as many as there are terms
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Illumination:
+    """A quadratic in row and column whose mean over its square window is 1.
+
+    Parameters
+    ----------
+    terms : ndarray, shape (6,)
+        Of `quadratic`, in sides of the window from its middle.
+    side : int
+        Side of the window in pixels.
+    """
+
+    terms: NDArray[np.float64]
+    side: int
+
+    @classmethod
+    def even(cls, side: int) -> Illumination:
+        """Return light that is the same everywhere."""
+        return cls(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), side)
+
+    def __call__(self, margin: int) -> NDArray[np.float64]:
+        """Return the light of the window and of a margin around it."""
+        return _terms(self.side, margin) @ self.terms
+
+
+def fitted_light(
+    observed: NDArray[np.floating], measured: NDArray[np.bool_], page: NDArray[np.floating], kernel: Kernel
+) -> Illumination:
+    """Fit the light of a window."""
+    side = observed.shape[0]
+    if int(measured.sum()) < _FEWEST:
+        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+    outer, inner = _terms(side, kernel.shape[0] // 2), _terms(side, 0)
+    lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
+    basis = np.stack([*lit, *(inner[..., j][measured] for j in range(6))], axis=-1)
+    terms, *_ = np.linalg.lstsq(basis, np.asarray(observed[measured], dtype=np.float64), rcond=None)
+    light = inner @ terms[:6]
+    if not float(light.min()) > 0.0:
+        raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
+    return Illumination(np.asarray(terms[:6] / float(light.mean())), side)
+
+
+def _terms(side: int, margin: int) -> NDArray[np.float64]:
+    t = (np.arange(-margin, side + margin) - (side - 1) / 2.0) / side
+    return quadratic(t[:, None], t[None, :])

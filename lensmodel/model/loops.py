@@ -1,0 +1,242 @@
+"""The inner loops of the regression, compiled; imported where they are needed: Numba takes long to load."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.jit import jit
+
+# Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.
+_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+_SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
+
+
+@jit
+def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
+    """Integers j in 0..size with a j^2 + 2 b j + c <= 0, as first and last + 1."""
+    root = b * b - a * c
+    if root < 0.0:
+        return 0, 0
+    root = math.sqrt(root)
+    first, last = math.ceil((-b - root) / a), math.floor((-b + root) / a)
+    return max(first, 0), min(last + 1, size)
+
+
+@jit
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Weights of the four coefficients round a point that lies `t` beyond the second."""
+    rest = _ONE - t
+    first, last = rest * rest * rest * _SIXTH, t * t * t * _SIXTH
+    second = _TWO_THIRDS - t * t * (_ONE - _HALF * t)
+    return first, second, _ONE - first - second - last, last
+
+
+@jit
+def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x), at least two steps inside its grid."""
+    row, col = int(y), int(x)
+    v0, v1, v2, v3 = _weights(np.float32(y - row))
+    h0, h1, h2, h3 = _weights(np.float32(x - col))
+    p = (row - 1) * side + col - 1
+    q, r, o = p + side, p + 2 * side, p + 3 * side
+    return (
+        v0 * (h0 * spline[p] + h1 * spline[p + 1] + h2 * spline[p + 2] + h3 * spline[p + 3])
+        + v1 * (h0 * spline[q] + h1 * spline[q + 1] + h2 * spline[q + 2] + h3 * spline[q + 3])
+        + v2 * (h0 * spline[r] + h1 * spline[r + 1] + h2 * spline[r + 2] + h3 * spline[r + 3])
+        + v3 * (h0 * spline[o] + h1 * spline[o + 1] + h2 * spline[o + 2] + h3 * spline[o + 3])
+    )
+
+
+@jit
+def _anywhere(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x), zero coefficients around its grid."""
+    row, col = math.floor(y), math.floor(x)
+    total = np.float32(0.0)
+    for i, v in enumerate(_weights(np.float32(y - row))):
+        for j, h in enumerate(_weights(np.float32(x - col))):
+            line, place = row - 1 + i, col - 1 + j
+            if 0 <= line < side and 0 <= place < side:
+                total += v * h * spline[line * side + place]
+    return total
+
+
+@jit
+def sums(
+    rows: NDArray[np.float32],
+    radii: NDArray[np.float64],
+    chosen: NDArray[np.intp],
+    weights: NDArray[np.float64],
+    maps: NDArray[np.float64],
+    starts: NDArray[np.intp],
+    shifts: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Add weighted sums of splines, read through affine maps, to `out` (answers, size, size).
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, side^2)
+        Coefficients of all samples.
+    radii : ndarray, shape (n,)
+        From `splines.light_radius`.
+    chosen, weights : ndarray, shape (m,)
+        Samples that are read, one answer after the other; weights include the determinants of the maps.
+    maps : ndarray, shape (m, 2, 2)
+        From (row, col) offsets of the answer in pixels to those of the sample in steps of its grid.
+    starts : ndarray of int, shape (answers + 1,)
+        Where each answer begins among the m.
+    shifts : ndarray, shape (answers, 2)
+        Pixels by which each answer is moved.
+    """
+    side, size = round(math.sqrt(rows.shape[1])), out.shape[1]
+    half, middle = side // 2, size // 2
+    for answer in range(out.shape[0]):
+        left = -middle - shifts[answer, 1]
+        for k in range(starts[answer], starts[answer + 1]):
+            row, weight = chosen[k], weights[k]
+            spline, reach = rows[row], radii[row]
+            inner = reach < half - 2.0
+            dy, dx = maps[k, 0, 1], maps[k, 1, 1]
+            for i in range(size):
+                down = i - middle - shifts[answer, 0]
+                y = maps[k, 0, 0] * down + dy * left
+                x = maps[k, 1, 0] * down + dx * left
+                first, last = _inside(dy * dy + dx * dx, y * dy + x * dx, y * y + x * x - reach * reach, size)
+                y, x = y + half, x + half
+                if inner:
+                    for j in range(first, last):
+                        out[answer, i, j] += weight * _inner(spline, side, y + j * dy, x + j * dx)
+                else:
+                    for j in range(first, last):
+                        out[answer, i, j] += weight * _anywhere(spline, side, y + j * dy, x + j * dx)
+
+
+@jit
+def without_negatives(values: NDArray[np.float64]) -> None:
+    """Replace each row of `values` (q, n) by the nearest one of its sum that is not negative.
+
+    Michelot's way: take the values above t for those that stay, until t = (their sum - total) / their number
+    no longer rises. Source: C. Michelot, "A finite algorithm for finding the projection of a point onto the
+    canonical simplex of R^n", Journal of Optimization Theory and Applications 50, 1986. Clipping alone would
+    keep the crests of a spline's ripples round a sharp kernel and drop their troughs.
+    """
+    for q in range(len(values)):
+        row = values[q]
+        least, largest, total = math.inf, -math.inf, 0.0
+        for x in row:
+            least, largest, total = min(least, x), max(largest, x), total + x
+        if least >= 0.0 or largest <= 0.0:
+            continue
+        total = total if total > 0.0 else largest
+        # below this the one largest value would already hold more than all of the sum
+        t, count = largest - total, 0
+        while True:
+            above, number = 0.0, 0
+            for x in row:
+                if x > t:
+                    above += x
+                    number += 1
+            t = (above - total) / number
+            if number == count:
+                break
+            count = number
+        for i in range(len(row)):
+            row[i] = max(row[i] - t, 0.0)
+
+
+@jit
+def near(
+    points: NDArray[np.float64],
+    claims: NDArray[np.float64],
+    asked: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    limit: float,
+    few: int,
+    dropped: float,
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.intp]]:
+    """Rows, Nadaraya-Watson weights and starts of many questions; see `neighbours`."""
+    starts = np.zeros(len(asked) + 1, dtype=np.intp)
+    rows, weights = np.empty(64, dtype=np.intp), np.empty(64)
+    squared, taken = np.empty(len(points)), np.empty(len(points), dtype=np.intp)
+    for question in range(len(asked)):
+        count = _within(points, claims, asked[question], 1.0 / scale, limit, squared, taken)
+        if count < few:
+            count = _fewest(squared, few, taken)
+        at = starts[question]
+        if at + count > len(rows):
+            rows = np.concatenate((rows, np.empty(len(rows) + count, dtype=np.intp)))
+            weights = np.concatenate((weights, np.empty(len(weights) + count)))
+        starts[question + 1] = at + _weigh(
+            squared, claims, taken[:count], dropped, rows[at : at + count], weights[at : at + count]
+        )
+    return rows[: starts[-1]], weights[: starts[-1]], starts
+
+
+@jit
+def _within(
+    points: NDArray[np.float64],
+    claims: NDArray[np.float64],
+    asked: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    limit: float,
+    squared: NDArray[np.float64],
+    taken: NDArray[np.intp],
+) -> int:
+    """Squared distances of all points, infinite of weight 0, and those within the limit; how many."""
+    count = 0
+    for i in range(len(points)):
+        total = 0.0
+        for c in range(len(asked)):
+            gap = (points[i, c] - asked[c]) * inverse[c]
+            if not math.isnan(gap):  # an unknown setting takes no part
+                total += gap * gap
+        squared[i] = total if claims[i] > 0.0 else math.inf
+        if squared[i] <= limit:
+            taken[count] = i
+            count += 1
+    return count
+
+
+@jit
+def _weigh(
+    squared: NDArray[np.float64],
+    claims: NDArray[np.float64],
+    taken: NDArray[np.intp],
+    dropped: float,
+    rows: NDArray[np.intp],
+    weights: NDArray[np.float64],
+) -> int:
+    """Gaussian weights of sum 1, the least first, without those that hardly weigh anything; how many."""
+    nearest, total, below, kept = squared[taken].min(), 0.0, 0.0, 0.0
+    weight = np.empty(len(taken))
+    for k in range(len(taken)):
+        weight[k] = claims[taken[k]] * math.exp(-0.5 * (squared[taken[k]] - nearest))
+        total += weight[k]
+    count = 0
+    for k in np.argsort(weight, kind="mergesort"):
+        below += weight[k]
+        if below > dropped * total:
+            rows[count], weights[count] = taken[k], weight[k]
+            kept += weight[k]
+            count += 1
+    weights[:count] /= kept
+    return count
+
+
+@jit
+def _fewest(squared: NDArray[np.float64], few: int, taken: NDArray[np.intp]) -> int:
+    """The nearest few of some weight, the nearest first; returns how many."""
+    count = 0
+    for i in range(len(squared)):
+        if squared[i] == math.inf or (count == few and squared[i] >= squared[taken[count - 1]]):
+            continue
+        k = count if count < few else few - 1
+        while k > 0 and squared[taken[k - 1]] > squared[i]:
+            taken[k] = taken[k - 1]
+            k -= 1
+        taken[k] = i
+        count = min(count + 1, few)
+    return count

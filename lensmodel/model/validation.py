@@ -1,0 +1,413 @@
+"""What samples say of each other: bandwidths, robust weights and held-out errors, by leaving one photo out.
+
+Every answer is a linear combination f_i = sum_j w_ij C_j, so the squared error of all held-out
+samples follows from the Gram matrix G = C C' alone::
+
+    |C_i - f_i|^2 = G_ii - 2 (W G)_ii + (W G W')_ii
+
+Trying another bandwidth costs products of n x n matrices and touches no kernel. Samples of one
+photo share its shake, focus and noise: leaving out single samples would be optimistic. With a
+single photo there is no other choice, and each sample is its own group.
+
+A spoilt photo (defocus, shake, another lens) spoils all its samples, so photos are judged first, by the
+median of their held-out errors d_i, then samples::
+
+    q_i <- q_i psi((d_i - median d) / s),   psi(t) = (1 - (t / c)^2)^2 below c = 4.685, else 0
+
+psi is Tukey's biweight; a sample that fits better than the median keeps its weight. Nothing is removed:
+a sample of weight zero stays listed with its reason, and one may exclude or include photos by hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.core.types import WAVELENGTH_NM
+from lensmodel.model import variables as va
+from lensmodel.model.answer import PAPER, ModelSettings
+from lensmodel.model.local_frame import LocalKernels
+
+MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+"""Of the bandwidth by the normal reference rule: in steps of a root of two, up to which errors hardly differ
+(chosen)."""
+PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
+"""The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
+MIRRORS = (0.0, 0.3, 1.0)  # weights of mirror images: none, some, full (chosen)
+_CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
+_AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
+_CV_PHOTOS = 3
+"""Photos from which on leaving one out tells of bandwidths: of two, each would be foretold by one alone
+(chosen)."""
+_CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
+_SCORED = 800
+"""Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
+ONE_FOCAL_LENGTH = 0.25
+"""Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
+_ROTATIONAL = 10.0  # chords of the circle: so wide that phi does not count
+_UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
+_FEWEST = 2  # one sample cannot be left out
+_TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
+_ROUNDS = 4  # of reweighting: each costs as much, and later ones change the weights less (chosen)
+_MIN_PHOTOS = 3  # with two nobody knows which one is wrong
+_LISTED = 0.5
+"""Weight below which a photo is named: it then counts for less than half of what it claims (chosen)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """A photo or sample that counts less than it claimed.
+
+    Parameters
+    ----------
+    photo : str
+        Photo id as in the samples.
+    sample : int or None
+        Row of the sample in the model; None = the whole photo.
+    factor : float
+        What its weight was multiplied by, 0..1.
+    error : float
+        Its relative L2 against the model of the other photos (median, for a photo).
+    reason : str
+        In plain words.
+    """
+
+    photo: str
+    sample: int | None
+    factor: float
+    error: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Samples prepared for cross-validation.
+
+    Parameters
+    ----------
+    gram, mirrored : ndarray, shape (n, n)
+        Products <C_i, C_j> and <C_i, M C_j>, M the reflection v -> -v.
+    place, turn, others : ndarray, shape (n, n)
+        Squared distances in r, in phi and in the settings, in bandwidths.
+    claims : ndarray, shape (n,)
+    groups : ndarray of int, shape (n,)
+        Samples that are held out together.
+    """
+
+    gram: NDArray[np.float64]
+    mirrored: NDArray[np.float64]
+    place: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    others: NDArray[np.float64]
+    claims: NDArray[np.float64]
+    groups: NDArray[np.intp]
+
+    @classmethod
+    def of(
+        cls,
+        rows: NDArray[np.floating],
+        side: int,
+        where: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        claims: NDArray[np.float64],
+        groups: NDArray[np.intp],
+    ) -> HeldOut:
+        """Prepare kernels given as flat rows of a square grid, at points `where` (n, 7)."""
+        rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
+        flipped = rows.reshape(-1, side, side)[:, ::-1].reshape(len(rows), -1)
+        gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
+        return cls(
+            gram=rows @ rows.T,
+            mirrored=rows @ flipped.T,
+            place=gap[..., 0],
+            turn=gap[..., 1] + gap[..., 2],
+            others=gap[..., 3:].sum(axis=-1),
+            claims=claims,
+            groups=groups,
+        )
+
+    def errors(self, r: float = 1.0, phi: float = 1.0, mirror: float = 0.0) -> NDArray[np.float64]:
+        """Relative L2 of each sample against the model of the other groups."""
+        return self.errors_of(self.weights(r, phi), mirror)
+
+    def weights(self, r: float = 1.0, phi: float = 1.0) -> NDArray[np.float64]:
+        """Held-out Nadaraya-Watson weights, rows of sum 1."""
+        squared = self.place / r**2 + self.turn / phi**2 + self.others
+        squared = np.where(self.groups[:, None] == self.groups[None, :], np.inf, squared)
+        nearest = squared.min(axis=1, keepdims=True)
+        weight = self.claims * np.exp(-0.5 * (squared - np.where(np.isfinite(nearest), nearest, 0.0)))
+        total = weight.sum(axis=1, keepdims=True)
+        return np.asarray(weight / np.where(total > 0, total, 1.0))
+
+    def errors_of(self, weight: NDArray[np.float64], mirror: float = 0.0) -> NDArray[np.float64]:
+        """Relative L2 of each sample against its weighted mean of others."""
+        own = np.diag(self.gram)
+        direct, across = weight @ self.gram, weight @ self.mirrored
+        whole = 1.0 + mirror
+        linear = np.diag(direct + mirror * across) / whole
+        square = ((1 + mirror**2) * direct + 2 * mirror * across) / whole**2
+        squared = own - 2 * linear + np.einsum("ij,ij->i", square, weight)
+        relative = np.sqrt(np.maximum(squared, 0.0) / np.maximum(own, 1e-30))
+        return np.where(weight.sum(axis=1) > 0, relative, 1.0)
+
+    def noise(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Squared relative scatter of each sample's others about their weighted mean.
+
+        From the weights of `weights`: sum_j w_j |C_j - f|^2 / (1 - sum_j w_j^2), over the sample's |C_i|^2.
+        """
+        own = np.diag(self.gram)
+        spread = weight @ own - np.einsum("ij,ij->i", weight @ self.gram, weight)
+        free = np.maximum(1.0 - (weight**2).sum(axis=1), 0.1)
+        return np.asarray(np.maximum(spread, 0.0) / free / np.maximum(own, 1e-30))
+
+    def score(self, errors: NDArray[np.float64]) -> float:
+        """Mean error by weight; gross errors count at most 1.5."""
+        return float(np.average(np.minimum(errors, _CAP), weights=np.maximum(self.claims, 1e-9)))
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What cross-validation chose: factors on the bandwidths, weight of the mirrored samples."""
+
+    r: float = 1.0
+    phi: float = 1.0
+    mirror: float = 0.0
+    error: float = 1.0
+
+
+def choose_factors(held: HeldOut, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
+    """Search the factors, each only where it is free, for the least held-out error."""
+
+    def best(options: tuple[float, ...], make: Callable[[float], Choice]) -> Choice:
+        # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
+        tried = [make(option) for option in options]
+        least = min(choice.error for choice in tried)
+        return next(choice for choice in tried if choice.error <= least * _AS_GOOD + _NEGLIGIBLE)
+
+    def at(r_: float, phi_: float, mirror_: float) -> Choice:
+        return Choice(r_, phi_, mirror_, held.score(held.errors(r_, phi_, mirror_)))
+
+    chosen = at(1.0, 1.0, 0.0)
+    for _ in range(2):
+        now = chosen
+        if r:
+            now = best(MULTIPLES, lambda x, c=now: at(x, c.phi, c.mirror))  # type: ignore[misc] # mypy infers no default
+        if phi:
+            now = best(PHI_MULTIPLES, lambda x, c=now: at(c.r, x, c.mirror))  # type: ignore[misc] # same
+        if mirror:
+            now = best(MIRRORS, lambda x, c=now: at(c.r, c.phi, x))  # type: ignore[misc] # same
+        if (now.r, now.phi, now.mirror) == (chosen.r, chosen.phi, chosen.mirror):
+            break
+        chosen = now
+    return chosen
+
+
+def robust_factors(
+    held: HeldOut, photos: NDArray[np.intp], *, r: float, phi: float, mirror: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Factors on the weights of samples."""
+    count = int(photos.max()) + 1
+    by_sample, by_photo = np.ones(photos.size), np.ones(count)
+    errors = held.errors(r, phi, mirror)
+    if count < _MIN_PHOTOS:
+        return by_sample, by_photo, errors
+    plain = held.weights(r, phi)
+    for _ in range(_ROUNDS):
+        weight = plain * (by_sample * by_photo[photos])
+        total = weight.sum(axis=1, keepdims=True)
+        errors = held.errors_of(weight / np.where(total > 0, total, 1.0), mirror)
+        medians = np.array([np.median(errors[photos == p]) for p in range(count)])
+        by_photo = _biweight(medians, floor=0.25)
+        trusted = errors[by_photo[photos] > _LISTED]
+        by_sample = _biweight(errors, reference=trusted if trusted.size else errors, floor=0.35)
+    return by_sample, by_photo, errors
+
+
+def _biweight(
+    values: NDArray[np.float64], *, floor: float, reference: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    base = values if reference is None else reference
+    middle = float(np.median(base))
+    spread = 1.4826 * float(np.median(np.abs(base - middle)))
+    spread = max(spread, floor * middle, 0.01)  # few photos that agree by chance condemn none
+    t = np.maximum(values - middle, 0.0) / (_TUKEY * spread)
+    return np.asarray(np.where(t < 1.0, (1.0 - t * t) ** 2, 0.0))
+
+
+def _flags(
+    samples: Sequence[PsfSample],
+    by_sample: NDArray[np.float64],
+    by_photo: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    names: Sequence[str],
+) -> tuple[Flag, ...]:
+    """List photos, then samples, whose weights were halved or worse."""
+    flagged: list[Flag] = []
+    for p, name in enumerate(names):
+        rows = [i for i, s in enumerate(samples) if s.photo == name]
+        if by_photo[p] < _LISTED:
+            others = [i for i, s in enumerate(samples) if s.photo != name]
+            reason = _reason([samples[i] for i in rows], [samples[i] for i in others])
+            flagged.append(Flag(name, None, float(by_photo[p]), float(np.median(errors[rows])), reason))
+    whole = {flag.photo for flag in flagged}
+    for i, sample in enumerate(samples):
+        if by_sample[i] < _LISTED and sample.photo not in whole:
+            near = sorted(
+                (s for s in samples if s.photo != sample.photo),
+                key=lambda s, r=sample.position.r: abs(s.position.r - r),  # type: ignore[misc] # bound per round
+            )[:12]
+            flagged.append(
+                Flag(sample.photo, i, float(by_sample[i]), float(errors[i]), _reason([sample], near))
+            )
+    return tuple(flagged)
+
+
+def _reason(these: Sequence[PsfSample], others: Sequence[PsfSample]) -> str:
+    """Say how kernels differ from others near them: wider, elongated all one way, sharper, or else."""
+    shapes = [second_moments(s.kernel) for s in these]
+    mean = np.mean(shapes, axis=0)
+    usual = np.mean([second_moments(s.kernel) for s in others], axis=0) if others else mean
+    ratio = math.sqrt(max(float(np.trace(mean)), 1e-6) / max(float(np.trace(usual)), 1e-6))
+    excess = np.linalg.eigvalsh(mean - usual)
+    if ratio > 1.15:
+        if excess[1] > 4.0 * abs(excess[0]):
+            return (
+                f"{ratio:.1f} times as wide as the other photos and stretched one way: camera shake or motion"
+            )
+        return f"{ratio:.1f} times as wide as the other photos: out of focus"
+    if ratio < 0.87:
+        return f"{ratio:.1f} times as wide as the other photos: sharpened, or of another lens"
+    return "as wide as the other photos but of another shape: perhaps another lens"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossValidation:
+    """What the samples say of each other.
+
+    Parameters
+    ----------
+    weights, errors, noise : ndarray, shape (n,)
+        weights after robust weighting; held-out relative L2; the part of its square that is the samples'
+        own scatter.
+    choice : Choice
+    flags : tuple of Flag
+    """
+
+    weights: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    choice: Choice
+    flags: tuple[Flag, ...] = ()
+
+
+def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
+    """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
+    bandwidths = rule = va.support_widths(rule) if settings.mode == PAPER else dict(rule)
+    bandwidths["r"] = settings.r or rule["r"] * choice.r
+    phi = rule["phi"] * choice.phi
+    if settings.rotational is not None:
+        phi = rule["phi"] ** (1.0 - settings.rotational) * _ROTATIONAL**settings.rotational
+    bandwidths["phi"] = settings.phi or phi
+    bandwidths["aperture_stops"] = settings.stops or rule["aperture_stops"]
+    return bandwidths
+
+
+def held_together(samples: Sequence[PsfSample], photo: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Group samples by photo; those of a photo that is alone at its focal length are held out one by one.
+
+    Without that photo nothing would be known of the focal length: that says how a lens changes when one
+    zooms, not how well its samples agree.
+    """
+    groups = np.array(photo)
+    octaves = np.array([math.log2(s.settings.focal_mm) if s.settings.focal_mm else math.nan for s in samples])
+    for number in np.unique(photo):
+        own = photo == number
+        apart = (
+            np.abs(octaves[~own] - np.nanmedian(octaves[own])) if (~np.isnan(octaves[own])).any() else None
+        )
+        alone = not (~own).any() if apart is None else bool((apart > ONE_FOCAL_LENGTH).all())
+        if alone:
+            groups[own] = len(samples) + np.flatnonzero(own)
+    return groups
+
+
+def cross_validate(
+    samples: Sequence[PsfSample],
+    settings: ModelSettings,
+    local: LocalKernels,
+    where: NDArray[np.float64],
+    base: NDArray[np.float64],
+) -> CrossValidation:
+    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
+    rule = va.bandwidths(where)
+    names, photo = np.unique([s.photo for s in samples], return_inverse=True)
+    voting = np.flatnonzero(base > 0)
+    several = len(np.unique(photo[voting])) >= 2
+    groups = held_together(samples, photo)
+
+    def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
+        kernels = local.upright(rows)
+        scale = va.scales(bandwidth(rule, settings, Choice()))
+        flat = kernels.reshape(len(rows), -1)
+        return HeldOut.of(flat, kernels.shape[1], where[rows], scale, weights[rows], groups[rows])
+
+    green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
+    choice = Choice(mirror=settings.mirror or 0.0)
+    automatic = settings.mode != PAPER and len(np.unique(photo[voting])) >= _CV_PHOTOS
+
+    def chosen(weights: NDArray[np.float64]) -> Choice:
+        if not automatic:
+            return choice
+        factors = choose_factors(
+            held(_thinned(green, _CV_SAMPLES), weights),
+            r=settings.r is None,
+            phi=settings.phi is None and settings.rotational is None,
+            mirror=settings.mirror is None,
+        )
+        return factors if settings.mirror is None else replace(factors, mirror=settings.mirror)
+
+    scored = _thinned(voting, _SCORED)
+    weights, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
+    noise = np.zeros(len(samples))
+    if len(scored) < _FEWEST:
+        return CrossValidation(weights, errors, noise, choice)
+    choice = chosen(weights)
+    prepared = held(scored, base)
+    _, own_photo = np.unique(photo[scored], return_inverse=True)
+    known = names[np.unique(photo[scored])]
+    by_sample, by_photo, held_out = robust_factors(
+        prepared, own_photo, r=choice.r, phi=choice.phi, mirror=choice.mirror
+    )
+    flags: tuple[Flag, ...] = ()
+    if settings.robust and several:
+        own = {str(name): factor for name, factor in zip(known, by_photo, strict=True)}
+        weights = base * np.array([own.get(s.photo, 1.0) for s in samples])
+        weights[scored] *= by_sample
+        flags = _flags([samples[i] for i in scored], by_sample, by_photo, held_out, [str(n) for n in known])
+        flags = tuple(f if f.sample is None else replace(f, sample=int(scored[f.sample])) for f in flags)
+        if not (weights > 0).any():
+            weights, flags = base.copy(), ()
+        if flags:
+            choice = chosen(weights)
+    scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), held_out**2)
+    errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
+    errors[scored], noise[scored] = held_out, scatter
+    return CrossValidation(weights, errors, noise, choice, flags)
+
+
+def _judging_channel(wavelengths: NDArray[np.float64]) -> float:
+    """Green, which has the least noise; without any, the channel of the most samples."""
+    known, counts = np.unique(wavelengths, return_counts=True)
+    green = WAVELENGTH_NM["g"]
+    return green if green in known else float(known[counts.argmax()])
+
+
+def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]

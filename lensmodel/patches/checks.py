@@ -1,0 +1,457 @@
+"""What only a look at the window's own pixels tells: spectrum, periods, blocks, blobs.
+
+Tell blur of the scene and of the hand from blur of the lens, as far as one photo allows.
+
+Whether the chosen patches of a photo are enough, and spread out enough, to tell about its lens.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.errors import NoUsablePatchesError
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.types import FieldPosition, Plane
+from lensmodel.patches.windows import BLOCKS_A_SIDE, CLIP_SHARE, SLOPE_ORDER, Patch, Windows
+
+SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
+BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
+BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
+
+EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
+"""Bands of the frequencies that blur takes away: below 0.1 cycles/pixel lenses leave nearly all, above 0.4
+demosaicing and compression leave little to see."""
+
+NON_UNIFORMITY: Final = 0.005
+"""Standard deviation of the gain of a sensor's pixels, relative: 0.3 to 1 percent is usual in data sheets by
+the standard EMVA 1288. Weaker structure is the sensor's and no noise model of light holds it."""
+
+DYNAMIC_RANGE: Final = 2.0**14.8
+"""Full level over the noise of darkness of the best camera sensors; noise said to be less was eaten by
+rounding or denoising."""
+
+_JPEG_BLOCK = 8  # pixels: ITU-T T.81
+_MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
+_ON_THE_WAY = 24
+"""Points between a peak and the middle: a valley is wider than a twentieth of the way (chosen)."""
+
+
+_CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
+_REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Details:
+    """Second look at some windows; every array has one entry a window along axis 0.
+
+    Parameters
+    ----------
+    information : ndarray of float64, shape (n, BANDS, SECTORS)
+        Natural logarithm of power over noise by radial band and angular sector.
+    period : ndarray of float64, shape (n,)
+        Highest separate peak of the autocorrelation, 1 for a perfect period.
+    blockiness : ndarray of float64, shape (n,)
+        Steps on an 8 px grid over steps off it; 1 where there is none.
+    blob : ndarray of int64, shape (n,)
+        Pixels of the largest connected clipped area.
+    kurtosis : ndarray of float64, shape (n,)
+        Of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges.
+    evidence : ndarray of float64, shape (n,)
+        Bits a frequency between 0.1 and 0.4 cycles/pixel, mean of log2(1 + S/N); 0 for noise.
+    """
+
+    information: NDArray[np.float64]
+    period: NDArray[np.float64]
+    blockiness: NDArray[np.float64]
+    blob: NDArray[np.int64]
+    kurtosis: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Details:
+        """Return the entries that `index` picks."""
+        return Details(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+def repeats(patch: Plane) -> bool:
+    """Whether a patch repeats itself like a fence or an arcade, so that no blur can be told from it.
+
+    Its autocorrelation then falls far below zero and comes back nearly to one.
+    """
+    power = np.abs(fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
+    correlation = fft.irfft2(power, s=patch.shape)
+    if not correlation[0, 0] > 0:
+        return False
+    correlation /= correlation[0, 0]
+    rows, cols = (np.minimum(np.arange(n), n - np.arange(n)) for n in patch.shape)
+    gap = np.hypot(rows[:, None], cols[None, :])
+    reach = gap < min(patch.shape) // 3
+    valley = float(correlation[(gap > _CORE_PX[0]) & reach].min())
+    peak = float(correlation[(gap > _CORE_PX[1]) & reach].max())
+    return valley < _REPEATS[0] and peak > _REPEATS[1]
+
+
+def look_at(
+    patch: Plane, sigma: float, clip: float, corner: tuple[int, int], coarse_sigma: float | None = None
+) -> Details:
+    """Look at one window."""
+    values = np.asarray(patch, dtype=np.float64)
+    power = _power(_detrended(values))
+    noise = max(sigma, coarse_sigma or 0.0) ** 2
+    noise += (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
+    return Details(
+        information=_information(power, sigma)[None],
+        period=np.array([1.0 if repeats(patch) else _period(power, sigma)]),
+        blockiness=np.array([_blockiness(values, corner)]),
+        blob=np.array([_largest_blob(values >= CLIP_SHARE * clip)], dtype=np.int64),
+        kurtosis=np.array([_kurtosis(values)]),
+        evidence=np.array([_evidence(power, noise)]),
+    )
+
+
+def joined_details(parts: list[Details]) -> Details:
+    """Put the entries of several together."""
+    return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
+
+
+@lru_cache(maxsize=2)
+def _slopes(size: int) -> NDArray[np.float64]:
+    """Orthonormal polynomials up to `SLOPE_ORDER` over a window, `(size^2, count)`."""
+    t = np.linspace(-1.0, 1.0, size)
+    powers = [(i, j) for i in range(SLOPE_ORDER + 1) for j in range(SLOPE_ORDER + 1 - i)]
+    basis: NDArray[np.float64] = np.linalg.qr(
+        np.stack([np.outer(t**i, t**j).ravel() for i, j in powers], axis=1)
+    )[0]
+    return basis
+
+
+def _detrended(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    basis = _slopes(values.shape[0])
+    flat = values.ravel()
+    return (flat - basis @ (flat @ basis)).reshape(values.shape)
+
+
+@lru_cache(maxsize=4)
+def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
+    """Hann window, |f|² and the band-sector number of each frequency (-1 outside)."""
+    hann = np.hanning(size + 2)[1:-1]
+    window = np.outer(hann, hann)
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    radius = np.hypot(fr, fc)
+    band = np.searchsorted(BAND_EDGES, radius, side="right") - 1
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
+    inside = (band >= 0) & (band < BANDS) & ((fc > 0.0) | (fr > 0.0))
+    number = np.where(inside, band * SECTORS + sector, -1)
+    return window, (2.0 * np.pi * radius) ** 2, number
+
+
+def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Periodogram under a Hann window, scaled so that white noise gives its variance."""
+    window, _, _ = _grids(values.shape[0])
+    return np.square(np.abs(fft.rfft2(values * window))) / float(np.square(window).sum())
+
+
+@lru_cache(maxsize=4)
+def _evidence_bins(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Number of band and sector of each frequency (-1 outside), and how many frequencies each holds."""
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    bands = len(EVIDENCE_EDGES) - 1
+    band = np.searchsorted(EVIDENCE_EDGES, np.hypot(fr, fc), side="right") - 1
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    inside = (band >= 0) & (band < bands) & ((fc > 0.0) | (fr > 0.0))
+    number = np.where(inside, band * SECTORS + sector, -1)
+    return number, np.bincount(number[inside], minlength=bands * SECTORS)
+
+
+def _evidence(power: NDArray[np.float64], noise: float) -> float:
+    """Bits a frequency: mean of log2(1 + max(P / N - 1, 0)) over the bands and sectors that blur empties.
+
+    It is the capacity of a channel with the scene as the signal: C. E. Shannon, "Communication in the
+    presence of noise", Proc. IRE 37, 1949. A frequency with signal below the noise says next to nothing
+    about what the lens did to it, one far above says it well.
+    """
+    number, count = _evidence_bins(power.shape[0])
+    inside = number >= 0
+    mean = np.bincount(number[inside], power[inside], count.size) / np.maximum(count, 1)
+    signal = np.maximum(mean / max(noise, 1e-30) - 1.0, 0.0)
+    return float(np.log2(1.0 + signal) @ count / count.sum())
+
+
+def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Mean log of power over noise: at which frequencies and directions the window carries signal.
+
+    If the scene were known, the covariance of a least-squares kernel would be the noise over
+    this power, frequency by frequency.
+    """
+    _, _, number = _grids(power.shape[0])
+    inside = number >= 0
+    total = np.bincount(number[inside], power[inside], BANDS * SECTORS)
+    count = np.bincount(number[inside], minlength=BANDS * SECTORS)
+    mean = total / np.maximum(count, 1)
+    return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
+
+
+@lru_cache(maxsize=4)
+def _lags(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Weights of the power of gradients, autocorrelation of the window, and which lags lie beyond its core.
+
+    The last two reach a third of the window to each side; the second is 1 in the middle.
+    """
+    window, square_frequency, _ = _grids(size)
+    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
+    middle, reach = size // 2, size // 3
+    part = slice(middle - reach, middle + reach + 1)
+    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
+    weight = square_frequency * np.exp(-2.0 * square_frequency)
+    return weight, taper[part, part] / taper[middle, middle], lag >= _MAIN_LOBE_PX
+
+
+def _period(power: NDArray[np.float64], sigma: float) -> float:
+    """Highest separate peak of the autocorrelation of the gradients.
+
+    A fence or a facade repeats itself, and a blind estimate then cannot tell one repetition
+    from the next. A long straight edge has a ridge through the origin, not a separate peak: on
+    the way from the origin the correlation must fall to half the peak's height.
+    """
+    size = power.shape[0]
+    weight, taper, far = _lags(size)
+    signal = np.maximum(power - sigma * sigma, 0.0) * weight
+    correlation = fft.fftshift(fft.irfft2(signal, s=(size, size)))
+    middle = size // 2
+    if correlation[middle, middle] <= 0.0:
+        return 0.0
+    # The window's own autocorrelation takes weight from long lags; give it back up to a third.
+    correlation = correlation / correlation[middle, middle]
+    reach = size // 3
+    part = slice(middle - reach, middle + reach + 1)
+    correlation = correlation[part, part] / taper
+    peaks = np.argwhere((correlation == ndimage.maximum_filter(correlation, 3)) & far & (correlation > 0.0))
+    heights = correlation[peaks[:, 0], peaks[:, 1]]
+    highest = 0.0
+    for at in np.argsort(heights)[::-1][:6]:
+        (row, col), height = peaks[at], float(heights[at])
+        t = np.linspace(0.0, 1.0, _ON_THE_WAY)
+        way = correlation[
+            np.rint(reach + (row - reach) * t).astype(int), np.rint(reach + (col - reach) * t).astype(int)
+        ]
+        if height > highest and float(way.min()) < 0.5 * height:
+            highest = height
+    return min(highest, 1.0)
+
+
+def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
+    """Mean step across the lines of an 8 px grid over the mean step elsewhere.
+
+    The step at a line is the difference minus what its neighbours on either side predict.
+    """
+    ratios = []
+    for axis in (0, 1):
+        d = np.abs(np.diff(values, axis=axis))
+        d = d if axis == 0 else d.T
+        excess = np.abs(d[1:-1] - 0.5 * (d[:-2] + d[2:])).mean(axis=1)
+        # Entry i belongs to the line between pixels i + 1 and i + 2 of the window.
+        phase = (np.arange(excess.size) + 2 + corner[axis]) % _JPEG_BLOCK
+        by_phase = np.array([excess[phase == k].mean() for k in range(_JPEG_BLOCK)])
+        ratios.append(by_phase[0] / max(float(np.median(by_phase[1:])), 1e-12))
+    return float(np.mean(ratios))
+
+
+def _largest_blob(mask: NDArray[np.bool_]) -> int:
+    if not mask.any():
+        return 0
+    labels, _ = ndimage.label(mask)
+    return int(np.bincount(labels.ravel())[1:].max())
+
+
+def _kurtosis(values: NDArray[np.float64]) -> float:
+    squares = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()]) ** 2
+    square = float(np.mean(squares))
+    return float(np.mean(squares**2)) / max(square * square, 1e-30)
+
+
+RINGS: Final = 8
+"""Of equal width in r: blur changes little within one, and each holds windows enough (chosen)."""
+ENVELOPE_PERCENTILE: Final = 15.0
+"""Of a ring's widths, see `width_envelope`: lower is a single window's error, higher needs more of the photo
+in focus (chosen)."""
+ENVELOPE_RATIO: Final = 1.25
+"""Of width to envelope, above which a window is defocused: widths scatter by some of it in focus, and a
+quarter wider harms a kernel (chosen)."""
+CORNER_ALLOWANCE: Final = 0.2
+"""The allowed ratio grows with r²: copies of a lens differ, and a decentred one is not out of focus."""
+GROWTH: Final = 4.0
+"""Of the envelope with r², see `width_envelope`: corners five times as wide as the centre are as bad as
+lenses get (chosen)."""
+SURFACE_LIMIT: Final = 0.19
+"""Of the log width, see `smooth_widths`: less and no real photo is smooth, more and depths pass for a lens
+(chosen)."""
+JUMP_SHARE: Final = 0.5
+"""Of the range of log widths, see `smooth_widths`: a slope takes a sixth of it, a step of depth all
+(chosen)."""
+SURFACE_STEPS: Final = 12  # of reweighting, each a small system: later ones change less (chosen)
+MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients: fewer let a surface follow the scene (chosen)
+QUARTER_ALLOWANCE: Final = 1.2
+"""A quarter of a window has fewer edges, its width a larger error: 1 would call windows defocused by chance
+(chosen)."""
+SHARP_PX: Final = 0.6
+"""Edges of a sharp photo measure about this wide; a smaller width carries no information."""
+MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
+
+MOTION_LIMIT: Final = 0.45
+"""Relative elongation above which `select` warns: that of a lens averages out over the field, a scene of one
+direction has some (chosen)."""
+MIN_FOR_MOTION: Final = 6  # windows: twice the three unknowns of the fit (chosen)
+
+
+def width_envelope(windows: Windows) -> NDArray[np.float64]:
+    """Smallest consistent edge width at each window's r.
+
+    Defocus can only widen, so that the lower envelope over a ring of the field is the width of
+    the lens in focus. The rings' 15th percentiles become an envelope by two facts about lenses:
+    it does not fall outwards, so that a ring holds at most what every ring further out holds;
+    and it grows by no more than the factor 1 + 4 r², so that a background far out of focus does
+    not pass for a soft corner.
+    """
+    known = np.isfinite(windows.width)
+    ring = np.minimum((windows.r * RINGS).astype(np.intp), RINGS - 1)
+    members = [windows.width[known & (ring == k)] for k in range(RINGS)]
+    used = [k for k in range(RINGS) if members[k].size >= MIN_IN_RING]
+    if not used:
+        return np.full(len(windows), np.inf)
+    low = np.array([np.percentile(members[k], ENVELOPE_PERCENTILE) for k in used])
+    level = np.maximum(np.minimum.accumulate(low[::-1])[::-1], SHARP_PX)
+    centres = (np.array(used) + 0.5) / RINGS
+    most = level[0] * (1.0 + GROWTH * windows.r**2)
+    return np.minimum(np.interp(windows.r, centres, level), most)
+
+
+def smooth_widths(windows: Windows) -> NDArray[np.float64]:
+    """Widths that a decentred or tilted lens would have, NaN where the photo does not look like one.
+
+    Such a lens is soft on one side, which the rings of `width_envelope` would take for defocus.
+    But its blur changes smoothly over the field, while a scene has depth steps. So the logarithm
+    of the width is fitted by a quadratic surface, robustly. The surface is accepted if four
+    windows in five follow it to within 19 percent, and if the width does not jump: over a sixth
+    of the frame, 95 of 100 changes stay below half of the range that it has in the photo.
+    """
+    known = np.isfinite(windows.width)
+    if int(known.sum()) < MIN_FOR_SURFACE:
+        return np.full(len(windows), np.nan)
+    x, y = windows.r * np.cos(windows.phi), windows.r * np.sin(windows.phi)
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    target, part = np.log(np.maximum(windows.width[known], SHARP_PX)), basis[known]
+    weight = np.ones_like(target)
+    residual = target
+    for _ in range(SURFACE_STEPS):
+        fit = np.linalg.lstsq(part * weight[:, None], target * weight, rcond=None)[0]
+        residual = np.abs(target - part @ fit)
+        # Least absolute deviations by reweighting; the floor is the measurement error.
+        weight = 1.0 / np.sqrt(np.maximum(residual, 0.03))
+    believed = float(np.quantile(residual, 0.8)) < SURFACE_LIMIT and not _jumps(windows)
+    return np.exp(basis @ fit) if believed else np.full(len(windows), np.nan)
+
+
+def _jumps(windows: Windows) -> bool:
+    rows, row_at = np.unique(windows.rows, return_inverse=True)
+    cols, col_at = np.unique(windows.cols, return_inverse=True)
+    grid = np.full((rows.size, cols.size), np.nan)
+    grid[row_at, col_at] = np.log(np.maximum(windows.width, SHARP_PX))
+    lag = max(BLOCKS_A_SIDE, cols.size // 6)
+    steps = np.abs(
+        np.concatenate([(grid[lag:] - grid[:-lag]).ravel(), (grid[:, lag:] - grid[:, :-lag]).ravel()])
+    )
+    steps = steps[np.isfinite(steps)]
+    if steps.size < MIN_FOR_SURFACE:
+        return True
+    low, high = np.nanquantile(grid, (0.1, 0.9))
+    return float(np.quantile(steps, 0.95)) > JUMP_SHARE * float(high - low)
+
+
+def defocus_excess(windows: Windows) -> NDArray[np.float64]:
+    """Width over the envelope's limit: above 1 the window counts as defocused; 0 where unknown."""
+    envelope = np.fmax(width_envelope(windows), smooth_widths(windows))
+    limit = envelope * ENVELOPE_RATIO * (1.0 + CORNER_ALLOWANCE * windows.r**2)
+    worst = np.fmax(windows.width, windows.widest / QUARTER_ALLOWANCE)
+    return np.nan_to_num(worst / limit)
+
+
+def motion(windows: Windows) -> tuple[float, float]:
+    """Elongation of the blur that all windows share in image axes, and its direction in degrees.
+
+    The blur of a lens turns with the field, that of the hand does not. The relative elongation
+    vectors (over twice the angle) are fitted by a constant plus a term that turns with phi::
+
+        e_i = c + k r_i² (cos 2 phi_i, -sin 2 phi_i)
+    """
+    known = np.any(windows.elongation != 0.0, axis=1)
+    if int(known.sum()) < MIN_FOR_MOTION:
+        return 0.0, 0.0
+    e = windows.elongation[known]
+    square, double = windows.r[known] ** 2, 2.0 * windows.phi[known]
+    # Image axes have rows growing downwards, phi grows towards row 0: hence the minus.
+    turning = np.stack([square * np.cos(double), -square * np.sin(double)], axis=1)
+    ones, zeros = np.ones_like(square), np.zeros_like(square)
+    basis = np.concatenate(
+        [
+            np.stack([ones, zeros, turning[:, 0]], axis=1),
+            np.stack([zeros, ones, turning[:, 1]], axis=1),
+        ]
+    )
+    target = np.concatenate([e[:, 0], e[:, 1]])
+    fit = np.linalg.lstsq(basis, target, rcond=None)[0]
+    return math.hypot(fit[0], fit[1]), -math.degrees(math.atan2(fit[1], fit[0])) / 2.0
+
+
+LEAST_PATCHES: Final = 6
+"""Patches that lie apart. A plane over the field, which is the least that tells a centred lens from a
+decentred one, has three unknowns; so many again tell whether the first three agree."""
+
+LEAST_PARTS: Final = 3
+"""Parts of the picture that they lie in: three places off one line determine a plane over the field."""
+
+PARTS: Final = 9
+"""The center, the four quarters of the picture around it, and the outer end of each."""
+
+
+def part_of(position: FieldPosition) -> int:
+    """Number of the part of the picture that a place lies in, 0 to `PARTS` - 1, the center first."""
+    zone = zone_of(position.r)
+    if zone == "center":
+        return 0
+    quarter = math.floor(position.phi / (math.pi / 2.0)) % 4
+    return 1 + quarter + (4 if zone == "corner" else 0)
+
+
+def apart(patches: Sequence[Patch]) -> list[Patch]:
+    """Patches half a side or more from each other, taken greedily in their order."""
+    kept: list[Patch] = []
+    for patch in patches:
+        if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size / 2 for k in kept):
+            kept.append(patch)
+    return kept
+
+
+def require_enough(patches: Sequence[Patch], *, least: int = LEAST_PATCHES) -> None:
+    """Refuse a photo whose detail is too little, or all in one place."""
+    single = apart(patches)
+    parts = len({part_of(patch.position) for patch in single})
+    if len(single) < least:
+        places = "one place" if len(single) == 1 else f"{len(single)} places"
+        raise NoUsablePatchesError(
+            f"fine detail in focus was found in only {places}, and a photo counts from {least} on; take a "
+            "scene full of detail, at a low ISO, and give the photo in its full size"
+        )
+    if parts < min(LEAST_PARTS, least):
+        raise NoUsablePatchesError(
+            f"fine detail in focus was found in only {parts} of {PARTS} parts of the picture (the center, "
+            f"four quarters and their outer ends), and a photo counts from {LEAST_PARTS} on; take "
+            "a scene with detail all over"
+        )

@@ -1,0 +1,314 @@
+"""Choose the windows of a photo that tell about the PSF."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.patches import checks, spread
+from lensmodel.patches.checks import Details
+from lensmodel.patches.good_regions import GoodRegionsSelector
+from lensmodel.patches.windows import (
+    BLOCKS_A_SIDE,
+    MAX_REJECTIONS,
+    Patch,
+    Reason,
+    Rejection,
+    Selection,
+    Windows,
+    measure_blocks,
+    windows_of,
+)
+
+logger = logging.getLogger(__name__)
+
+SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
+CLIPPED_LIMIT: Final = 0.005
+"""Share of a window's pixels: a few specular points do little harm, and none at all would leave sunlit scenes
+out (chosen)."""
+BLOB_LIMIT: Final = 20
+"""Connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)."""
+DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
+FLAT_CONTRAST: Final = 4.0
+"""Variance of signal over that of noise: below, noise decides the estimate (chosen)."""
+FLAT_EIGENVALUE: Final = 10.0
+"""Smaller eigenvalue of the structure tensor over that of noise: ten times what a window without edges has by
+chance (chosen)."""
+ONE_DIRECTION_RATIO: Final = 0.05
+"""Smaller eigenvalue of the structure tensor over the larger: a single line has next to nothing across
+(chosen)."""
+SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
+PERIOD_LIMIT: Final = 0.8
+"""See `Details.period`: a repetition is as alike as that, other scenes seldom (chosen)."""
+BLOCKINESS_LIMIT: Final = 1.8
+"""See `Details.blockiness`, 1 without any: chance gives a little more, and twice is plain to see (chosen)."""
+JPEG_WEIGHT: Final = 0.3
+"""JPEG files were sharpened and gamma-coded: their patches count for less."""
+EVIDENCE_FLOOR: Final = 0.25
+"""Bits a frequency between 0.1 and 0.4 cycles/pixel that a patch needs: signal as strong as the noise over a
+quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
+SHORTLIST_A_SECTOR: Final = 8
+"""Windows that the costlier scores look at: several times as many as are taken (chosen)."""
+# Of the logarithm of the width over the envelope: where the weight is 1/e (chosen)
+FOCUS_SOFTNESS: Final = 0.33
+
+_ADVICE: Final[dict[str, str]] = {
+    "flat": "take a scene with more fine detail, at a lower ISO",
+    "dark": "expose longer",
+    "clipped": "expose shorter",
+    "one-directional": "take a scene with edges in all directions",
+    "periodic": "avoid fences, grids and facades that repeat",
+    "jpeg-blocks": "use the RAW file or a higher JPEG quality",
+    "border": "crop the empty border away",
+    "defocus": "take a flat, distant scene in focus",
+}
+
+
+class Selector(Protocol):
+    """Says how much each window tells about the PSF (Hirsch and Schölkopf, ICCV 2015, section 5.2)."""
+
+    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+        """Score the windows of a photo.
+
+        Parameters
+        ----------
+        windows : Windows
+            n windows: where they lie, their edges, noise and clipping.
+        looked : Details
+            A second look at the same windows: spectrum, periods, blocks of JPEG.
+
+        Returns
+        -------
+        ndarray of float64, shape (n,)
+            0..1; higher tells more.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class RMapSelector:
+    """Edges in every direction where the r-map is high, and signal at every frequency.
+
+    With e the energy of the kept edges over that of noise in eight directions, e_(2) its second
+    smallest entry, and S/N the spectrum over noise in 3 bands by 8 sectors::
+
+        score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / full_marks
+
+    Parameters
+    ----------
+    full_marks : float
+        What counts as 1.
+    """
+
+    full_marks: float = 8.0
+
+    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
+        """Return one score a window; see `Selector`."""
+        information = np.maximum(looked.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
+        return np.clip((edge_score(windows) + information) / self.full_marks, 0.0, 1.0)
+
+
+selectors: Registry[Selector] = Registry(
+    "patch selector",
+    {"r-map": RMapSelector, "good-regions": GoodRegionsSelector},
+    "lensmodel.selectors",
+)
+
+
+def edge_score(windows: Windows) -> NDArray[np.float64]:
+    """Decimal logarithm of the second weakest direction's edge energy over noise, at least 0."""
+    return np.log10(np.maximum(np.sort(windows.directions, axis=1)[:, 1], 1.0))
+
+
+def select(
+    plane: Plane,
+    noise: NoiseModel,
+    frame: Frame,
+    *,
+    clip: float = 1.0,
+    count: int = 48,
+    size: int = 192,
+    selector: str | Selector = "r-map",
+    jpeg: bool = False,
+    coarse_noise: NoiseModel | None = None,
+    on_step: StepHook = ignore_step,
+) -> Selection:
+    """Choose patches that tell about the PSF, spread over the field.
+
+    Parameters
+    ----------
+    plane : Plane, shape (H, W)
+        One colour plane of linear light; may be memory-mapped, it is read in strips.
+    noise : NoiseModel
+        Of that plane.
+    frame : Frame
+        The sensor frame; the plane covers all of it.
+    clip : float
+        Level at which the plane saturates.
+    count : int
+        How many patches at most.
+    size : int
+        Side in pixels; rounded down to a multiple of 4, and smaller where the frame's shorter
+        side is less than four patches.
+    selector : str or Selector
+        Name in `selectors`, or an object of one's own.
+    jpeg : bool
+        Whether the photo was a JPEG file; scores are then scaled by 0.3.
+    coarse_noise : NoiseModel, optional
+        Noise power of that plane between 0.1 and 0.4 cycles/pixel, where it is more than `noise`, as
+        that of demosaiced and denoised pixels is. A patch must stand above it.
+    on_step : StepHook
+        Progress.
+
+    Returns
+    -------
+    Selection
+        The same for the same input, always.
+
+    Raises
+    ------
+    NoUsablePatchesError
+        If no window is usable; the text names the commonest reason and a remedy.
+    InvalidInputError
+        If the plane does not cover the frame, or `count` or `size` is out of range.
+
+    Notes
+    -----
+    About 0.3 s a megapixel and 250 MB whatever the size of the plane.
+    """
+    if plane.shape != (frame.height, frame.width):
+        raise InvalidInputError(f"the plane is {plane.shape}, the frame {frame.height} x {frame.width}")
+    if count < 1:
+        raise InvalidInputError(f"count must be at least 1, got {count}")
+    chooser = selectors.create(selector) if isinstance(selector, str) else selector
+    side = _block_side(frame, size)
+    blocks = measure_blocks(plane, noise, side, clip, on_step)
+    windows = windows_of(blocks, frame, noise)
+    excess = checks.defocus_excess(windows)
+    reasons = first_reasons(windows, excess)
+    usable = np.flatnonzero(reasons == "")
+    short = usable[spread.shortlist(windows.take(usable), edge_score(windows)[usable], SHORTLIST_A_SECTOR)]
+    reasons[np.setdiff1d(usable, short)] = "duplicate"
+    chosen: list[tuple[int, int]] = []
+    score = np.zeros(len(windows))
+    if short.size:
+        looked = checks.joined_details([_look(plane, windows, int(i), clip, coarse_noise) for i in short])
+        reasons[short] = second_reasons(looked)
+        fine = reasons[short] == ""
+        left = short[fine]
+        score[left] = chooser.score(windows.take(left), looked.take(fine)) * _focus_weight(excess[left])
+        if left.size:
+            picks = spread.spread_windows(windows.take(left), score[left], count)
+            chosen = [(int(left[i]), cell) for i, cell in picks]
+    if not chosen:
+        raise NoUsablePatchesError(_nothing_usable(Counter(reasons.tolist())))
+    taken = np.array([i for i, _ in chosen])
+    reasons[np.setdiff1d(np.flatnonzero(reasons == ""), taken)] = "duplicate"
+    reasons[taken] = ""
+    weight = JPEG_WEIGHT if jpeg else 1.0
+    patches = tuple(_patch(windows, i, float(score[i]) * weight, cell) for i, cell in chosen)
+    counts = Counter(reason for reason in reasons.tolist() if reason)
+    logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), dict(counts))
+    return Selection(patches, _rejections(windows, reasons), dict(counts), _warnings(windows.take(taken)))
+
+
+def _block_side(frame: Frame, size: int) -> int:
+    if size < SMALLEST_PATCH:
+        raise InvalidInputError(f"patches need at least {SMALLEST_PATCH} px, got {size}")
+    shorter = min(frame.height, frame.width)
+    if shorter < SMALLEST_PATCH:
+        raise NoUsablePatchesError(
+            f"the photo is {frame.width} x {frame.height} px, a patch needs {SMALLEST_PATCH}; "
+            "use the photo in its full size"
+        )
+    fitting = max(shorter // 4, min(shorter, 2 * SMALLEST_PATCH))
+    return min(size, fitting) // BLOCKS_A_SIDE
+
+
+def first_reasons(windows: Windows, excess: NDArray[np.float64]) -> NDArray[np.str_]:
+    """Reason of each window from block sums alone, the first that holds; empty where none does."""
+    small, large = windows.eigenvalues.T
+    tests: list[tuple[Reason, NDArray[np.bool_]]] = [
+        ("border", windows.missing > 0.0),
+        ("clipped", windows.clipped > CLIPPED_LIMIT),
+        ("dark", windows.dark > DARK_LIMIT),
+        ("flat", (windows.contrast < FLAT_CONTRAST) | (large < FLAT_EIGENVALUE)),
+        ("one-directional", small < ONE_DIRECTION_RATIO * large),
+        ("flat", small < FLAT_EIGENVALUE),
+        ("defocus", excess > 1.0),
+    ]
+    return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
+
+
+def second_reasons(looked: Details) -> NDArray[np.str_]:
+    """Reason of each window from its own pixels; empty where none holds."""
+    tests: list[tuple[Reason, NDArray[np.bool_]]] = [
+        ("clipped", looked.blob > BLOB_LIMIT),
+        ("flat", looked.evidence < EVIDENCE_FLOOR),
+        ("periodic", looked.period > PERIOD_LIMIT),
+        ("jpeg-blocks", looked.blockiness > BLOCKINESS_LIMIT),
+        ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
+    ]
+    return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
+
+
+def _focus_weight(excess: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fall from 1 at the envelope to a third at the limit: of equal windows the sharper wins."""
+    over = np.maximum(excess * checks.ENVELOPE_RATIO - 1.0, 0.0)
+    return np.exp(-np.square(over / FOCUS_SOFTNESS))
+
+
+def _look(plane: Plane, windows: Windows, i: int, clip: float, coarse: NoiseModel | None) -> Details:
+    row, col, size = int(windows.rows[i]), int(windows.cols[i]), windows.size
+    patch = np.array(plane[row : row + size, col : col + size])
+    level = float(windows.level[i])
+    coarse_sigma = None if coarse is None else float(np.sqrt(coarse.variance(np.array(level))))
+    return checks.look_at(patch, float(windows.sigma[i]), clip, (row, col), coarse_sigma)
+
+
+def _patch(windows: Windows, i: int, score: float, cell: int) -> Patch:
+    position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
+    return Patch(int(windows.rows[i]), int(windows.cols[i]), windows.size, position, score, cell)
+
+
+def _rejections(windows: Windows, reasons: NDArray[np.str_]) -> tuple[Rejection, ...]:
+    """Return the rejected windows, thinned evenly in reading order when there are too many."""
+    at = np.flatnonzero(reasons != "")
+    if at.size > MAX_REJECTIONS:
+        at = at[np.linspace(0, at.size - 1, MAX_REJECTIONS).astype(np.intp)]
+    return tuple(
+        Rejection(int(windows.rows[i]), int(windows.cols[i]), windows.size, str(reasons[i]))  # type: ignore[arg-type]  # only reasons are stored
+        for i in at
+    )
+
+
+def _warnings(chosen: Windows) -> tuple[str, ...]:
+    amount, direction = checks.motion(chosen)
+    if amount <= checks.MOTION_LIMIT:
+        return ()
+    text = (
+        "motion: the blur of all patches is elongated in the same direction "
+        f"({direction:.0f} degrees from horizontal), which looks like camera shake; "
+        "use a photo taken from a tripod or with a shorter exposure"
+    )
+    return (text,)
+
+
+def _nothing_usable(counts: Counter[str]) -> str:
+    total = sum(counts.values())
+    if total == 0:
+        return "no part of the photo is large enough for a patch; use the photo in its full size"
+    reason, times = counts.most_common(1)[0]
+    listed = ", ".join(f"{name} {number}" for name, number in counts.most_common())
+    return (
+        f"none of {total} windows is usable ({listed}); {times} are rejected as {reason}: "
+        f"{_ADVICE.get(reason, 'use another photo')}"
+    )

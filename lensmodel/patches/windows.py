@@ -1,0 +1,531 @@
+"""What patch selection returns, and what a selector must be able to do.
+
+One pass over a plane: sums over small blocks, from which any window is put together.
+
+What is known of every candidate window of a photo, as arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Final, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane, StepHook
+from lensmodel.patches.rmap import (
+    FLAT_WINDOW,
+    GROUPS,
+    R_BINS,
+    automatic_threshold,
+    gradient_noise,
+    r_bin,
+    r_of_gradients,
+    smoothed_gradients,
+)
+
+Reason: TypeAlias = Literal[
+    "border",
+    "clipped",
+    "dark",
+    "flat",
+    "one-directional",
+    "periodic",
+    "jpeg-blocks",
+    "defocus",
+    "duplicate",
+]
+"""Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
+
+MAX_REJECTIONS: Final = 2000
+"""A photo has ten thousand windows; a report needs no more than this."""
+
+REASONS: Final[tuple[Reason, ...]] = get_args(Reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A window of a photo that tells about the PSF.
+
+    Parameters
+    ----------
+    row, col : int
+        Top-left pixel.
+    size : int
+        Side in pixels.
+    position : FieldPosition
+        Of the window's centre.
+    score : float
+        How much it tells, 0 to 1.
+    cell : int
+        Number of the field cell; patches of one cell may share one kernel.
+    """
+
+    row: int
+    col: int
+    size: int
+    position: FieldPosition
+    score: float
+    cell: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A window that was not taken, and why."""
+
+    row: int
+    col: int
+    size: int
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The outcome of patch selection on one plane.
+
+    Parameters
+    ----------
+    patches : tuple of Patch
+        Ordered by cell, the best of each cell first.
+    rejected : tuple of Rejection
+        At most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons.
+    counts : mapping of str to int
+        How many windows every reason holds for, complete.
+    warnings : tuple of str
+        What concerns the photo as a whole, in words for the user.
+    """
+
+    patches: tuple[Patch, ...]
+    rejected: tuple[Rejection, ...]
+    counts: Mapping[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+ORIENTATIONS: Final = 8
+"""Bins of gradient direction over half a turn: corners need a few directions, each must hold edges enough for
+a histogram (chosen)."""
+
+BLOCKS_A_SIDE: Final = 4
+"""A window is this many blocks wide, and windows start at every block: finer starts cost time and find nearly
+the same windows (chosen)."""
+
+WIDTH_BINS: Final = 28
+WIDTH_STEP_PX: Final = 0.2
+"""Histogram of edge widths, 0 to 5.6 px (chosen: finer than the widths of sharp and soft photos differ)."""
+
+EDGE_SIGMAS: Final = 4.0
+"""Of a gradient's noise, above which a pixel is an edge: noise alone exceeds it in one pixel of 3000
+(chosen)."""
+WIDTH_SIGMAS: Final = 10.0
+"""The same where a width is measured: noise must not move the places where an edge begins and ends
+(chosen)."""
+CLIP_SHARE: Final = 0.98
+"""Of the clipping level, above which a pixel is clipped: noise and demosaicing leave it a little lower
+(chosen)."""
+DARK_SNR: Final = 5.0
+"""A pixel below this ratio of level to noise counts as dark. One percent of full range is the noise of
+the published lens-blur benchmark; ten times that level would already throw out half a photo there."""
+
+_MARGIN = 18  # half an r-map window and the smoothing
+_STRIP_PIXELS = 2_000_000
+"""Pixels at once, 8 MB a plane of float32: the calls cost little beside the work (chosen)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockSums:
+    """Sums over blocks; every array starts with axes (block row, block column).
+
+    Parameters
+    ----------
+    side : int
+        Side of a block in pixels.
+    row, col : int
+        Top-left pixel of block (0, 0).
+    energy : ndarray of float32, shape (n, m, ORIENTATIONS, R_BINS)
+        Squared modulus of the edge gradients by direction and r.
+    tensor : ndarray of float64, shape (n, m, 3)
+        Structure tensor of the edge gradients: rr, rc, cc.
+    level, square : ndarray of float64, shape (n, m)
+        Sums of the values and of their squares.
+    clipped, dark, missing : ndarray of int64, shape (n, m)
+        Pixels above 98 percent of the clip level, below `DARK_SNR`, and not finite.
+    widths : ndarray of int64, shape (n, m, WIDTH_BINS)
+        Histogram of local edge widths.
+    width_sums : ndarray of float64, shape (n, m, ORIENTATIONS, 2)
+        Count and sum of squared widths by gradient direction.
+    histogram : ndarray of int64, shape (GROUPS, R_BINS)
+        Edge pixels of the whole plane by orientation group and r.
+    """
+
+    side: int
+    row: int
+    col: int
+    energy: NDArray[np.float32]
+    tensor: NDArray[np.float64]
+    level: NDArray[np.float64]
+    square: NDArray[np.float64]
+    clipped: NDArray[np.int64]
+    dark: NDArray[np.int64]
+    missing: NDArray[np.int64]
+    widths: NDArray[np.int64]
+    width_sums: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+
+
+def intensity_scale(plane: Plane) -> float:
+    """Level that counts as white: the 99.5 percentile of every eighth pixel, never below 1e-3."""
+    sample = np.asarray(plane[::8, ::8])
+    sample = sample[np.isfinite(sample)]
+    return max(float(np.percentile(sample, 99.5)), 1e-3) if sample.size else 1.0
+
+
+def measure_blocks(plane: Plane, noise: NoiseModel, side: int, clip: float, on_step: StepHook) -> BlockSums:
+    """Sum over blocks of `side` pixels, in strips, so that memory does not grow with the plane.
+
+    About 0.2 s a megapixel; the grid is centred, and incomplete blocks at the rim are left out.
+    """
+    height, width = plane.shape
+    n, m = height // side, width // side
+    row0, col0 = (height - n * side) // 2, (width - m * side) // 2
+    scale = intensity_scale(plane)
+    blocks = BlockSums(
+        side=side,
+        row=row0,
+        col=col0,
+        energy=np.zeros((n, m, ORIENTATIONS, R_BINS), np.float32),
+        tensor=np.zeros((n, m, 3)),
+        level=np.zeros((n, m)),
+        square=np.zeros((n, m)),
+        clipped=np.zeros((n, m), np.int64),
+        dark=np.zeros((n, m), np.int64),
+        missing=np.zeros((n, m), np.int64),
+        widths=np.zeros((n, m, WIDTH_BINS), np.int64),
+        width_sums=np.zeros((n, m, ORIENTATIONS, 2)),
+        histogram=np.zeros((GROUPS, R_BINS), np.int64),
+    )
+    for first, last in _strips(n, max(1, _STRIP_PIXELS // (side * width))):
+        _measure_strip(plane, blocks, slice(first, last), noise=noise, clip=clip, scale=scale)
+        on_step(last, n)
+    return blocks
+
+
+def _strips(count: int, step: int) -> Iterator[tuple[int, int]]:
+    for first in range(0, count, step):
+        yield first, min(first + step, count)
+
+
+def _measure_strip(
+    plane: Plane, blocks: BlockSums, rows: slice, *, noise: NoiseModel, clip: float, scale: float
+) -> None:
+    side, m = blocks.side, blocks.level.shape[1]
+    top, bottom = blocks.row + rows.start * side, blocks.row + rows.stop * side
+    above, below = min(_MARGIN, top), min(_MARGIN, plane.shape[0] - bottom)
+    values = np.array(plane[top - above : bottom + below], dtype=np.float32)
+    finite = np.isfinite(values)
+    if not finite.all():
+        values[~finite] = 0.0
+    smooth, along_rows, along_cols = smoothed_gradients(values)
+    size = np.hypot(along_rows, along_cols)
+    r = r_of_gradients(along_rows, along_cols, size, FLAT_WINDOW, scale)
+
+    inner = (slice(above, values.shape[0] - below), slice(blocks.col, blocks.col + m * side))
+    level = values[inner]
+    blocks.missing[rows] = _block_sum(~finite[inner], side)
+    blocks.level[rows] = _block_sum(level, side)
+    blocks.square[rows] = _block_sum(np.square(level, dtype=np.float64), side)
+    blocks.clipped[rows] = _block_sum(level >= CLIP_SHARE * clip, side)
+    blocks.dark[rows] = _block_sum(smooth[inner] < _level_of_snr(noise, DARK_SNR), side)
+
+    unit = np.sqrt(noise.variance(smooth[inner])).astype(np.float32) * np.float32(gradient_noise(1.0))
+    gr, gc, modulus = along_rows[inner], along_cols[inner], size[inner]
+    at = np.flatnonzero(modulus > EDGE_SIGMAS * unit)
+    where = _block_numbers(at, side, m)
+    gr_at, gc_at = gr.ravel()[at], gc.ravel()[at]
+    orientation = _orientation(gr_at, gc_at)
+    bins = r_bin(r[inner].ravel()[at])
+    power = modulus.ravel()[at] ** 2
+    shape = (rows.stop - rows.start, m)
+    count = shape[0] * m
+    key = (where * ORIENTATIONS + orientation) * R_BINS + bins
+    blocks.energy[rows] = np.bincount(key, power, count * ORIENTATIONS * R_BINS).reshape(
+        *shape, ORIENTATIONS, R_BINS
+    )
+    group = orientation // (ORIENTATIONS // GROUPS) * R_BINS + bins
+    blocks.histogram[:] += np.bincount(group, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS)
+    for i, product in enumerate((gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)):
+        blocks.tensor[rows, :, i] = np.bincount(where, product, count).reshape(shape)
+    ridge = _ridge(along_rows, along_cols, size)[inner] & (modulus > WIDTH_SIGMAS * unit)
+    _measure_widths(blocks, rows, smooth, (gr, gc, modulus), np.flatnonzero(ridge), inner)
+
+
+def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.bool_]:
+    """Where no neighbour across the edge is steeper; the rim has one neighbour only and is let through."""
+    center, inside = modulus[1:-1, 1:-1], (slice(1, -1), slice(1, -1))
+    ridge = np.ones(modulus.shape, dtype=np.bool_)
+    ridge[inside] = np.where(
+        np.abs(along_rows[inside]) > np.abs(along_cols[inside]),
+        (center >= modulus[:-2, 1:-1]) & (center >= modulus[2:, 1:-1]),
+        (center >= modulus[1:-1, :-2]) & (center >= modulus[1:-1, 2:]),
+    )
+    return ridge
+
+
+def _measure_widths(
+    blocks: BlockSums,
+    rows: slice,
+    smooth: Plane,
+    gradients: tuple[Plane, Plane, Plane],
+    at: NDArray[np.intp],
+    inner: tuple[slice, slice],
+) -> None:
+    """Width of the blur at edge ridges by re-blurring.
+
+    A step blurred by a Gaussian of s and smoothed by 1 px has its steepest gradient in
+    proportion to 1/sqrt(s² + 1); smoothed once more by 1 px, to 1/sqrt(s² + 2). Hence
+
+        R² = (s² + 2) / (s² + 1),        s² = 1 / (R² - 1) - 1
+
+    S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44,
+    2011, eq. (3) to (5), with the smoothing taken into account. It holds on the ridge of the
+    gradient only: `at` are the pixels of the inner part that lie there.
+    """
+    gr, gc, modulus = gradients
+    side, m = blocks.side, blocks.level.shape[1]
+    again = np.asarray(ndimage.gaussian_filter(smooth, 1.0, truncate=3.0), dtype=np.float32)
+    second = np.hypot(*(np.asarray(part)[inner] for part in np.gradient(again)))
+    excess = np.square(modulus.ravel()[at] / np.maximum(second.ravel()[at], 1e-12)) - 1.0
+    square = 1.0 / np.maximum(excess, 1e-3) - 1.0
+    square = np.clip(square, 0.0, (WIDTH_BINS * WIDTH_STEP_PX) ** 2 - 1e-3)
+    where = _block_numbers(at, side, m)
+    shape = (rows.stop - rows.start, m)
+    count = shape[0] * m
+    key = where * WIDTH_BINS + (np.sqrt(square) / WIDTH_STEP_PX).astype(np.intp)
+    blocks.widths[rows] = np.bincount(key, minlength=count * WIDTH_BINS).reshape(*shape, WIDTH_BINS)
+    key = where * ORIENTATIONS + _orientation(gr.ravel()[at], gc.ravel()[at])
+    for i, weights in enumerate((None, square)):
+        blocks.width_sums[rows, :, :, i] = np.bincount(key, weights, count * ORIENTATIONS).reshape(
+            *shape, ORIENTATIONS
+        )
+
+
+def _orientation(along_rows: NDArray[np.float32], along_cols: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Bin of the gradient's direction over half a turn, 0 = along columns, growing downwards."""
+    angle = np.arctan2(along_rows, along_cols) * (ORIENTATIONS / np.pi)
+    return np.floor(angle + 0.5).astype(np.intp) % ORIENTATIONS
+
+
+def _block_numbers(at: NDArray[np.intp], side: int, m: int) -> NDArray[np.intp]:
+    row, col = np.divmod(at, m * side)
+    return (row // side) * m + col // side
+
+
+def _block_sum(values: NDArray[np.generic], side: int) -> NDArray[np.float64]:
+    n, m = values.shape[0] // side, values.shape[1] // side
+    return values.reshape(n, side, m, side).sum(axis=(1, 3), dtype=np.float64)
+
+
+def _level_of_snr(noise: NoiseModel, snr: float) -> float:
+    """Level whose ratio to its noise is `snr`: the positive root of l² = snr² (shot l + read)."""
+    half = 0.5 * snr * snr * noise.shot
+    return half + float(np.sqrt(half * half + snr * snr * noise.read))
+
+
+SLOPE_ORDER: Final = 2
+"""Order of the polynomial that is taken off first: vignetting, a sky, shading of a wall are no detail."""
+
+MIN_RIDGE_PIXELS: Final = 30
+"""Fewer edge pixels do not give a width: nine of them would lie below its quantile (chosen)."""
+
+WIDTH_QUANTILE: Final = 0.3
+"""Soft edges of the scene widen the upper half of the widths, not the lower: on sharp photographs, half of
+each defocused by a disc of 2 px, this told the halves apart better than the median or the 15th percentile.
+Measured once, no command repeats it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Candidate windows of one photo; every array has one entry a window along axis 0.
+
+    Parameters
+    ----------
+    size : int
+        Side of every window in pixels.
+    rows, cols : ndarray of int64, shape (n,)
+        Top-left pixels.
+    r, phi : ndarray of float64, shape (n,)
+        Field position of the centres.
+    directions : ndarray of float64, shape (n, ORIENTATIONS)
+        Edge energy by gradient direction where r is high enough, over the energy of noise.
+    r_mean, r_kept : ndarray of float64, shape (n,)
+        Mean r weighted by edge energy, and the share of the energy where r is high enough.
+    eigenvalues : ndarray of float64, shape (n, 2)
+        Of the structure tensor, smaller first, over that of noise.
+    contrast : ndarray of float64, shape (n,)
+        Variance of the signal over variance of the noise; a slope, as of a sky, is no signal.
+    level, sigma : ndarray of float64, shape (n,)
+        Mean level and the noise's standard deviation there.
+    clipped, dark, missing : ndarray of float64, shape (n,)
+        Shares of the pixels.
+    width : ndarray of float64, shape (n,)
+        Width of the sharper edges as the sigma of a Gaussian in pixels; NaN where edges are few.
+    widest : ndarray of float64, shape (n,)
+        The same of the window's widest quarter: a depth step inside the window shows there.
+    elongation : ndarray of float64, shape (n, 2)
+        Cosine and sine parts, over twice the angle in image axes (columns to rows), of the squared
+        edge width relative to its mean; zero where unknown.
+    """
+
+    size: int
+    rows: NDArray[np.int64]
+    cols: NDArray[np.int64]
+    r: NDArray[np.float64]
+    phi: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    r_mean: NDArray[np.float64]
+    r_kept: NDArray[np.float64]
+    eigenvalues: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    level: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    clipped: NDArray[np.float64]
+    dark: NDArray[np.float64]
+    missing: NDArray[np.float64]
+    width: NDArray[np.float64]
+    widest: NDArray[np.float64]
+    elongation: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return int(self.rows.size)
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Windows:
+        """Return the windows that `index` picks."""
+        parts = {name: getattr(self, name) for name in self.__slots__ if name != "size"}
+        return Windows(size=self.size, **{name: part[index] for name, part in parts.items()})
+
+
+def windows_of(blocks: BlockSums, frame: Frame, noise: NoiseModel) -> Windows:
+    """Put the windows together from block sums; windows start at every block."""
+    size = blocks.side * BLOCKS_A_SIDE
+    area = size * size
+    level = _window_sum(blocks.level) / area
+    variance = _window_sum(blocks.square) / area - level**2 - _slope_variance(blocks)
+    noise_variance = np.maximum(noise.variance(level), 1e-12)
+    gradient_power = noise_variance * gradient_noise(1.0) ** 2
+    energy = _window_sum(blocks.energy)
+    lowest = automatic_threshold(blocks.histogram, blocks.level.size * blocks.side**2, FLAT_WINDOW**2)
+    kept = energy[..., lowest:].sum(axis=-1)
+    by_r = energy.sum(axis=1)
+    total = np.maximum(by_r.sum(axis=-1), 1e-12)
+    rows, cols = _corners(blocks)
+    half = (size - 1) / 2.0
+    r, phi = frame.polar(rows + half, cols + half)
+    return Windows(
+        size=size,
+        rows=rows,
+        cols=cols,
+        r=r,
+        phi=phi,
+        # The mean square of the modulus is twice that of a component, shared by all directions.
+        directions=kept / (2.0 * gradient_power * area / ORIENTATIONS)[:, None],
+        r_mean=by_r @ ((np.arange(R_BINS) + 0.5) / R_BINS) / total,
+        r_kept=kept.sum(axis=-1) / total,
+        eigenvalues=_eigenvalues(_window_sum(blocks.tensor)) / (area * gradient_power)[:, None],
+        contrast=(variance - noise_variance) / noise_variance,
+        level=level,
+        sigma=np.sqrt(noise_variance),
+        clipped=_window_sum(blocks.clipped) / area,
+        dark=_window_sum(blocks.dark) / area,
+        missing=_window_sum(blocks.missing) / area,
+        width=_typical_width(_window_sum(blocks.widths)),
+        widest=_widest_quarter(blocks.widths),
+        elongation=_elongation(_window_sum(blocks.width_sums)),
+    )
+
+
+def _window_sum(values: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Sum of every square of blocks, windows flattened: `(n, m, ...)` to `(windows, ...)`."""
+    out = np.asarray(values, dtype=np.float64)
+    for axis in (0, 1):
+        view = np.lib.stride_tricks.sliding_window_view(out, BLOCKS_A_SIDE, axis=axis)
+        out = view.sum(axis=-1)
+    return out.reshape(-1, *out.shape[2:])
+
+
+def _slope_variance(blocks: BlockSums) -> NDArray[np.float64]:
+    """Variance of the polynomial of order `SLOPE_ORDER` that fits the means of a window's blocks.
+
+    With M the polynomials without the constant averaged over blocks, G their covariance over the pixels and
+    m the 16 means, c = M^+ m and the variance is c' G c.
+    """
+    averaged, covariance = _slopes(blocks.side)
+    means = np.asarray(blocks.level, dtype=np.float64) / blocks.side**2
+    view = np.lib.stride_tricks.sliding_window_view(means, (BLOCKS_A_SIDE, BLOCKS_A_SIDE))
+    fit = view.reshape(-1, BLOCKS_A_SIDE**2) @ np.linalg.pinv(averaged).T
+    return np.asarray(np.einsum("ni,ij,nj->n", fit, covariance, fit))
+
+
+@lru_cache(maxsize=4)
+def _slopes(side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    size = side * BLOCKS_A_SIDE
+    t = np.linspace(-1.0, 1.0, size)
+    orders = range(SLOPE_ORDER + 1)
+    parts = [np.outer(t**i, t**j) for i in orders for j in orders if 0 < i + j <= SLOPE_ORDER]
+    basis = np.stack([part - part.mean() for part in parts])
+    averaged = basis.reshape(-1, BLOCKS_A_SIDE, side, BLOCKS_A_SIDE, side).mean(axis=(2, 4))
+    flat = basis.reshape(len(parts), -1)
+    return averaged.reshape(len(parts), -1).T, flat @ flat.T / size**2
+
+
+def _corners(blocks: BlockSums) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    n, m = (count - BLOCKS_A_SIDE + 1 for count in blocks.level.shape)
+    rows, cols = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
+    return blocks.row + rows.ravel() * blocks.side, blocks.col + cols.ravel() * blocks.side
+
+
+def _eigenvalues(tensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    rr, rc, cc = tensor.T
+    mean, spread = (rr + cc) / 2.0, np.hypot((rr - cc) / 2.0, rc)
+    return np.stack([np.maximum(mean - spread, 0.0), mean + spread], axis=1)
+
+
+def _typical_width(histogram: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quantile of binned widths, linear inside its bin."""
+    total = histogram.sum(axis=1)
+    below = histogram.cumsum(axis=1)
+    at = np.minimum((below < WIDTH_QUANTILE * total[:, None]).sum(axis=1), WIDTH_BINS - 1)
+    pick = np.arange(len(total))
+    inside = np.maximum(histogram[pick, at], 1.0)
+    part = 1.0 - (below[pick, at] - WIDTH_QUANTILE * total) / inside
+    return np.where(total >= MIN_RIDGE_PIXELS, (at + np.clip(part, 0.0, 1.0)) * WIDTH_STEP_PX, np.nan)
+
+
+def _widest_quarter(histograms: NDArray[np.int64]) -> NDArray[np.float64]:
+    half = BLOCKS_A_SIDE // 2
+    sums = np.asarray(histograms, dtype=np.float64)
+    for axis in (0, 1):
+        sums = np.lib.stride_tricks.sliding_window_view(sums, half, axis=axis).sum(axis=-1)
+    n, m = sums.shape[0] - half, sums.shape[1] - half
+    quarters = [sums[i : i + n, j : j + m].reshape(n * m, -1) for i in (0, half) for j in (0, half)]
+    widths = np.stack([_typical_width(part) for part in quarters])
+    return np.where(np.isnan(widths).all(axis=0), np.nan, np.nan_to_num(widths).max(axis=0))
+
+
+def _elongation(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fit s² = a (1 + c cos 2t + s sin 2t) to the mean squared widths by direction."""
+    angle = 2.0 * np.pi * np.arange(ORIENTATIONS) / ORIENTATIONS
+    basis = np.stack([np.ones(ORIENTATIONS), np.cos(angle), np.sin(angle)], axis=1)
+    count, square = sums[..., 0], sums[..., 1]
+    # Directions weigh equally up to 20 pixels, so that one long edge does not decide alone.
+    weight = np.minimum(count, 20.0)
+    mean = square / np.maximum(count, 1.0)
+    normal = np.einsum("nd,di,dj->nij", weight, basis, basis) + 1e-3 * np.eye(3)
+    fit = np.linalg.solve(normal, np.einsum("nd,nd,di->ni", weight, mean, basis)[..., None])[..., 0]
+    known = ((count >= 5.0).sum(axis=1) >= ORIENTATIONS // 2) & (fit[:, 0] > 1e-3)
+    relative = fit[:, 1:] / np.maximum(fit[:, :1], 1e-3)
+    relative /= np.maximum(np.hypot(*relative.T), 1.0)[:, None]
+    return np.where(known[:, None], relative, 0.0)

@@ -249,29 +249,14 @@ class PatchRecurrence:
     min over x, k of |y - k * x|² + lambda1 rho(x, x^a) + lambda2 |k|²: alternating the match of
     patches, a Wiener-like image step and a least-squares kernel step, coarse to fine. All patches
     of a set share k: their normal equations are summed with weights 1/noise².
-
-    Parameters
-    ----------
-    levels : int
-        Levels of the pyramid, each 4/3 smaller.
-    iterations : int
-        Alternations on each level.
-    beta : float
-        Weight of the matched image in the image step; too large makes kernels too wide.
-    bandwidth : float
-        h of the match, in ranges of the patch; at least twice the noise.
-    ridge : float
-        lambda2 over the mean diagonal of the normal matrix.
-    support : int or None
-        Odd side of the estimated kernel; None takes it from `size`.
     """
 
-    levels: int = 6
-    iterations: int = 4
-    beta: float = 0.2
-    bandwidth: float = 0.03
-    ridge: float = 2.5e-2
-    support: int | None = None
+    levels: int = 6  # levels of the pyramid, each 4/3 smaller
+    iterations: int = 4  # alternations on each level
+    beta: float = 0.2  # weight of the matched image in the image step; too large makes kernels too wide
+    bandwidth: float = 0.03  # h of the match, in ranges of the patch; at least twice the noise
+    ridge: float = 2.5e-2  # lambda2 over the mean diagonal of the normal matrix
+    support: int | None = None  # odd side of the estimated kernel; None takes it from `size`
 
     name = "michaeli-irani"
     version = 1

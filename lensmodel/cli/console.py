@@ -53,18 +53,10 @@ class _Lines(logging.Formatter):
 
 @dataclass(frozen=True, slots=True)
 class Display:
-    """How much is said.
+    """How much is said."""
 
-    Parameters
-    ----------
-    quiet : bool
-        Only errors; and results where they were asked for as JSON.
-    verbose : int
-        0 warnings, 1 what happens, 2 all that is logged.
-    """
-
-    quiet: bool = False
-    verbose: int = 0
+    quiet: bool = False  # only errors; and results where they were asked for as JSON
+    verbose: int = 0  # 0 warnings, 1 what happens, 2 all that is logged
 
     @classmethod
     def of(cls, context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Display:

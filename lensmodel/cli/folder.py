@@ -48,19 +48,11 @@ ENDING: Final = ".lensprofile"
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """What the options said of learning.
+    """What the options said of learning."""
 
-    Parameters
-    ----------
-    profiles : Path or None
-        Folder of the lens profiles; None is `lenses` in the folder of the corrected photos.
-    most : int
-        Photos that each group is learned from.
-    estimator, selector : str
-    """
-
+    # folder of the lens profiles; None is `lenses` in the folder of the corrected photos
     profiles: Path | None
-    most: int
+    most: int  # photos that each group is learned from
     estimator: str
     selector: str
 
@@ -364,19 +356,12 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class PhotoGroup:
-    """Photos of one lens, of one body where the lens has no serial, and of about one focal length.
+    """Photos of one lens, of one body where the lens has no serial, and of about one focal length."""
 
-    Parameters
-    ----------
-    shots : tuple of Shot
-        By name; at least one.
-    name : str
-        Of the lens profile that the group belongs to, without an ending. A lens that the files name has one
-        for all its focal lengths, since a profile tells them apart; photos that name no lens may be of as
-        many lenses as there are focal lengths.
-    """
-
-    shots: tuple[Shot, ...]
+    shots: tuple[Shot, ...]  # by name; at least one
+    # Of the lens profile that the group belongs to, without an ending. A lens that the files name has one for
+    # all its focal lengths, since a profile tells them apart; photos that name no lens may be of as many
+    # lenses as there are focal lengths.
     name: str
 
     @property

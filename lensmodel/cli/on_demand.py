@@ -13,21 +13,12 @@ from typer.core import TyperCommand, TyperGroup
 
 @dataclass(frozen=True, slots=True)
 class CommandEntry:
-    """What the list of commands says of one, and where it is.
+    """What the list of commands says of one, and where it is."""
 
-    Parameters
-    ----------
-    home : str
-        Module and name of the function, or of the `typer.Typer` of a command with commands of its own.
-    summary : str
-        First sentence of its help.
-    hidden : bool
-        Whether the list leaves it out.
-    """
-
+    # module and name of the function, or of the `typer.Typer` of a command with commands of its own
     home: str
-    summary: str
-    hidden: bool = False
+    summary: str  # first sentence of its help
+    hidden: bool = False  # whether the list leaves it out
 
 
 class OnDemand(TyperGroup):

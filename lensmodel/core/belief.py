@@ -33,21 +33,11 @@ _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
-    """Mean and uncertainty of a PSF.
+    """Mean and uncertainty of a PSF."""
 
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-        The mean.
-    variance : ndarray, shape (64, 33)
-        Expected |H - E[H]|² at the `rfft2` frequencies of `GRID`.
-    error : float
-        Expected relative L2 distance of the true kernel from the mean.
-    """
-
-    kernel: Kernel
-    variance: NDArray[np.float32]
-    error: float
+    kernel: Kernel  # (k, k), the mean
+    variance: NDArray[np.float32]  # (64, 33), expected |H - E[H]|² at the `rfft2` frequencies of `GRID`
+    error: float  # expected relative L2 distance of the true kernel from the mean
 
     @classmethod
     def of_error(cls, kernel: Kernel, error: float) -> Belief:

@@ -33,19 +33,12 @@ def zone_of(r: float) -> Zone:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The sensor frame of a photo, in sensor orientation.
+    """The sensor frame of a photo, in sensor orientation."""
 
-    Parameters
-    ----------
-    height, width : int
-        Size in pixels.
-    circle_px : float, optional
-        Half diagonal in pixels of the larger frame of which this one is the middle, as in crop mode: r is
-        counted in it. None where this is the whole frame.
-    """
-
-    height: int
+    height: int  # size in pixels
     width: int
+    # Half diagonal in pixels of the larger frame of which this one is the middle, as in crop mode: r is
+    # counted in it. None where this is the whole frame.
     circle_px: float | None = None
 
     def __post_init__(self) -> None:

@@ -145,24 +145,12 @@ def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[
 
 @dataclass(frozen=True, slots=True)
 class KernelDistance:
-    """How far one kernel is from another after the best sub-pixel shift.
+    """How far one kernel is from another after the best sub-pixel shift."""
 
-    Parameters
-    ----------
-    ncc : float
-        Normalised cross-correlation; 1 for equal shapes.
-    rel_l2 : float
-        |a - b| / |b|.
-    mtf_rmse : float
-        Root mean square difference of the moduli for |f| <= 0.5 cycles/pixel.
-    shift : tuple of float
-        The shift `(row, col)` in pixels that was applied to `a`.
-    """
-
-    ncc: float
-    rel_l2: float
-    mtf_rmse: float
-    shift: tuple[float, float]
+    ncc: float  # normalised cross-correlation; 1 for equal shapes
+    rel_l2: float  # |a - b| / |b|
+    mtf_rmse: float  # root mean square difference of the moduli for |f| <= 0.5 cycles/pixel
+    shift: tuple[float, float]  # the shift `(row, col)` in pixels that was applied to `a`
 
 
 def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDistance:
@@ -220,26 +208,13 @@ KINDS: Final[tuple[PatchKind, ...]] = get_args(PatchKind)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedPatch:
-    """What a patch of a photo says of the lens without a kernel: the input of attention over many patches.
+    """What a patch of a photo says of the lens without a kernel: the input of attention over many patches."""
 
-    Parameters
-    ----------
-    statistics : ndarray of float16, shape (n,)
-        Statistics of its pixels (`lensmodel.neural.statistics`), turned into the octant of its place.
-    token : ndarray of float16, shape (192,)
-        What the network made of them beside the other patches of the photo.
-    kind : {"raw", "tiff", "jpeg"}
-        Kind of file, which tells how its pixels were made.
-
-    Raises
-    ------
-    InvalidInputError
-        If a number is not finite, the token has another length, or there is no such kind.
-    """
-
+    # (n,), statistics of its pixels (`lensmodel.neural.statistics`), turned into the octant of its place
     statistics: npt.NDArray[np.float16]
+    # (192,), what the network made of them beside the other patches of the photo
     token: npt.NDArray[np.float16]
-    kind: PatchKind = "raw"
+    kind: PatchKind = "raw"  # kind of file, which tells how its pixels were made
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -25,20 +25,13 @@ class Registry(Generic[T]):
 
         [project.entry-points."lensmodel.estimators"]
         mine = "my_package:MyEstimator"
-
-    Parameters
-    ----------
-    kind : str
-        What the entries are, for error messages.
-    entries : mapping of str to callable
-        Factories by name; each returns an entry from keyword parameters.
-    group : str
-        Entry points of this group in installed packages are entries too; empty for none. They are loaded when
-        they are first asked for, and never replace an entry that is there.
     """
 
-    kind: str
+    kind: str  # what the entries are, for error messages
+    # factories by name; each returns an entry from keyword parameters
     entries: Mapping[str, Callable[..., T]]
+    # Entry points of this group in installed packages are entries too; empty for none. They are loaded when
+    # they are first asked for, and never replace an entry that is there.
     group: str = ""
 
     def __post_init__(self) -> None:

@@ -231,22 +231,10 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True)
 class EdgeGain:
-    """What a correction did to the edges of a photographed chart in one zone: medians.
+    """What a correction did to the edges of a photographed chart in one zone: medians."""
 
-    Parameters
-    ----------
-    edges : int
-        How many were measured before and after.
-    mtf50_before, mtf50_after : float
-        Cycles/pixel.
-    gain : float
-        MTF50 after over before.
-    overshoot_after : float
-        How far the edge profile rises above its bright level, in percent of the step.
-    """
-
-    edges: int
-    mtf50_before: float
+    edges: int  # how many were measured before and after
+    mtf50_before: float  # cycles/pixel
     mtf50_after: float
-    gain: float
-    overshoot_after: float
+    gain: float  # MTF50 after over before
+    overshoot_after: float  # how far the edge profile rises above its bright level, in percent of the step

@@ -17,30 +17,14 @@ PREFIX = "measured-"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredPsf:
-    """A PSF measured at one place of a photo.
+    """A PSF measured at one place of a photo."""
 
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-        Impulse response on the sensor's grid, centre of mass on the middle pixel.
-    position : FieldPosition
-        Middle of what it was measured on.
-    channel : {"r", "g", "b"}
-        Colour plane.
-    error : float
-        Relative L2 distance to the truth that the method expects.
-    pixel : tuple of float
-        Middle of what it was measured on, (row, col).
-    side : int
-        Side in pixels of the window that it was measured on.
-    """
-
-    kernel: Kernel
-    position: FieldPosition
-    channel: Channel
-    error: float
-    pixel: tuple[float, float]
-    side: int
+    kernel: Kernel  # (k, k), impulse response on the sensor's grid, centre of mass on the middle pixel
+    position: FieldPosition  # middle of what it was measured on
+    channel: Channel  # colour plane
+    error: float  # relative L2 distance to the truth that the method expects
+    pixel: tuple[float, float]  # middle of what it was measured on, (row, col)
+    side: int  # side in pixels of the window that it was measured on
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))

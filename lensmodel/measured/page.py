@@ -59,14 +59,9 @@ class TargetPage:
     """A page, by the number of its samples along the long side.
 
     Coordinates of the page are `(y, x)` in samples; (0, 0) is the middle of its top left sample.
-
-    Parameters
-    ----------
-    detail : int
-        Samples along the long side.
     """
 
-    detail: int
+    detail: int  # samples along the long side
 
     def __post_init__(self) -> None:
         if not _SMALLEST <= self.detail <= _LARGEST:

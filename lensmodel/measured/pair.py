@@ -75,19 +75,11 @@ _FEWEST: Final = 64  # points that a fit of brightness takes: some ten for each 
 
 @dataclass(frozen=True, slots=True)
 class AperturePair:
-    """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more.
+    """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more."""
 
-    Parameters
-    ----------
-    across, down : int
-        Cells of the frame, in each of which the window with most detail is taken.
-    side : int
-        Side of a window in pixels.
-    """
-
-    across: int = 8
+    across: int = 8  # cells of the frame, in each of which the window with most detail is taken
     down: int = 6
-    side: int = _SIDE
+    side: int = _SIDE  # side of a window in pixels
 
     name: ClassVar[str] = "pair"
     version: ClassVar[int] = 1

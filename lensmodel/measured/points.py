@@ -53,19 +53,11 @@ _SURE: Final = 0.45
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """PSFs from isolated, unsaturated points of light.
+    """PSFs from isolated, unsaturated points of light."""
 
-    Parameters
-    ----------
-    across, down : int
-        Cells of the frame; the points of a cell are stacked.
-    detector : str
-        "auto" or "own", see `find_lights`.
-    """
-
-    across: int = 7
+    across: int = 7  # cells of the frame; the points of a cell are stacked
     down: int = 5
-    detector: str = "auto"
+    detector: str = "auto"  # "auto" or "own", see `find_lights`
 
     name: ClassVar[str] = "points"
     version: ClassVar[int] = 1

@@ -36,21 +36,11 @@ case: less would drop good ones where nearly all are (chosen)."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Warp:
-    """Pixels of a photo to places of a reference.
+    """Pixels of a photo to places of a reference."""
 
-    Parameters
-    ----------
-    homography : ndarray, shape (3, 3)
-        Of (row, col, 1) to the reference's (row, col, 1).
-    bend : ndarray, shape (terms, 2)
-        Polynomial in reference units.
-    frame : Frame
-        Of the photo.
-    """
-
-    homography: NDArray[np.float64]
-    bend: NDArray[np.float64]
-    frame: Frame
+    homography: NDArray[np.float64]  # (3, 3), of (row, col, 1) to the reference's (row, col, 1)
+    bend: NDArray[np.float64]  # (terms, 2), polynomial in reference units
+    frame: Frame  # of the photo
 
     @classmethod
     def plain(cls, homography: NDArray[np.float64], frame: Frame) -> Warp:

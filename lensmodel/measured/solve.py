@@ -74,20 +74,11 @@ def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smooth:
-    """What slow changes explain of a window and of its latent picture.
+    """What slow changes explain of a window and of its latent picture."""
 
-    Parameters
-    ----------
-    basis : ndarray, shape (H, W, n)
-        Terms that are orthonormal under the weight, as single precision.
-    of_y : ndarray, shape (n,)
-        Their share of what was observed.
-    of_x : ndarray, shape (n, k²)
-        Their share of x(p - u), for each u in the order of the kernel's values.
-    """
-
-    basis: NDArray[np.float32]
-    of_y: NDArray[np.float64]
+    basis: NDArray[np.float32]  # (H, W, n), terms that are orthonormal under the weight, as single precision
+    of_y: NDArray[np.float64]  # (n,), their share of what was observed
+    # (n, k²), their share of x(p - u), for each u in the order of the kernel's values
     of_x: NDArray[np.float64]
 
     @classmethod
@@ -154,30 +145,15 @@ _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A kernel and how well it explains its window.
+    """A kernel and how well it explains its window."""
 
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-        Not centred.
-    light : float
-        Sum of the kernel before it was normalised: what the latent picture must be multiplied with.
-    offset : float
-        The mean of c.
-    shift : tuple of float
-        Its centre of mass, (row, col) pixels from the middle.
-    error : float
-        Expected relative L2.
-    misfit : float
-        Mean squared residual over that of the noise: q.
-    """
-
-    kernel: Kernel
+    kernel: Kernel  # (k, k), not centred
+    # sum of the kernel before it was normalised: what the latent picture must be multiplied with
     light: float
-    offset: float
-    shift: tuple[float, float]
-    error: float
-    misfit: float
+    offset: float  # the mean of c
+    shift: tuple[float, float]  # its centre of mass, (row, col) pixels from the middle
+    error: float  # expected relative L2
+    misfit: float  # mean squared residual over that of the noise: q
 
 
 def solve(

@@ -74,22 +74,13 @@ _TRIED: Final = 6  # windows looked at along each axis for one that is measured:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Non-blind PSFs from one photo of the printed target.
+    """Non-blind PSFs from one photo of the printed target."""
 
-    Parameters
-    ----------
-    across, down : int
-        Places along the sides of the frame; fewer where windows would overlap by more than a quarter.
-    side : int
-        Side of a window in pixels.
-    details : tuple of int
-        Pages that it may be, by the samples along their long side.
-    """
-
+    # places along the sides of the frame; fewer where windows would overlap by more than a quarter
     across: int = 9
     down: int = 6
-    side: int = _SIDE
-    details: tuple[int, ...] = DETAILS
+    side: int = _SIDE  # side of a window in pixels
+    details: tuple[int, ...] = DETAILS  # pages that it may be, by the samples along their long side
 
     name: ClassVar[str] = "target"
     version: ClassVar[int] = 1
@@ -269,20 +260,11 @@ _LIGHT_ROUNDS: Final = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPage:
-    """A page where it lies in a photo.
-
-    Parameters
-    ----------
-    page : TargetPage
-    warp : Warp
-        Pixels of the photo to samples of the page.
-    tones : tuple of float
-        t1, t2, t3 of the print.
-    """
+    """A page where it lies in a photo."""
 
     page: TargetPage
-    warp: Warp
-    tones: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    warp: Warp  # pixels of the photo to samples of the page
+    tones: tuple[float, float, float] = (1.0, 0.0, 0.0)  # t1, t2, t3 of the print
 
     def window(self, row: float, col: float, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Light of the page as pixels would see it that are points; no frequency beyond theirs."""
@@ -431,18 +413,10 @@ _FEWEST: Final = 64  # pixels: five times as many as there are terms
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Illumination:
-    """A quadratic in row and column whose mean over its square window is 1.
+    """A quadratic in row and column whose mean over its square window is 1."""
 
-    Parameters
-    ----------
-    terms : ndarray, shape (6,)
-        Of `quadratic`, in sides of the window from its middle.
-    side : int
-        Side of the window in pixels.
-    """
-
-    terms: NDArray[np.float64]
-    side: int
+    terms: NDArray[np.float64]  # (6,), of `quadratic`, in sides of the window from its middle
+    side: int  # side of the window in pixels
 
     @classmethod
     def even(cls, side: int) -> Illumination:

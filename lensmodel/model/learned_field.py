@@ -45,21 +45,11 @@ _ANSWERS: Final = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attended:
-    """What the network answers to one question.
-
-    Parameters
-    ----------
-    answer : FieldAnswer
-    rows : ndarray of int, shape (m,)
-        Samples that it attended to, of `answer.weights`.
-    pitch_um : float or None
-        Pixel pitch of the kernels.
-    support : Support
-    """
+    """What the network answers to one question."""
 
     answer: FieldAnswer
-    rows: NDArray[np.intp]
-    pitch_um: float | None
+    rows: NDArray[np.intp]  # (m,), samples that it attended to, of `answer.weights`
+    pitch_um: float | None  # pixel pitch of the kernels
     support: support.Support
 
     def kernel(self, channel: Channel, size: int, pitch_um: float | None) -> Kernel:
@@ -76,26 +66,13 @@ class Attended:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Encoded patches as arrays.
+    """Encoded patches as arrays."""
 
-    Parameters
-    ----------
-    tokens : ndarray of float16, shape (n, 192)
-    xy : ndarray, shape (n, 2)
-        Places in half diagonals, to the right and up.
-    where : ndarray, shape (n, 5)
-        Places and settings in units of `support`.
-    pitch : ndarray, shape (n,)
-        Pixel pitch in micrometres; NaN = unknown.
-    photos : ndarray of str, shape (n,)
-    conditions : tuple of Conditions, n
-    """
-
-    tokens: NDArray[np.float16]
-    xy: NDArray[np.float64]
-    where: NDArray[np.float64]
-    pitch: NDArray[np.float64]
-    photos: NDArray[np.object_]
+    tokens: NDArray[np.float16]  # (n, 192)
+    xy: NDArray[np.float64]  # (n, 2), places in half diagonals, to the right and up
+    where: NDArray[np.float64]  # (n, 5), places and settings in units of `support`
+    pitch: NDArray[np.float64]  # (n,), pixel pitch in micrometres; NaN = unknown
+    photos: NDArray[np.object_]  # (n,)
     conditions: tuple[Conditions, ...]
 
     @classmethod

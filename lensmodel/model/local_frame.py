@@ -37,28 +37,15 @@ MIRRORED = np.array([1.0, -1.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalKernels:
-    """Splines of the samples with the frames that they belong to.
+    """Splines of the samples with the frames that they belong to."""
 
-    Parameters
-    ----------
-    side : int
-        Odd side of the stored kernels.
-    splines : ndarray of float32, shape (n, (finer (side - 1) + 1)^2)
-        Coefficients.
-    angles, radii : ndarray, shape (n,)
-        phi of the places in radians; radius of the light in steps of the grid.
-    widths : ndarray, shape (n, 2)
-        Scales (s_u, s_v) of the places.
-    finer : int
-        Coefficients for each pixel along an axis.
-    """
-
-    side: int
-    splines: NDArray[np.float32]
+    side: int  # odd side of the stored kernels
+    splines: NDArray[np.float32]  # (n, (finer (side - 1), coefficients
+    # (n,), phi of the places in radians; radius of the light in steps of the grid
     angles: NDArray[np.float64]
     radii: NDArray[np.float64]
-    widths: NDArray[np.float64]
-    finer: int = FINER
+    widths: NDArray[np.float64]  # (n, 2), scales (s_u, s_v) of the places
+    finer: int = FINER  # coefficients for each pixel along an axis
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], where: NDArray[np.float64], field: WidthField) -> LocalKernels:

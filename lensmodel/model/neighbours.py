@@ -27,21 +27,11 @@ _MANY: Final = 4096  # fewer samples are looked through as fast as a tree (chose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answers:
-    """Which samples answer which questions.
+    """Which samples answer which questions."""
 
-    Parameters
-    ----------
-    rows : ndarray of int, shape (m,)
-        Samples, one question after the other.
-    weights : ndarray, shape (m,)
-        Sum 1 in each question.
-    starts : ndarray of int, shape (questions + 1,)
-        Where each question begins among the m.
-    """
-
-    rows: NDArray[np.intp]
-    weights: NDArray[np.float64]
-    starts: NDArray[np.intp]
+    rows: NDArray[np.intp]  # (m,), samples, one question after the other
+    weights: NDArray[np.float64]  # (m,), sum 1 in each question
+    starts: NDArray[np.intp]  # (questions + 1,), where each question begins among the m
 
     @property
     def counts(self) -> NDArray[np.intp]:
@@ -51,21 +41,11 @@ class Answers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Samples by their points and weights, in kd-trees that are built when they are first asked.
+    """Samples by their points and weights, in kd-trees that are built when they are first asked."""
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 7)
-        Of `variables`; NaN = unknown.
-    weights : ndarray, shape (n,)
-        Samples of weight 0 take no part.
-    scale : ndarray, shape (7,)
-        Bandwidths.
-    """
-
-    points: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    points: NDArray[np.float64]  # (n, 7), of `variables`; NaN = unknown
+    weights: NDArray[np.float64]  # (n,), samples of weight 0 take no part
+    scale: NDArray[np.float64]  # (7,), bandwidths
     _trees: dict[tuple[int, ...], scipy.spatial.cKDTree] = field(default_factory=dict)
 
     def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:

@@ -51,38 +51,23 @@ _UNREADABLE = (
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A body that photos of a lens were taken with; the lens may be part of it.
+    """A body that photos of a lens were taken with; the lens may be part of it."""
 
-    Parameters
-    ----------
-    maker, model, serial : str, optional
-        As the photos say; None where they do not.
-    """
-
-    maker: str | None = None
+    maker: str | None = None  # as the photos say; None where they do not
     model: str | None = None
     serial: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensProfile:
-    """A model with what is known of its lens and of the photos that it came from.
-
-    Parameters
-    ----------
-    model : LensModel
-    lens : dict
-        Texts: maker, model, serial, label; whatever is known.
-    photos : dict
-        File name of each photo by the id that samples carry.
-    cameras : tuple of Camera
-        What these were taken with, each once; empty where no photo says.
-    """
+    """A model with what is known of its lens and of the photos that it came from."""
 
     model: LensModel
+    # texts: maker, model, serial, label; whatever is known
     lens: dict[str, str] = field(default_factory=dict)
+    # file name of each photo by the id that samples carry
     photos: dict[str, str] = field(default_factory=dict)
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[Camera, ...] = ()  # what these were taken with, each once; empty where no photo says
 
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:

@@ -41,35 +41,18 @@ _WIDEST: Final = 255
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """Kernels of samples, prepared for questions.
+    """Kernels of samples, prepared for questions."""
 
-    Parameters
-    ----------
-    pitch_um : float or None
-        Pixel pitch that all kernels are brought to; None where none is known.
-    widths : WidthField
-    local : LocalKernels
-    where : ndarray, shape (n, 5)
-        Points of the samples in units of `support`.
-    validation : CrossValidation
-    expected : ndarray, shape (n,)
-        Errors that the estimators expect of their samples; 0 where they expect nothing.
-    photos : ndarray of str, shape (n,)
-    bandwidth : dict
-        Bandwidths in use.
-    neighbourhood : Neighbourhood
-        Which samples answer a question, and with which weights.
-    """
-
-    pitch_um: float | None
+    pitch_um: float | None  # pixel pitch that all kernels are brought to; None where none is known
     widths: WidthField
     local: LocalKernels
-    where: NDArray[np.float64]
+    where: NDArray[np.float64]  # (n, 5), points of the samples in units of `support`
     validation: CrossValidation
+    # (n,), errors that the estimators expect of their samples; 0 where they expect nothing
     expected: NDArray[np.float64]
-    photos: NDArray[np.object_]
-    bandwidth: dict[str, float]
-    neighbourhood: Neighbourhood
+    photos: NDArray[np.object_]  # (n,)
+    bandwidth: dict[str, float]  # bandwidths in use
+    neighbourhood: Neighbourhood  # which samples answer a question, and with which weights
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Regression:

@@ -19,22 +19,13 @@ _INFINITY: Final = "infinity"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedSamples:
-    """Samples as JSON and arrays.
+    """Samples as JSON and arrays."""
 
-    Parameters
-    ----------
-    entries : list of dict
-        Named fields of each sample, of what `json` can write; `size` is the side of its kernel, `encoded` the
-        row of its patch in `encoded`, which the channels of one patch share, or None.
-    kernels : ndarray of float32, shape (n, k, k)
-        Zeros around kernels that are smaller than the largest.
-    encoded : ndarray of uint8, shape (m, bytes)
-        `EncodedPatch.to_bytes` of the patches.
-    """
-
+    # named fields of each sample, of what `json` can write; `size` is the side of its kernel, `encoded` the
+    # row of its patch in `encoded`, which the channels of one patch share, or None
     entries: list[dict[str, Any]]
-    kernels: NDArray[np.float32]
-    encoded: NDArray[np.uint8]
+    kernels: NDArray[np.float32]  # (n, k, k), zeros around kernels that are smaller than the largest
+    encoded: NDArray[np.uint8]  # (m, bytes), `EncodedPatch.to_bytes` of the patches
 
 
 def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:

@@ -61,51 +61,26 @@ _LISTED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """A photo or sample that counts less than it claimed.
+    """A photo or sample that counts less than it claimed."""
 
-    Parameters
-    ----------
-    photo : str
-        Photo id as in the samples.
-    sample : int or None
-        Row of the sample in the model; None = the whole photo.
-    factor : float
-        What its weight was multiplied by, 0..1.
-    error : float
-        Its relative L2 against the model of the other photos (median, for a photo).
-    reason : str
-        In plain words.
-    """
-
-    photo: str
-    sample: int | None
-    factor: float
-    error: float
-    reason: str
+    photo: str  # photo id as in the samples
+    sample: int | None  # row of the sample in the model; None = the whole photo
+    factor: float  # what its weight was multiplied by, 0..1
+    error: float  # its relative L2 against the model of the other photos (median, for a photo)
+    reason: str  # in plain words
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Samples prepared for cross-validation.
+    """Samples prepared for cross-validation."""
 
-    Parameters
-    ----------
-    gram, mirrored : ndarray, shape (n, n)
-        Products <C_i, C_j> and <C_i, M C_j>, M the reflection v -> -v.
-    place, turn, others : ndarray, shape (n, n)
-        Squared distances in r, in phi and in the settings, in bandwidths.
-    claims : ndarray, shape (n,)
-    groups : ndarray of int, shape (n,)
-        Samples that are held out together.
-    """
-
-    gram: NDArray[np.float64]
+    gram: NDArray[np.float64]  # (n, n), products <C_i, C_j> and <C_i, M C_j>, M the reflection v -> -v
     mirrored: NDArray[np.float64]
-    place: NDArray[np.float64]
+    place: NDArray[np.float64]  # (n, n), squared distances in r, in phi and in the settings, in bandwidths
     turn: NDArray[np.float64]
     others: NDArray[np.float64]
-    claims: NDArray[np.float64]
-    groups: NDArray[np.intp]
+    claims: NDArray[np.float64]  # (n,)
+    groups: NDArray[np.intp]  # (n,), samples that are held out together
 
     @classmethod
     def of(
@@ -287,17 +262,10 @@ def _reason(these: Sequence[PsfSample], others: Sequence[PsfSample]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossValidation:
-    """What the samples say of each other.
+    """What the samples say of each other."""
 
-    Parameters
-    ----------
-    weights, errors, noise : ndarray, shape (n,)
-        weights after robust weighting; held-out relative L2; the part of its square that is the samples'
-        own scatter.
-    choice : Choice
-    flags : tuple of Flag
-    """
-
+    # (n,), weights after robust weighting; held-out relative L2; the part of its square that is the samples'
+    # own scatter
     weights: NDArray[np.float64]
     errors: NDArray[np.float64]
     noise: NDArray[np.float64]

@@ -40,21 +40,12 @@ Scale = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WidthField:
-    """Widths (s_u, s_v) of the PSF over the field, relative to a reference width of the model.
+    """Widths (s_u, s_v) of the PSF over the field, relative to a reference width of the model."""
 
-    Parameters
-    ----------
-    slopes : ndarray, shape (m, 2) or None
-        Coefficients of log s_u and log s_v; None = one width everywhere.
-    reference : float
-        Logarithm of the width that counts as 1.
-    stops, focal, wavelength : float
-        Origins of the settings, where terms of them are zero.
-    """
-
+    # (m, 2), coefficients of log s_u and log s_v; None = one width everywhere
     slopes: NDArray[np.float64] | None = None
-    reference: float = 0.0
-    stops: float = 0.0
+    reference: float = 0.0  # logarithm of the width that counts as 1
+    stops: float = 0.0  # origins of the settings, where terms of them are zero
     focal: float = 0.0
     wavelength: float = WAVELENGTH_NM["g"]
 

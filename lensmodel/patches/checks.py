@@ -50,29 +50,16 @@ _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Details:
-    """Second look at some windows; every array has one entry a window along axis 0.
+    """Second look at some windows; every array has one entry a window along axis 0."""
 
-    Parameters
-    ----------
-    information : ndarray of float64, shape (n, BANDS, SECTORS)
-        Natural logarithm of power over noise by radial band and angular sector.
-    period : ndarray of float64, shape (n,)
-        Highest separate peak of the autocorrelation, 1 for a perfect period.
-    blockiness : ndarray of float64, shape (n,)
-        Steps on an 8 px grid over steps off it; 1 where there is none.
-    blob : ndarray of int64, shape (n,)
-        Pixels of the largest connected clipped area.
-    kurtosis : ndarray of float64, shape (n,)
-        Of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges.
-    evidence : ndarray of float64, shape (n,)
-        Bits a frequency between 0.1 and 0.4 cycles/pixel, mean of log2(1 + S/N); 0 for noise.
-    """
-
+    # (n, BANDS, SECTORS), natural logarithm of power over noise by radial band and angular sector
     information: NDArray[np.float64]
-    period: NDArray[np.float64]
-    blockiness: NDArray[np.float64]
-    blob: NDArray[np.int64]
+    period: NDArray[np.float64]  # (n,), highest separate peak of the autocorrelation, 1 for a perfect period
+    blockiness: NDArray[np.float64]  # (n,), steps on an 8 px grid over steps off it; 1 where there is none
+    blob: NDArray[np.int64]  # (n,), pixels of the largest connected clipped area
+    # (n,), of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges
     kurtosis: NDArray[np.float64]
+    # (n,), bits a frequency between 0.1 and 0.4 cycles/pixel, mean of log2(1 + S/N); 0 for noise
     evidence: NDArray[np.float64]
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Details:

@@ -87,28 +87,14 @@ def features_of(windows: Windows, looked: Details) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TreeEnsemble:
-    """Sum of regression trees, as plain arrays.
+    """Sum of regression trees, as plain arrays."""
 
-    Parameters
-    ----------
-    start : float
-        Value before the first tree.
-    feature : ndarray of int16, shape (trees, nodes)
-        Column that an inner node asks for; -1 at a leaf.
-    threshold : ndarray of float32, shape (trees, nodes)
-        Values up to it go left.
-    left, right : ndarray of int16, shape (trees, nodes)
-        Numbers of the children; a leaf points to itself.
-    value : ndarray of float32, shape (trees, nodes)
-        What a leaf adds, the learning rate included.
-    """
-
-    start: float
-    feature: NDArray[np.int16]
-    threshold: NDArray[np.float32]
-    left: NDArray[np.int16]
+    start: float  # value before the first tree
+    feature: NDArray[np.int16]  # (trees, nodes), column that an inner node asks for; -1 at a leaf
+    threshold: NDArray[np.float32]  # (trees, nodes), values up to it go left
+    left: NDArray[np.int16]  # (trees, nodes), numbers of the children; a leaf points to itself
     right: NDArray[np.int16]
-    value: NDArray[np.float32]
+    value: NDArray[np.float32]  # (trees, nodes), what a leaf adds, the learning rate included
 
     @classmethod
     def load(cls, path: Path = MODEL) -> TreeEnsemble:

@@ -101,14 +101,9 @@ class RMapSelector:
     smallest entry, and S/N the spectrum over noise in 3 bands by 8 sectors::
 
         score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / full_marks
-
-    Parameters
-    ----------
-    full_marks : float
-        What counts as 1.
     """
 
-    full_marks: float = 8.0
+    full_marks: float = 8.0  # what counts as 1
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
         """Return one score a window; see `Selector`."""

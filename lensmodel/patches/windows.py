@@ -50,28 +50,14 @@ REASONS: Final[tuple[Reason, ...]] = get_args(Reason)
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A window of a photo that tells about the PSF.
+    """A window of a photo that tells about the PSF."""
 
-    Parameters
-    ----------
-    row, col : int
-        Top-left pixel.
-    size : int
-        Side in pixels.
-    position : FieldPosition
-        Of the window's centre.
-    score : float
-        How much it tells, 0 to 1.
-    cell : int
-        Number of the field cell; patches of one cell may share one kernel.
-    """
-
-    row: int
+    row: int  # top-left pixel
     col: int
-    size: int
-    position: FieldPosition
-    score: float
-    cell: int
+    size: int  # side in pixels
+    position: FieldPosition  # of the window's centre
+    score: float  # how much it tells, 0 to 1
+    cell: int  # number of the field cell; patches of one cell may share one kernel
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,24 +72,14 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The outcome of patch selection on one plane.
+    """The outcome of patch selection on one plane."""
 
-    Parameters
-    ----------
-    patches : tuple of Patch
-        Ordered by cell, the best of each cell first.
-    rejected : tuple of Rejection
-        At most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons.
-    counts : mapping of str to int
-        How many windows every reason holds for, complete.
-    warnings : tuple of str
-        What concerns the photo as a whole, in words for the user.
-    """
-
-    patches: tuple[Patch, ...]
+    patches: tuple[Patch, ...]  # ordered by cell, the best of each cell first
+    # at most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons
     rejected: tuple[Rejection, ...]
+    # how many windows every reason holds for, complete
     counts: Mapping[str, int] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what concerns the photo as a whole, in words for the user
 
 
 ORIENTATIONS: Final = 8
@@ -138,42 +114,24 @@ _STRIP_PIXELS = 2_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockSums:
-    """Sums over blocks; every array starts with axes (block row, block column).
+    """Sums over blocks; every array starts with axes (block row, block column)."""
 
-    Parameters
-    ----------
-    side : int
-        Side of a block in pixels.
-    row, col : int
-        Top-left pixel of block (0, 0).
-    energy : ndarray of float32, shape (n, m, ORIENTATIONS, R_BINS)
-        Squared modulus of the edge gradients by direction and r.
-    tensor : ndarray of float64, shape (n, m, 3)
-        Structure tensor of the edge gradients: rr, rc, cc.
-    level, square : ndarray of float64, shape (n, m)
-        Sums of the values and of their squares.
-    clipped, dark, missing : ndarray of int64, shape (n, m)
-        Pixels above 98 percent of the clip level, below `DARK_SNR`, and not finite.
-    widths : ndarray of int64, shape (n, m, WIDTH_BINS)
-        Histogram of local edge widths.
-    width_sums : ndarray of float64, shape (n, m, ORIENTATIONS, 2)
-        Count and sum of squared widths by gradient direction.
-    histogram : ndarray of int64, shape (GROUPS, R_BINS)
-        Edge pixels of the whole plane by orientation group and r.
-    """
-
-    side: int
-    row: int
+    side: int  # side of a block in pixels
+    row: int  # top-left pixel of block (0, 0)
     col: int
+    # (n, m, ORIENTATIONS, R_BINS), squared modulus of the edge gradients by direction and r
     energy: NDArray[np.float32]
-    tensor: NDArray[np.float64]
-    level: NDArray[np.float64]
+    tensor: NDArray[np.float64]  # (n, m, 3), structure tensor of the edge gradients: rr, rc, cc
+    level: NDArray[np.float64]  # (n, m), sums of the values and of their squares
     square: NDArray[np.float64]
+    # (n, m), pixels above 98 percent of the clip level, below `DARK_SNR`, and not finite
     clipped: NDArray[np.int64]
     dark: NDArray[np.int64]
     missing: NDArray[np.int64]
-    widths: NDArray[np.int64]
+    widths: NDArray[np.int64]  # (n, m, WIDTH_BINS), histogram of local edge widths
+    # (n, m, ORIENTATIONS, 2), count and sum of squared widths by gradient direction
     width_sums: NDArray[np.float64]
+    # (GROUPS, R_BINS), edge pixels of the whole plane by orientation group and r
     histogram: NDArray[np.int64]
 
 
@@ -349,54 +307,32 @@ Measured once, no command repeats it."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """Candidate windows of one photo; every array has one entry a window along axis 0.
+    """Candidate windows of one photo; every array has one entry a window along axis 0."""
 
-    Parameters
-    ----------
-    size : int
-        Side of every window in pixels.
-    rows, cols : ndarray of int64, shape (n,)
-        Top-left pixels.
-    r, phi : ndarray of float64, shape (n,)
-        Field position of the centres.
-    directions : ndarray of float64, shape (n, ORIENTATIONS)
-        Edge energy by gradient direction where r is high enough, over the energy of noise.
-    r_mean, r_kept : ndarray of float64, shape (n,)
-        Mean r weighted by edge energy, and the share of the energy where r is high enough.
-    eigenvalues : ndarray of float64, shape (n, 2)
-        Of the structure tensor, smaller first, over that of noise.
-    contrast : ndarray of float64, shape (n,)
-        Variance of the signal over variance of the noise; a slope, as of a sky, is no signal.
-    level, sigma : ndarray of float64, shape (n,)
-        Mean level and the noise's standard deviation there.
-    clipped, dark, missing : ndarray of float64, shape (n,)
-        Shares of the pixels.
-    width : ndarray of float64, shape (n,)
-        Width of the sharper edges as the sigma of a Gaussian in pixels; NaN where edges are few.
-    widest : ndarray of float64, shape (n,)
-        The same of the window's widest quarter: a depth step inside the window shows there.
-    elongation : ndarray of float64, shape (n, 2)
-        Cosine and sine parts, over twice the angle in image axes (columns to rows), of the squared
-        edge width relative to its mean; zero where unknown.
-    """
-
-    size: int
-    rows: NDArray[np.int64]
+    size: int  # side of every window in pixels
+    rows: NDArray[np.int64]  # (n,), top-left pixels
     cols: NDArray[np.int64]
-    r: NDArray[np.float64]
+    r: NDArray[np.float64]  # (n,), field position of the centres
     phi: NDArray[np.float64]
+    # (n, ORIENTATIONS), edge energy by gradient direction where r is high enough, over the energy of noise
     directions: NDArray[np.float64]
+    # (n,), mean r weighted by edge energy, and the share of the energy where r is high enough
     r_mean: NDArray[np.float64]
     r_kept: NDArray[np.float64]
-    eigenvalues: NDArray[np.float64]
+    eigenvalues: NDArray[np.float64]  # (n, 2), of the structure tensor, smaller first, over that of noise
+    # (n,), variance of the signal over variance of the noise; a slope, as of a sky, is no signal
     contrast: NDArray[np.float64]
-    level: NDArray[np.float64]
+    level: NDArray[np.float64]  # (n,), mean level and the noise's standard deviation there
     sigma: NDArray[np.float64]
-    clipped: NDArray[np.float64]
+    clipped: NDArray[np.float64]  # (n,), shares of the pixels
     dark: NDArray[np.float64]
     missing: NDArray[np.float64]
+    # (n,), width of the sharper edges as the sigma of a Gaussian in pixels; NaN where edges are few
     width: NDArray[np.float64]
+    # (n,), the same of the window's widest quarter: a depth step inside the window shows there
     widest: NDArray[np.float64]
+    # (n, 2), cosine and sine parts, over twice the angle in image axes (columns to rows), of the squared edge
+    # width relative to its mean; zero where unknown
     elongation: NDArray[np.float64]
 
     def __len__(self) -> int:

@@ -25,24 +25,12 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeMeasurement:
-    """One measured edge of a chart.
+    """One measured edge of a chart."""
 
-    Parameters
-    ----------
-    box : tuple of int
-        (row, col, height, width).
-    position : FieldPosition
-        Of the middle of the box.
-    direction : {"tangential", "sagittal"}
-        Contrast along u or along v, whichever the edge's normal is nearer to.
-    response : EdgeResponse
-        What was measured.
-    """
-
-    box: Box
-    position: FieldPosition
-    direction: Direction
-    response: EdgeResponse
+    box: Box  # (row, col, height, width)
+    position: FieldPosition  # of the middle of the box
+    direction: Direction  # contrast along u or along v, whichever the edge's normal is nearer to
+    response: EdgeResponse  # what was measured
 
     @property
     def zone(self) -> Zone:
@@ -52,28 +40,15 @@ class EdgeMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class ZoneSharpness:
-    """Medians over the edges of one zone.
-
-    Parameters
-    ----------
-    zone : Zone
-    edges : int
-        How many were measured.
-    mtf50, tangential_mtf50, sagittal_mtf50 : float
-        Cycles/pixel; NaN where the zone has no edge of that direction.
-    mtf_max : float
-        Largest of the zone: above 1 means oversharpened.
-    overshoot : float
-        Largest of the zone, percent of the step.
-    """
+    """Medians over the edges of one zone."""
 
     zone: Zone
-    edges: int
-    mtf50: float
+    edges: int  # how many were measured
+    mtf50: float  # cycles/pixel; NaN where the zone has no edge of that direction
     tangential_mtf50: float
     sagittal_mtf50: float
-    mtf_max: float
-    overshoot: float
+    mtf_max: float  # largest of the zone: above 1 means oversharpened
+    overshoot: float  # largest of the zone, percent of the step
 
 
 def measure_edges(

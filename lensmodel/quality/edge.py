@@ -41,43 +41,23 @@ _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeResponse:
-    """What one slanted edge says about the sharpness across it.
+    """What one slanted edge says about the sharpness across it."""
 
-    Parameters
-    ----------
-    frequencies : ndarray, shape (n,)
-        Cycles/pixel along the normal of the edge, 0 to 1.
-    mtf : ndarray, shape (n,)
-        Contrast, 1 at zero frequency.
-    mtf50, mtf50p : float
-        Lowest frequency in cycles/pixel where the contrast falls to half of that at zero, and to
-        half of its largest value (robust to oversharpening); 1.0 where it does not fall so far.
-    mtf_max : float
-        Largest contrast up to 0.5 cycles/pixel; above 1 means oversharpened.
-    mtf_nyquist : float
-        Contrast at 0.5 cycles/pixel.
-    overshoot, undershoot : float
-        How far the edge profile rises above its bright level and falls below its dark one, in
-        percent of the step.
-    normal : float
-        Angle of the normal from dark to bright, radians, counter-clockwise from the right.
-    step : float
-        Bright minus dark level.
-    esf_distance, esf : ndarray, shape (m,)
-        Edge profile: distance in pixels, dark to bright, and level.
-    """
-
-    frequencies: NDArray[np.float64]
-    mtf: NDArray[np.float64]
+    frequencies: NDArray[np.float64]  # (n,), cycles/pixel along the normal of the edge, 0 to 1
+    mtf: NDArray[np.float64]  # (n,), contrast, 1 at zero frequency
+    # lowest frequency in cycles/pixel where the contrast falls to half of that at zero, and to half of its
+    # largest value (robust to oversharpening); 1.0 where it does not fall so far
     mtf50: float
     mtf50p: float
-    mtf_max: float
-    mtf_nyquist: float
+    mtf_max: float  # largest contrast up to 0.5 cycles/pixel; above 1 means oversharpened
+    mtf_nyquist: float  # contrast at 0.5 cycles/pixel
+    # how far the edge profile rises above its bright level and falls below its dark one, in percent of the
+    # step
     overshoot: float
     undershoot: float
-    normal: float
-    step: float
-    esf_distance: NDArray[np.float64]
+    normal: float  # angle of the normal from dark to bright, radians, counter-clockwise from the right
+    step: float  # bright minus dark level
+    esf_distance: NDArray[np.float64]  # (m,), edge profile: distance in pixels, dark to bright, and level
     esf: NDArray[np.float64]
 
     @property

@@ -56,46 +56,24 @@ _Fit = Callable[[NDArray[np.intp]], _Array]
 
 @dataclass(frozen=True, slots=True)
 class Asymmetry:
-    """A vector over the picture with its error.
+    """A vector over the picture with its error."""
 
-    Parameters
-    ----------
-    amount : float
-        Length; what it counts is said where it stands.
-    direction : float
-        Radians, counter-clockwise from the right.
-    error : float
-        Standard error of each component of the vector, in the unit of `amount`.
-    significant : bool
-        Whether chance makes a vector so long in less than one of a hundred centred lenses.
-    """
-
-    amount: float
-    direction: float
-    error: float
-    significant: bool
+    amount: float  # length; what it counts is said where it stands
+    direction: float  # radians, counter-clockwise from the right
+    error: float  # standard error of each component of the vector, in the unit of `amount`
+    significant: bool  # whether chance makes a vector so long in less than one of a hundred centred lenses
 
 
 @dataclass(frozen=True, slots=True)
 class Centring:
-    """How well centred a copy is, by what its photos show.
-
-    Parameters
-    ----------
-    verdict : {"centred", "decentred", "unknown"}
-    text : str
-        The verdict as one sentence, without a full stop.
-    softer : Asymmetry or None
-        Towards the softer side; amount = ln of the ratio of widths of opposite sides at r = 0.85. None where
-        there are too few samples.
-    coma : Asymmetry or None
-        Towards the tail of the blur in the middle of the picture; amount = |m0|.
-    """
+    """How well centred a copy is, by what its photos show."""
 
     verdict: Literal["centred", "decentred", "unknown"]
-    text: str
+    text: str  # the verdict as one sentence, without a full stop
+    # Towards the softer side; amount = ln of the ratio of widths of opposite sides at r = 0.85. None where
+    # there are too few samples.
     softer: Asymmetry | None = None
-    coma: Asymmetry | None = None
+    coma: Asymmetry | None = None  # towards the tail of the blur in the middle of the picture; amount = |m0|
 
     @property
     def side(self) -> str:

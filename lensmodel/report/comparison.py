@@ -30,20 +30,12 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class ZoneChange:
-    """How the second differs from the first in one zone: MTF50 in cycles/pixel.
-
-    Parameters
-    ----------
-    zone : {"center", "mid", "corner"}
-    first, second : float
-    error : float or None
-        Standard error of their difference; None where one of them has none.
-    """
+    """How the second differs from the first in one zone: MTF50 in cycles/pixel."""
 
     zone: Zone
     first: float
     second: float
-    error: float | None
+    error: float | None  # standard error of their difference; None where one of them has none
 
     @property
     def share(self) -> float:

@@ -35,25 +35,14 @@ _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the mem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfGrid:
-    """Kernels at a grid of places, or at a single one.
+    """Kernels at a grid of places, or at a single one."""
 
-    Parameters
-    ----------
-    kernels : ndarray of float32, shape (rows * cols, k, k)
-        Row by row from the top left.
-    positions : tuple of FieldPosition
-    rows, cols : int
-    settings : LensSettings
-    predicted_error : tuple of float
-        Expected relative L2 of each kernel.
-    """
-
-    kernels: NDArray[np.float32]
+    kernels: NDArray[np.float32]  # (rows * cols, k, k), row by row from the top left
     positions: tuple[FieldPosition, ...]
     rows: int
     cols: int
     settings: LensSettings
-    predicted_error: tuple[float, ...]
+    predicted_error: tuple[float, ...]  # expected relative L2 of each kernel
 
     def __post_init__(self) -> None:
         n = len(self.positions)

@@ -80,18 +80,10 @@ _Pairs: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True)
 class SensorGeometry:
-    """What turns cycles/pixel into other units.
+    """What turns cycles/pixel into other units."""
 
-    Parameters
-    ----------
-    pixel_pitch_um : float or None
-        Micrometres from pixel to pixel.
-    height_px : int or None
-        Pixels of the shorter side of the picture.
-    """
-
-    pixel_pitch_um: float | None = None
-    height_px: int | None = None
+    pixel_pitch_um: float | None = None  # micrometres from pixel to pixel
+    height_px: int | None = None  # pixels of the shorter side of the picture
 
     def factor(self, unit: Unit) -> float | None:
         """What cycles/pixel are multiplied with: LP/PH = H f, lp/mm = 1000 f / p; None where unknown."""

@@ -132,46 +132,24 @@ _SATISFIED: Final = 0.01  # of the kernel's norm: less gain is not worth another
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """One photo that would help.
+    """One photo that would help."""
 
-    Parameters
-    ----------
-    text : str
-        What to photograph: "something with fine detail at the upper left corner, at f/2".
-    reason : str
-        Why: what the model knows of that place now.
-    position : FieldPosition
-        Where the detail should lie, in sensor orientation.
-    settings : LensSettings
-        Aperture and focal length that are short of evidence.
-    gain : float
-        Drop of the predicted relative L2 error that one photo is worth.
-    """
-
-    text: str
-    reason: str
-    position: FieldPosition
-    settings: LensSettings
-    gain: float
+    text: str  # what to photograph: "something with fine detail at the upper left corner, at f/2"
+    reason: str  # why: what the model knows of that place now
+    position: FieldPosition  # where the detail should lie, in sensor orientation
+    settings: LensSettings  # aperture and focal length that are short of evidence
+    gain: float  # drop of the predicted relative L2 error that one photo is worth
 
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What to photograph next.
+    """What to photograph next."""
 
-    Parameters
-    ----------
-    text : str
-        One sentence for people.
-    suggestions : tuple of Suggestion
-        At most three, the most helpful first; different places or apertures.
-    enough : bool
-        True where no single photo would help much any more, and every part of the picture has patches
-        near it (`places.little_seen`).
-    """
-
-    text: str
+    text: str  # one sentence for people
+    # at most three, the most helpful first; different places or apertures
     suggestions: tuple[Suggestion, ...]
+    # true where no single photo would help much any more, and every part of the picture has patches near it
+    # (`places.little_seen`)
     enough: bool
 
 

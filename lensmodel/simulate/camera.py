@@ -40,41 +40,20 @@ _BITS: Final = (8, 16)  # of the raw files that cameras write
 
 @dataclass(frozen=True, slots=True)
 class SimulatedCamera:
-    """A sensor with a Bayer mosaic.
+    """A sensor with a Bayer mosaic."""
 
-    Parameters
-    ----------
-    height, width : int
-        Pixels; even.
-    pitch_um : float
-        Pixel pitch in micrometres.
-    full_well_electrons : float
-        Electrons at the white level; a higher ISO means fewer.
-    read_noise : float
-        Standard deviation in electrons.
-    bits : int
-        Of the mosaic's numbers.
-    black, white : int
-        Black and white level.
-    pattern : {"RGGB", "BGGR", "GRBG", "GBRG"}
-        Colours of the 2 x 2 cell, row by row.
-    white_balance : tuple of float
-        Multipliers for r, g, b that make a grey scene grey: the sensor sees scene / multiplier.
-    maker, model, serial : str
-        As written into the metadata of its photos.
-    """
-
-    height: int = 1000
+    height: int = 1000  # pixels; even
     width: int = 1500
-    pitch_um: float = 4.5
-    full_well_electrons: float = 20000.0
-    read_noise: float = 4.0
-    bits: int = 14
-    black: int = 512
+    pitch_um: float = 4.5  # pixel pitch in micrometres
+    full_well_electrons: float = 20000.0  # electrons at the white level; a higher ISO means fewer
+    read_noise: float = 4.0  # standard deviation in electrons
+    bits: int = 14  # of the mosaic's numbers
+    black: int = 512  # black and white level
     white: int = 15872
-    pattern: str = "RGGB"
+    pattern: str = "RGGB"  # colours of the 2 x 2 cell, row by row
+    # multipliers for r, g, b that make a grey scene grey: the sensor sees scene / multiplier
     white_balance: tuple[float, float, float] = (2.0, 1.0, 1.6)
-    maker: str = "Simulated Camera"
+    maker: str = "Simulated Camera"  # as written into the metadata of its photos
     model: str = "SC-1"
     serial: str = "SC1-0001"
 
@@ -197,24 +176,13 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedPhoto:
-    """A simulated photo and its truth.
+    """A simulated photo and its truth."""
 
-    Parameters
-    ----------
-    mosaic : ndarray, shape (height, width), uint16
-        Raw numbers.
-    planes : Planes, shape (3, height, width)
-        Sensor values of all channels without a mosaic, with noise and clipping of their own.
-    clean : Planes, shape (3, height, width)
-        The light on the sensor: before noise, quantisation and clipping.
-    sharp : Planes, shape (3, height, width)
-        The same without blur, lateral colour and vignetting: what a correction should reach.
-    truth : Truth
-    """
-
-    mosaic: NDArray[np.uint16]
+    mosaic: NDArray[np.uint16]  # (height, width), raw numbers
+    # (3, height, width), sensor values of all channels without a mosaic, with noise and clipping of their own
     planes: Planes
-    clean: Planes
+    clean: Planes  # (3, height, width), the light on the sensor: before noise, quantisation and clipping
+    # (3, height, width), the same without blur, lateral colour and vignetting: what a correction should reach
     sharp: Planes
     truth: Truth
 
@@ -291,27 +259,13 @@ _REFINED: Final = 2  # nodes of the windows per exact node
 
 @dataclass(frozen=True, slots=True)
 class BlurOptions:
-    """How the blur of a scene is simulated.
+    """How the blur of a scene is simulated."""
 
-    Parameters
-    ----------
-    pitch_um : float
-        Pixel pitch in micrometres.
-    size : int
-        Odd side of the kernels in pixels.
-    step : float
-        Distance in half diagonals of the nodes where kernels are exact.
-    defocus : float
-        Focus error of this photo, waves at the open aperture.
-    lateral, vignetting : bool
-        Whether to simulate lateral colour, and the loss of light by the cat's eye.
-    """
-
-    pitch_um: float = DEFAULT_PITCH_UM
-    size: int = DEFAULT_SIZE
-    step: float = DEFAULT_STEP
-    defocus: float = 0.0
-    lateral: bool = True
+    pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
+    size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
+    step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
+    defocus: float = 0.0  # focus error of this photo, waves at the open aperture
+    lateral: bool = True  # whether to simulate lateral colour, and the loss of light by the cat's eye
     vignetting: bool = False
 
     def __post_init__(self) -> None:

@@ -22,27 +22,15 @@ _MIN_TILE: Final = 72  # pixels: the crop of an edge and the blur around it
 
 @dataclass(frozen=True, slots=True)
 class ChartEdge:
-    """One slanted edge of a chart.
+    """One slanted edge of a chart."""
 
-    Parameters
-    ----------
-    row, col, height, width : int
-        Box in the frame that holds the edge and flat ground on both sides, nothing else.
-    normal : float
-        Angle of the edge's normal from dark to bright, radians, counter-clockwise from the right.
-    position : FieldPosition
-        Of the middle of the box.
-    direction : {"tangential", "sagittal"}
-        Contrast along u (tangential) or v (sagittal).
-    """
-
-    row: int
+    row: int  # box in the frame that holds the edge and flat ground on both sides, nothing else
     col: int
     height: int
     width: int
-    normal: float
-    position: FieldPosition
-    direction: Direction
+    normal: float  # angle of the edge's normal from dark to bright, radians, counter-clockwise from the right
+    position: FieldPosition  # of the middle of the box
+    direction: Direction  # contrast along u (tangential) or v (sagittal)
 
     @property
     def box(self) -> tuple[int, int, int, int]:
@@ -57,18 +45,10 @@ class ChartEdge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """A chart and where its edges are.
+    """A chart and where its edges are."""
 
-    Parameters
-    ----------
-    scene : Planes, shape (3, H + 2 margin, W + 2 margin)
-        Linear light.
-    edges : tuple of ChartEdge
-        In coordinates of the frame, margin not counted.
-    """
-
-    scene: Planes
-    edges: tuple[ChartEdge, ...]
+    scene: Planes  # (3, H + 2 margin, W + 2 margin), linear light
+    edges: tuple[ChartEdge, ...]  # in coordinates of the frame, margin not counted
 
 
 def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: float) -> NDArray[np.float64]:

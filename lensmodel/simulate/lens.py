@@ -115,24 +115,16 @@ class CameraLens(Protocol):
 class SimulatedLens:
     """One copy of a lens. Frozen and hashable; equal parameters give equal kernels.
 
-    Parameters
-    ----------
-    optics : tuple of Aberrations
-        One for every entry of `focal_mm`; between them a zoom interpolates in log focal length.
-    focal_mm : tuple of float
-        Ascending focal lengths; one for a prime lens.
-    maker, model, serial : str
-        As written into the metadata of its photos.
-
     Notes
     -----
     The focus distance takes no part: every photo is taken at the distance of best focus, give or
     take the `defocus` passed to `kernel`.
     """
 
+    # one for every entry of `focal_mm`; between them a zoom interpolates in log focal length
     optics: tuple[Aberrations, ...]
-    focal_mm: tuple[float, ...] = (50.0,)
-    maker: str = "Simulated Optics"
+    focal_mm: tuple[float, ...] = (50.0,)  # ascending focal lengths; one for a prime lens
+    maker: str = "Simulated Optics"  # as written into the metadata of its photos
     model: str = "Simulated 50mm f/2"
     serial: str = "SIM0000001"
 
@@ -245,22 +237,12 @@ class SimulatedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedField:
-    """The PSF field of a simulated lens at one setting: the truth, in the shape of a `PsfField`.
-
-    Parameters
-    ----------
-    lens : SimulatedLens
-    settings : LensSettings
-    pitch_um : float
-        Pixel pitch of the camera in micrometres.
-    defocus : float
-        As of `SimulatedLens.kernel`.
-    """
+    """The PSF field of a simulated lens at one setting: the truth, in the shape of a `PsfField`."""
 
     lens: SimulatedLens
     settings: LensSettings
-    pitch_um: float = DEFAULT_PITCH_UM
-    defocus: float = 0.0
+    pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch of the camera in micrometres
+    defocus: float = 0.0  # as of `SimulatedLens.kernel`
     _known: dict[tuple[float, float, Channel, int], Kernel] = field(default_factory=dict, repr=False)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
@@ -319,19 +301,12 @@ def coordinates(samples: int, step: float) -> tuple[NDArray[np.float32], NDArray
 
 @dataclass(frozen=True, slots=True)
 class PixelOtf:
-    """Transfer function of lens and pixel together, for light of one colour channel.
+    """Transfer function of lens and pixel together, for light of one colour channel."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (q, q // 2 + 1), complex64
-        On an `rfft2` grid; at zero frequency 1 less the light that diffraction throws beyond the
-        period.
-    period : float
-        Period in pixels of the image that it describes: frequencies are multiples of 1 / period.
-    """
-
+    # (q, q // 2 + 1), on an `rfft2` grid; at zero frequency 1 less the light that diffraction throws beyond
+    # the period
     values: NDArray[np.complex64]
-    period: float
+    period: float  # period in pixels of the image that it describes: frequencies are multiples of 1 / period
 
     def kernel(self, size: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Share of the light in `(size, size)` pixels, the image moved by `shift` (row, col) pixels."""
@@ -419,41 +394,25 @@ SMALLEST_F: Final = 32.0
 
 @dataclass(frozen=True, slots=True)
 class Aberrations:
-    """The optics of one copy at one focal length; wavefront terms in waves of 540 nm at `f_number`.
+    """The optics of one copy at one focal length; wavefront terms in waves of 540 nm at `f_number`."""
 
-    Parameters
-    ----------
-    f_number : float
-        Open aperture N0.
-    spherical, coma, astigmatism, field_curvature, defocus : float
-        W040, W131, W222, W220 and W020.
-    decentring : tuple of float
-        Where the centre of symmetry lies, (right, up), in half diagonals.
-    uniform_coma, uniform_astigmatism : tuple of float
-        Faults that are the same all over the field: vector (right, up); (a, b).
-    tilt : tuple of float
-        Defocus per unit of field towards (right, up).
-    colour_focus : tuple of float
-        Longitudinal colour: c1, c2.
-    vignetting : tuple of float
-        Cat's eye: radius of the second circle over that of the pupil, and its shift per unit of
-        field. A radius of 0 means none.
-    lateral_red, lateral_blue : tuple of float
-        Lateral colour against green: displacement outwards = c1 r + c3 r^3 in half diagonals.
-    """
-
-    f_number: float = 2.0
-    spherical: float = 0.0
+    f_number: float = 2.0  # open aperture N0
+    spherical: float = 0.0  # W040, W131, W222, W220 and W020
     coma: float = 0.0
     astigmatism: float = 0.0
     field_curvature: float = 0.0
     defocus: float = 0.0
+    # where the centre of symmetry lies, (right, up), in half diagonals
     decentring: tuple[float, float] = (0.0, 0.0)
+    # faults that are the same all over the field: vector (right, up); (a, b)
     uniform_coma: tuple[float, float] = (0.0, 0.0)
     uniform_astigmatism: tuple[float, float] = (0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)
-    colour_focus: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float] = (0.0, 0.0)  # defocus per unit of field towards (right, up)
+    colour_focus: tuple[float, float] = (0.0, 0.0)  # longitudinal colour: c1, c2
+    # Cat's eye: radius of the second circle over that of the pupil, and its shift per unit of field. A radius
+    # of 0 means none.
     vignetting: tuple[float, float] = (0.0, 0.0)
+    # lateral colour against green: displacement outwards = c1 r + c3 r^3 in half diagonals
     lateral_red: tuple[float, float] = (0.0, 0.0)
     lateral_blue: tuple[float, float] = (0.0, 0.0)
 

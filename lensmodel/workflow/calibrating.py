@@ -42,18 +42,10 @@ _SAME_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata chan
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a photo says of its lens and of its camera.
+    """What a photo says of its lens and of its camera."""
 
-    Parameters
-    ----------
-    lens : mapping of str to str
-        maker, model, serial, as far as they are known.
-    camera : Camera or None
-        The body; `None` where the photo does not name its model.
-    """
-
-    lens: Mapping[str, str] = field(default_factory=dict)
-    camera: Camera | None = None
+    lens: Mapping[str, str] = field(default_factory=dict)  # maker, model, serial, as far as they are known
+    camera: Camera | None = None  # the body; `None` where the photo does not name its model
 
     @classmethod
     def of(cls, metadata: PhotoMetadata) -> Identity:

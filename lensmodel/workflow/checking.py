@@ -31,24 +31,12 @@ _CUT: Final = 0.25  # of the blocks, those that a rendering fits worst: edges, a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """A photo, what was made of it, and the verdict.
+    """A photo, what was made of it, and the verdict."""
 
-    Parameters
-    ----------
-    original : LinearPhoto
-        The photo, developed.
-    corrected : Planes
-        What was made of it, in the photo's own light.
-    audit : PhotoAudit
-        The verdict.
-    reblurred : bool
-        Whether a profile's PSFs took part.
-    """
-
-    original: LinearPhoto
-    corrected: Planes
-    audit: PhotoAudit
-    reblurred: bool
+    original: LinearPhoto  # the photo, developed
+    corrected: Planes  # what was made of it, in the photo's own light
+    audit: PhotoAudit  # the verdict
+    reblurred: bool  # whether a profile's PSFs took part
 
 
 def check(

@@ -61,30 +61,14 @@ while each costs a second."""
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """What is taken where nobody asks for something else.
+    """What is taken where nobody asks for something else."""
 
-    Parameters
-    ----------
-    name : str
-        What users call it.
-    estimator : str
-        Of `estimators`.
-    kernel_size : int
-        Largest odd side of the estimated kernels in pixels.
-    patches : int
-        Parts of a photo that are looked at.
-    mode : str
-        Of `answer.MODES`.
-    method : str
-        Of `deconvolvers`.
-    """
-
-    name: str
-    estimator: str
-    kernel_size: int
-    patches: int
-    mode: str
-    method: str
+    name: str  # what users call it
+    estimator: str  # of `estimators`
+    kernel_size: int  # largest odd side of the estimated kernels in pixels
+    patches: int  # parts of a photo that are looked at
+    mode: str  # of `answer.MODES`
+    method: str  # of `deconvolvers`
 
 
 WAYS: Final[Mapping[str, Way]] = MappingProxyType(
@@ -118,30 +102,15 @@ def chosen_way(name: str | None, model: LensModel | None) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How the samples of a photo are made; what is None is as the lens is learned (`ways`).
+    """How the samples of a photo are made; what is None is as the lens is learned (`ways`)."""
 
-    Parameters
-    ----------
-    settings : LensSettings
-        Values for photos that do not say their own (`settings_of`).
-    model : str, optional
-        Name of a way; None is that of the lens, of a new one the usual.
-    estimator : str or PsfEstimator, optional
-        Name in `estimators`, or an object of one's own.
-    kernel_size : int, optional
-        Odd side of the kernels in pixels.
-    selector : str or Selector
-        Name in `selectors`, or an object of one's own.
-    count : int, optional
-        Patches asked for.
-    """
-
+    # values for photos that do not say their own (`settings_of`)
     settings: LensSettings = field(default_factory=LensSettings)
-    model: str | None = None
-    estimator: str | blind.PsfEstimator | None = None
-    kernel_size: int | None = None
-    selector: str | patches.Selector = "r-map"
-    count: int | None = None
+    model: str | None = None  # name of a way; None is that of the lens, of a new one the usual
+    estimator: str | blind.PsfEstimator | None = None  # name in `estimators`, or an object of one's own
+    kernel_size: int | None = None  # odd side of the kernels in pixels
+    selector: str | patches.Selector = "r-map"  # name in `selectors`, or an object of one's own
+    count: int | None = None  # patches asked for
 
     def of_lens(self, lens: Lens | None) -> Recipe:
         """Return it as it holds for a lens."""
@@ -295,24 +264,12 @@ def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
 
 @dataclass(frozen=True, slots=True)
 class CellSample:
-    """One PSF sample with what it was made from.
+    """One PSF sample with what it was made from."""
 
-    Parameters
-    ----------
-    patch : Patch
-        Where in the photo.
-    channel : {"r", "g", "b"}
-        Which colour plane.
-    sample : PsfSample
-        The estimate, ready for the model.
-    diagnostics : mapping of str to float
-        What the estimator reports of itself.
-    """
-
-    patch: Patch
-    channel: Channel
-    sample: PsfSample
-    diagnostics: Mapping[str, float]
+    patch: Patch  # where in the photo
+    channel: Channel  # which colour plane
+    sample: PsfSample  # the estimate, ready for the model
+    diagnostics: Mapping[str, float]  # what the estimator reports of itself
 
 
 def estimate_cell(

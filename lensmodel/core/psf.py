@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
@@ -308,25 +308,6 @@ class PsfSample:
                 raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
-
-    def with_weight(self, weight: float) -> PsfSample:
-        """Return the same sample with another vote.
-
-        Parameters
-        ----------
-        weight : float
-            Confidence in 0..1.
-
-        Returns
-        -------
-        PsfSample
-
-        Raises
-        ------
-        InvalidInputError
-            If the weight lies outside 0..1.
-        """
-        return replace(self, weight=weight)
 
 
 class PsfField(Protocol):

@@ -80,13 +80,7 @@ class Observation:
 
 
 def load_psfs(path: Path | None = None) -> NDArray[np.float64]:
-    """Read PSFs, key `psf`, `(n, k, k)`; our own twelve when no path is given.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file has no such array.
-    """
+    """Read PSFs, key `psf`, `(n, k, k)`; our own twelve when no path is given."""
     source = path or DATA / "lens_psfs.npz"
     try:
         with np.load(source, allow_pickle=False) as stored:
@@ -99,13 +93,7 @@ def load_psfs(path: Path | None = None) -> NDArray[np.float64]:
 
 
 def list_photos(folder: Path | None = None) -> tuple[Path, ...]:
-    """Photos of a folder by name; the library's own photographs when no folder is given.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder holds none.
-    """
+    """Photos of a folder by name; the library's own photographs when no folder is given."""
     if folder is None:
         return tuple(demo_data_path(f"{name}.jpg") for name in DEMO_SCENES)
     if not folder.is_dir():
@@ -155,11 +143,6 @@ def make_cases(
     """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
 
     A scene is a window of a photo: one of each, or `scenes` of all in turn.
-
-    Raises
-    ------
-    InvalidInputError
-        If the half has no photo or no PSF, or `scenes` is below one.
     """
     if scenes is not None and scenes < 1:
         raise InvalidInputError(f"a benchmark takes at least one scene, not {scenes}")

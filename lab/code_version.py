@@ -18,15 +18,6 @@ _DATA: Final = (".npz", ".json")
 def version_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> str:
     """Hash of the code and data behind some modules.
 
-    Parameters
-    ----------
-    modules : str
-        Dotted names, such as "lab.rivals".
-    without : sequence of str
-        Names of modules or packages that are left out with all that only they import.
-    root : Path
-        Folder that holds the packages.
-
     Returns
     -------
     str

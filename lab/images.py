@@ -29,17 +29,7 @@ def psnr(
     mask: NDArray[np.bool_] | None = None,
     srgb: bool = False,
 ) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures.
-
-    Parameters
-    ----------
-    image, reference : ndarray, shape (..., H, W)
-        Linear light.
-    mask : ndarray of bool, shape (H, W), optional
-        Pixels that count.
-    srgb : bool
-        Compare after `to_srgb`, the usual figure for pictures.
-    """
+    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
     error = _squared_error(image, reference, srgb=srgb)
     if mask is not None:
         if mask.shape != error.shape[-2:] or not mask.any():
@@ -83,11 +73,6 @@ def noise_gain(corrected: NDArray[np.floating], original: NDArray[np.floating]) 
     """Standard deviation of the noise in a flat part after a correction, over that before.
 
     Shading does not count, see `flat_noise`.
-
-    Parameters
-    ----------
-    corrected, original : ndarray, shape (H, W)
-        The same flat part of both pictures.
     """
     _same_shape(corrected, original)
     before, after = flat_noise(original), flat_noise(corrected)
@@ -146,15 +131,6 @@ def fidelity(
     A blind method leaves the place of the picture free, and the centre of mass of a PSF is not its core: the
     truth of each block, which has no noise, is moved to where it lies best.
 
-    Parameters
-    ----------
-    image, reference : Planes, shape (3, H, W)
-        Linear light, white-balanced where `srgb`.
-    frame : Frame
-        (H, W).
-    srgb : bool
-        Compare after `to_srgb`, else linear light without SSIM.
-
     Returns
     -------
     dict
@@ -208,13 +184,7 @@ class Gains:
 
 
 def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
-    """Compare original and corrected picture with the truth, block by block; None where no block fits.
-
-    Parameters
-    ----------
-    before, after, truth : ndarray, shape (row, col, 3)
-        sRGB-encoded: 0 to 1, or whole numbers up to 65535. May be memory-mapped.
-    """
+    """Compare original and corrected picture with the truth, block by block; None where no block fits."""
     frame = Frame(*truth.shape[:2])
     if min(frame.height, frame.width) < BLOCK:
         return None

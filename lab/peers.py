@@ -85,11 +85,6 @@ class Peer:
             Its picture.
         float
             CPU seconds of the process, files included.
-
-        Raises
-        ------
-        InvalidInputError
-            If the program is missing, fails, writes nothing or does not end.
         """
         if not self.installed:
             raise InvalidInputError(f"{self.program} is not installed; install it to compare with it")
@@ -231,15 +226,7 @@ PEERS: Final[tuple[Peer, ...]] = (
 
 
 def skimage_results(seen: Planes, widths: Sequence[float] = (0.7, 1.0, 1.5)) -> dict[str, list[Planes]]:
-    """Pictures of scikit-image's Richardson-Lucy and Wiener with one Gaussian, for several settings.
-
-    Parameters
-    ----------
-    seen : Planes, shape (3, height, width)
-        Linear light.
-    widths : sequence of float
-        Standard deviations of the Gaussian in pixels.
-    """
+    """Pictures of scikit-image's Richardson-Lucy and Wiener with one Gaussian, for several settings."""
     light = np.clip(seen, 1e-4, 1.0)
     kernels = [gaussian(15, np.eye(2) * width**2).astype(np.float32) for width in widths]
     lucy = restoration.richardson_lucy

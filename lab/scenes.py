@@ -361,17 +361,6 @@ def dead_leaves(
 
     Area-sampled: drawn `oversampling` times larger, then averaged over the pixels.
 
-    Parameters
-    ----------
-    height, width : int
-        Size in pixels.
-    rng : numpy.random.Generator
-        Places, sizes and colours.
-    smallest, largest : float
-        Radii in pixels.
-    oversampling : int
-        Samples a pixel and axis.
-
     Returns
     -------
     Planes, shape (3, height, width), values 0.02..0.95
@@ -434,14 +423,6 @@ def disc_kernel(radius: float) -> NDArray[np.float64]:
 
 def out_of_focus(scene: Planes, radius: float, near: NDArray[np.bool_]) -> Planes:
     """Two depths: the part `near` of a scene blurred by a disc, composed over the sharp rest.
-
-    Parameters
-    ----------
-    scene : Planes, shape (3, H, W)
-    radius : float
-        Radius of the disc in pixels.
-    near : ndarray of bool, shape (H, W)
-        Where the defocused object is. It lies in front, so its blurred outline covers the rest.
 
     Returns
     -------

@@ -32,13 +32,7 @@ def stored(path: Path, make: Callable[[], Unit]) -> tuple[Unit, bool]:
 
 
 def read(path: Path) -> Unit:
-    """Read a stored result.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is damaged.
-    """
+    """Read a stored result."""
     try:
         unit: Unit = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

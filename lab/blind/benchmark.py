@@ -299,29 +299,7 @@ def run_blind_benchmark(
     methods: Registry[PsfEstimator] | None = None,
     on_step: StepHook = ignore_step,
 ) -> BlindReport:
-    """Run the benchmark; what the cache folder already holds is not computed again.
-
-    Parameters
-    ----------
-    settings : BlindBenchmark
-        What to run.
-    workers : int
-        Processes; the numbers do not depend on it.
-    cache : Path or None
-        Folder for finished results, one line of JSON each, keyed by the content of photo, PSF,
-        method and settings. A run that was stopped goes on from there.
-    methods : Registry of PsfEstimator or None
-        Where the method names are looked up; None means `methods.compared`.
-    on_step : StepHook
-        Called after each case.
-
-    Raises
-    ------
-    UnknownMethodError
-        If there is no method or judge of a name.
-    InvalidInputError
-        If there are no photos or PSFs.
-    """
+    """Run the benchmark; what the cache folder already holds is not computed again."""
     registry = compared if methods is None else methods
     chosen = {name: registry.create(name) for name in settings.methods}
     judge = judges.create(settings.judge)

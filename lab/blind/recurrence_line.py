@@ -52,13 +52,7 @@ class RecurrenceLine:
 
 
 def line_through(disagreement: Floats, error: Floats) -> RecurrenceLine:
-    """Fit the line of least squares.
-
-    Parameters
-    ----------
-    disagreement, error : ndarray, shape (n,)
-        Relative L2 distances: of the kernels of two halves, and of the kernel from the truth. Three at least.
-    """
+    """Fit the line of least squares."""
     design = np.stack([np.ones_like(disagreement), disagreement], axis=1)
     (at, by), *_ = np.linalg.lstsq(design, error, rcond=None)
     left = error - design @ (at, by)

@@ -31,14 +31,7 @@ def places(
     after: Rendered,
     named: Sequence[tuple[str, Sequence[int] | None]] = (),
 ) -> list[Place]:
-    """Center, corners, and the three places where most was changed.
-
-    Parameters
-    ----------
-    before, after : ndarray of uint16, shape (row, col, 3)
-    named : sequence of (str, (row, col) or None)
-        Further places by the pixel in their middle; left out where another crop shows most of them.
-    """
+    """Center, corners, and the three places where most was changed."""
     height, width = before.shape[:2]
     side = side_of(before)
     found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]

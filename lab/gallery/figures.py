@@ -91,10 +91,6 @@ def dots(before: Shown, after: Shown) -> NDArray[np.bool_]:
     `STANDS_OUT` at least, and at most one of its own eight neighbours goes with it: what is sharpened
     along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`.
 
-    Parameters
-    ----------
-    before, after : Shown, shape (row, col, 3)
-
     Returns
     -------
     ndarray of bool, shape (row, col)
@@ -138,10 +134,6 @@ def hue_flips(before: Shown, after: Shown) -> NDArray[np.bool_]:
     get purer, up to twice, but not turn into another one. A small thing whose colour blur has washed out
     left a tenth of it, and a ridge (`TRACE`); only where all around it has the opposite hue did it leave
     nothing, and counts.
-
-    Parameters
-    ----------
-    before, after : Shown, shape (row, col, 3)
 
     Returns
     -------
@@ -201,12 +193,6 @@ def overshoots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArr
     profile is the mean of five lines across it; the overshoot is how far it leaves the plateaus 1 to 6 pixels
     away, in percent of the step. Where the truth is known, edges beside which it has a line that blur hid
     are left out as well: a perfect correction "overshoots" there.
-
-    Parameters
-    ----------
-    before, after : Shown, shape (row, col, 3)
-    truth : Shown, shape (row, col, 3), or None
-        What a perfect lens would have shown.
 
     Returns
     -------
@@ -285,10 +271,6 @@ def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
     Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
     the original, more of it than rounding. Which of them are the flattest `grain_ratio` decides.
 
-    Parameters
-    ----------
-    before, after : Shown, shape (row, col, 3)
-
     Returns
     -------
     ndarray, shape (n, 1 + 2 * bands)
@@ -317,13 +299,7 @@ def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
 
 
 def grain_ratio(places: NDArray[np.float64]) -> dict[str, float] | None:
-    """Noise power of the corrected picture over the original's in each band; None where nothing is flat.
-
-    Parameters
-    ----------
-    places : ndarray, shape (n, 1 + 2 * bands)
-        From `grain`, of the whole picture; the tenth with the least variance counts.
-    """
+    """Noise power of the corrected picture over the original's in each band; None where nothing is flat."""
     count = max(round(_FLAT_SHARE * len(places)), _FLAT_BLOCKS)
     if len(places) < count:
         return None
@@ -337,10 +313,6 @@ def textures(before: Shown, after: Shown) -> NDArray[np.float64]:
 
     Standard deviation of lightness in squares of 16 pixels, less their plane; of 1.5 to 13 of 255 in the
     original. Lawns, slats and grain lie there: far below 1, they were painted over.
-
-    Parameters
-    ----------
-    before, after : Shown, shape (row, col, 3)
 
     Returns
     -------

@@ -32,11 +32,6 @@ Figures = dict[str, Any]
 def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figures:
     """Take all figures of a picture.
 
-    Parameters
-    ----------
-    before, after, truth : ndarray of uint16, shape (row, col, 3)
-        Rendered; may be memory-mapped.
-
     Returns
     -------
     dict

@@ -156,13 +156,7 @@ class Picture:
 
 
 def real_pictures(folder: Path) -> list[Picture]:
-    """Find the real pictures of the test data, those included that cannot be read.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder has none.
-    """
+    """Find the real pictures of the test data, those included that cannot be read."""
     files = [path for name in FOLDERS for path in sorted((folder / name).glob("*")) if path.is_file()]
     files += [path for path in sorted((folder / STARS[0]).glob("*")) if path.suffix.lower() in STARS[1]]
     found = []
@@ -199,13 +193,7 @@ def simulated_pictures(cache: Path) -> list[Picture]:
 
 
 def chosen(pictures: Sequence[Picture], only: Sequence[str]) -> list[Picture]:
-    """Keep the pictures whose name holds one of some texts; all where none is given.
-
-    Raises
-    ------
-    InvalidInputError
-        If a text is in no name.
-    """
+    """Keep the pictures whose name holds one of some texts; all where none is given."""
     for text in only:
         if not any(text in picture.name for picture in pictures):
             names = ", ".join(picture.name for picture in pictures)

@@ -50,12 +50,6 @@ def aligned(picture: Rendered, like: Rendered, orientation: int) -> Rendered:
     """Lay another program's picture of a photo on ours: turned back, moved by whole pixels, of our size.
 
     Other programs turn a photo upright and cut its border differently; what they cut off is black.
-
-    Parameters
-    ----------
-    picture, like : ndarray of uint16, shape (row, col, 3)
-    orientation : int
-        EXIF orientation of the photo.
     """
     turned = [picture]
     if orientation in _TURNED_BACK:

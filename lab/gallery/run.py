@@ -154,14 +154,6 @@ def hang(
 ) -> Iterator[GalleryEntry]:
     """Make what the page shows, one picture after the other.
 
-    Parameters
-    ----------
-    pictures : sequence of Picture
-    output : Path
-        Folder of the page; crops and stored results go below it.
-    wishes : Wishes
-    on_picture : OnPicture
-
     Yields
     ------
     GalleryEntry

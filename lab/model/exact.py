@@ -41,15 +41,7 @@ def all_pairs(
     pixel: float,
     widths: Mapping[str, float],
 ) -> NDArray[np.float64]:
-    """Sum over all pixels of all samples for every pixel of the answer, shape (size, size).
-
-    Parameters
-    ----------
-    pixel : float
-        Bandwidth h_u = h_v in pixels.
-    widths : mapping of str to float
-        The other bandwidths, by the names in `variables.COLUMNS`.
-    """
+    """Sum over all pixels of all samples for every pixel of the answer, shape (size, size)."""
     t = np.arange(size, dtype=np.float64) - size // 2
     u, v = (a.ravel() for a in pixel_to_local(t[:, None], t[None, :], position.phi))
     above, below = np.zeros(u.size), np.zeros(u.size)
@@ -114,13 +106,7 @@ class PaperModel:
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], *, neighbours: int = 200) -> PaperModel:
-        """Build the tree; that is all the training there is.
-
-        Raises
-        ------
-        NoSamplesError
-            If there are no samples.
-        """
+        """Build the tree; that is all the training there is."""
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         where = va.points(samples)

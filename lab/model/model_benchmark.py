@@ -95,19 +95,6 @@ def run_model_benchmark(
 ) -> dict[str, Any]:
     """Compare methods of regression by the error of their predictions.
 
-    Parameters
-    ----------
-    seeds : sequence of int
-        Lenses to draw. Nothing was tuned on seeds from 1000 on.
-    photos : sequence of int
-        How many photos of 24 patches a model sees.
-    methods : sequence of str, optional
-        "eff-linear", "polynomial", "paper", "mode-default" or "mode-paper"; by default all.
-    psf_field : Path, optional
-        Measured PSFs; then `seeds` and `photos` play no part.
-    on_step : StepHook
-        Told after each fit of a method with its questions.
-
     Returns
     -------
     dict
@@ -151,24 +138,12 @@ def run_model_benchmark(
 
 
 def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
-    """Fit one of the methods of `run_model_benchmark` to samples; all of the same settings.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is no method of that name.
-    """
+    """Fit one of the methods of `run_model_benchmark` to samples; all of the same settings."""
     return _fits([method])[method](samples)
 
 
 def load_field(path: Path) -> list[PsfSample]:
-    """Read measured PSFs from an npz; negative pixels are noise and become zero.
-
-    Raises
-    ------
-    InvalidInputError
-        If a key is missing or shapes differ.
-    """
+    """Read measured PSFs from an npz; negative pixels are noise and become zero."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             psf, r, phi = stored["psf"], stored["r"], stored["phi"]

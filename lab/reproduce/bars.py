@@ -88,13 +88,7 @@ def _within(value: float | None, low: float | None, high: float | None) -> bool 
 
 
 def bars(result: Mapping[str, Any]) -> list[Bar]:
-    """Evaluate every bar on each family's lenses wide open, raw, at base ISO, and on what hurts.
-
-    Parameters
-    ----------
-    result : mapping
-        What `run_reproduction` returned.
-    """
+    """Evaluate every bar on each family's lenses wide open, raw, at base ISO, and on what hurts."""
     found: list[Bar] = []
     method = _method(result)
     for family in FAMILIES:
@@ -238,13 +232,7 @@ def held(found: Sequence[Bar]) -> dict[str, int]:
 
 
 def missed(result: Mapping[str, Any]) -> list[str]:
-    """Say which bars are missed, a line each, and of five photos that are worse than two, where.
-
-    Parameters
-    ----------
-    result : mapping
-        What `run_reproduction` returned.
-    """
+    """Say which bars are missed, a line each, and of five photos that are worse than two, where."""
     lines = []
     for bar in bars(result):
         if bar.met is False:

@@ -126,13 +126,7 @@ def repository_grids() -> tuple[Path, ...]:
 
 @lru_cache(maxsize=16)
 def traced(path: Path) -> GridLens:
-    """Read a ray-traced lens at the one aperture of a grid file.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file has another form.
-    """
+    """Read a ray-traced lens at the one aperture of a grid file."""
     return GridLens.read(path)
 
 
@@ -346,28 +340,6 @@ def planned(
     default_only: bool = False,
 ) -> Reproduction:
     """Plan a run of one of four sizes.
-
-    Parameters
-    ----------
-    size : {"quick", "small", "default", "full"}
-        Four lenses, small photos, n = 1, 2, without rivals and the paper's own way; all lenses wide open on
-        frames of a megapixel, n = 1, 2, 5, without rivals; eight lenses of different kind, wide open,
-        n = 1, 2, 5; the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller
-        frames. The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each
-        family, the full size takes them and the scenes that hurt with four of third order.
-    scenes : Path or None
-        See `Reproduction`.
-    grids : sequence of Path, optional
-        Grids of ray-traced lenses, one lens each; None takes those of the repository.
-    only : sequence of str
-        Only lenses whose name begins so, such as "1003" or "heliar"; for sittings on several machines.
-    default_only : bool
-        Only what a user gets who chooses nothing is measured, beside the photo as it was and the true PSF.
-
-    Raises
-    ------
-    InvalidInputError
-        If two grids are of one design and aperture, or no lens has such a name.
 
     Notes
     -----

@@ -137,11 +137,6 @@ def measured_field(case: Case, path: Path) -> PsfField:
 
     The target stands a little turned, aslant and unevenly lit, and its photo is a DNG like the others;
     the simulator's truth takes no part.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If the target cannot be found or measured.
     """
     page = measure.TargetPage(round(_FILL * case.height * 2**0.5))  # as many samples as it takes pixels
     scene = targets.target_scene(page, (case.height, case.width), targets.Setup(fill=_FILL))

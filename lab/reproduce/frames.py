@@ -69,13 +69,7 @@ class Layout:
 
 
 def scene_files(folder: Path | None) -> tuple[Path, ...]:
-    """Photographs of the test half of a folder; all five of the library when there is no folder.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder holds none of the test half.
-    """
+    """Photographs of the test half of a folder; all five of the library when there is no folder."""
     found = list_photos(folder)
     if folder is None:
         return found
@@ -86,22 +80,7 @@ def scene_files(folder: Path | None) -> tuple[Path, ...]:
 
 
 def layout_for(files: Sequence[Path], frames: int, wanted: tuple[int, int] | None = None) -> Layout:
-    """Decide how to make `frames` frames without using anything twice.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        The photographs.
-    frames : int
-        How many frames.
-    wanted : tuple of int, optional
-        (height, width) that each has to cover: the smallest grid that does. None: the largest grid.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are too few photographs, or they are too small.
-    """
+    """Decide how to make `frames` frames without using anything twice."""
     share = len(files) // frames
     if share == 0 and 2 * len(files) < frames:
         raise InvalidInputError(
@@ -130,11 +109,6 @@ def _layout(files: Sequence[Path], pieces: int, grid: tuple[int, int]) -> Layout
 def frame_scene(files: Sequence[Path], layout: Layout, order: Sequence[int], number: int) -> Planes:
     """Compose frame `number` from photographs in the given order.
 
-    Parameters
-    ----------
-    order : sequence of int
-        Permutation of the numbers of all parts, `len(files) * layout.pieces`.
-
     Returns
     -------
     Planes, shape (3, rows * tile height, cols * tile width)
@@ -157,11 +131,6 @@ def centred_cut(scene: Planes, height: int, width: int) -> Planes:
     """Cut the middle so that the scene exceeds `height` x `width` by twice the margin, or by less.
 
     What remains exceeds the frame by an even number, as the simulated camera wants it.
-
-    Raises
-    ------
-    InvalidInputError
-        If the scene is smaller than the frame.
     """
     cut = []
     for have, want in zip(scene.shape[1:], (height, width), strict=True):

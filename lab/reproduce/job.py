@@ -72,22 +72,6 @@ def run_reproduction(
 ) -> dict[str, Any]:
     """Run what is missing and return everything.
 
-    Parameters
-    ----------
-    plan : Reproduction
-    folder : Path
-        Pictures go to `pictures` in it.
-    on_work : OnWork
-        Called after each result.
-    results : Path, optional
-        Where results are stored and taken from; by default `cache` in `folder`.
-    workers : int
-        Processes.
-    with_figures : bool
-        Whether to draw Fig. 2 and Fig. 4 too.
-    learner : callable
-        What is under test.
-
     Returns
     -------
     dict

@@ -72,13 +72,7 @@ class Learner(Protocol):
         """
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
-        """Return the PSFs at some places.
-
-        Raises
-        ------
-        NoSamplesError
-            If no photo has counted yet.
-        """
+        """Return the PSFs at some places."""
 
     def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
         """Correct a photo that takes no part in learning, with what is known now."""

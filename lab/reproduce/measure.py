@@ -95,17 +95,7 @@ def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[Zone, fl
 def forecast(
     before: Mapping[str, float], after: Planes, expected: Mapping[str, float | None], shots: Shots, case: Case
 ) -> dict[str, dict[str, float | None]]:
-    """Gain in PSNR of linear light that a correction expected of itself in each zone, beside the true one.
-
-    Parameters
-    ----------
-    before : mapping
-        `light` of the photo as it was.
-    after : Planes
-        Corrected, of the raw path.
-    expected : mapping
-        Decibels by zone; None where the correction does not tell.
-    """
+    """Gain in PSNR of linear light that a correction expected of itself in each zone, beside the true one."""
     found = light(after, shots, case)
     return {
         zone: {"expected": expected[zone], "true": found[zone] - before[zone]}

@@ -48,11 +48,6 @@ _COUNTED = ("zones", "worse", "clearly_worse", "ssim_worse", "unimproved")
 def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
     """Write `reproduction.md` and `reproduction.html`; the pictures lie in `pictures` beside them.
 
-    Parameters
-    ----------
-    result : mapping
-        What `run_reproduction` returned.
-
     Returns
     -------
     tuple of Path
@@ -141,22 +136,10 @@ def _programs(names: Sequence[str]) -> str:
 def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
     """Take tables and curves of a finished benchmark; None where there is none.
 
-    Parameters
-    ----------
-    folder : Path
-        Output folder of the benchmark.
-    pictures : Path
-        Where its curves are copied to.
-
     Returns
     -------
     dict or None
         `rows`, one a method and noise level; `settings`; `pictures`, names of the copies.
-
-    Raises
-    ------
-    InvalidInputError
-        If the stored benchmark cannot be read.
     """
     path = folder / "blind.json"
     if not path.exists():

@@ -50,14 +50,6 @@ def version() -> str:
 def best_setting(peer: peers.Peer, photo: Planes, truth: Planes, gains: Gains) -> tuple[float, Planes]:
     """Try every setting of a program on a photo.
 
-    Parameters
-    ----------
-    peer : Peer
-    photo, truth : Planes, shape (3, height, width)
-        Linear light of the sensor.
-    gains : tuple of float
-        White balance.
-
     Returns
     -------
     setting : float

@@ -72,11 +72,6 @@ def principal(fields: NDArray[np.floating], radii: Sequence[float], count: int) 
         J of them.
     count : int
         m.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are fewer fields than components.
     """
     both = np.concatenate([fields, fields[:, :, ::-1]]).astype(np.float64)
     if len(both) < count:

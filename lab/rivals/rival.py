@@ -25,15 +25,7 @@ class Rival(Protocol):
     source: str
 
     def field(self, photos: Sequence[LinearPhoto]) -> PsfField:
-        """Estimate the PSF field, all channels.
-
-        Raises
-        ------
-        NotEnoughEvidenceError
-            If the photos do not determine it.
-        NoUsablePatchesError
-            If no part of a photo tells about its blur.
-        """
+        """Estimate the PSF field, all channels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -138,13 +138,7 @@ class GridField:
 
 
 def read_grid(path: str | Path) -> GridField:
-    """Read a grid that `GridField.write` wrote.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file has another form.
-    """
+    """Read a grid that `GridField.write` wrote."""
     with np.load(path, allow_pickle=False) as stored:
         if int(stored["format"]) != FORMAT:
             raise InvalidInputError(f"{path} has grid format {stored['format']}, expected {FORMAT}")
@@ -215,13 +209,7 @@ class GridLens:
         defocus: float = 0.0,
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
-        """Kernel at field vector `h`, its centre of mass at `offset` (row, col) pixels.
-
-        Raises
-        ------
-        InvalidInputError
-            If the pixel pitch is not that of the grid, or the photo is out of focus.
-        """
+        """Kernel at field vector `h`, its centre of mass at `offset` (row, col) pixels."""
         grid = self._grid(settings)
         if defocus != 0.0 or abs(pitch_um / grid.pitch_um - 1.0) > 1e-3:
             raise InvalidInputError(

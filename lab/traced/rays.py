@@ -212,11 +212,6 @@ class Tracer:
             Per wavelength, before vignetting.
         start : ndarray, shape (2, 3), optional
             See `aimed`.
-
-        Raises
-        ------
-        InvalidInputError
-            If hardly any ray arrives.
         """
         entrance = self.aimed(direction, radius, _sunflower(rays), start)
         many = len(wavelengths_um)
@@ -260,13 +255,7 @@ class Tracer:
         return np.asarray(np.linalg.lstsq(basis.T, entrance[:, seen].T, rcond=None)[0].T)
 
     def marginal(self, f_number: float) -> Array:
-        """Heights (mm) at which the axial ray of cosine 1 / (2 N) crosses the stop and the rims.
-
-        Raises
-        ------
-        InvalidInputError
-            If the design does not open so far.
-        """
+        """Heights (mm) at which the axial ray of cosine 1 / (2 N) crosses the stop and the rims."""
         heights = np.linspace(0.0, 3.0 * self._pupil_radius * max(self.design.f_number / f_number, 1.0), 600)
         entrance = np.vstack([np.zeros_like(heights), heights])
         _, cosines, _, stop, rims = self.launch((0.0, 0.0), entrance, np.full(heights.size, AIM_UM))

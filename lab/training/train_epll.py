@@ -43,26 +43,7 @@ def windows_of(photo: Path, count: int, rng: np.random.Generator) -> NDArray[np.
 def train_epll(
     photos: Sequence[Path], out: Path, *, components: int = 40, windows: int = 30_000, seed: int = 0
 ) -> None:
-    """Fit the mixture by expectation maximisation and write it.
-
-    Parameters
-    ----------
-    photos : sequence of Path
-        Sharp photographs.
-    out : Path
-        The .npz file: `weights` (m,) and `covariances` (m, 2080), lower triangles, float32.
-    components : int
-        m; 40 make a file of a third of a megabyte.
-    windows : int
-        How many windows to fit.
-    seed : int
-        For the choice of windows and the start.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is no photo, or scikit-learn is not installed.
-    """
+    """Fit the mixture by expectation maximisation and write it."""
     if not photos:
         raise InvalidInputError("no photos to train on; name at least one sharp photograph")
     try:

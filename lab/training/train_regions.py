@@ -159,13 +159,7 @@ class RegionsReport:
 
 
 def fit(table: Path, model: Path, seed: int = 0) -> RegionsReport:
-    """Learn from the development half, write the trees, report on the test half.
-
-    Raises
-    ------
-    InvalidInputError
-        If a half is empty, or scikit-learn is not installed.
-    """
+    """Learn from the development half, write the trees, report on the test half."""
     try:
         from sklearn.ensemble import GradientBoostingRegressor  # noqa: PLC0415  # needed for training only
     except ImportError as error:

@@ -17,11 +17,6 @@ def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0
     """Drop values below `threshold` times the peak and islands below `least_mass` of the sum.
 
     Not centred. The largest island always stays.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If nothing positive is there.
     """
     kept = np.maximum(kernel, 0.0)
     if not kept.max() > 0:

@@ -249,13 +249,7 @@ class KernelEquations:
 
     @classmethod
     def of(cls, pairs: Sequence[DerivativePair], side: int) -> KernelEquations:
-        """Sum over pairs; predictions near the border, whose blur reaches outside, are left out.
-
-        Raises
-        ------
-        NotEnoughEvidenceError
-            If nothing was predicted.
-        """
+        """Sum over pairs; predictions near the border, whose blur reaches outside, are left out."""
         reach = [max(pair.sharp.shape[axis] for pair in pairs) + side for axis in (0, 1)]
         grid = (int(fft.next_fast_len(reach[0], real=True)), int(fft.next_fast_len(reach[1], real=True)))
         power = np.zeros((grid[0], grid[1] // 2 + 1))

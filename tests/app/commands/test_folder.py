@@ -148,7 +148,7 @@ def test_a_folder_of_an_unknown_lens_is_learned_and_corrected(tmp_path: Path) ->
     (group,) = json.loads(done.stdout)["groups"]
     assert group["learned_from"] == 1
     assert group["corrected"] + group["left"] == 2
-    assert load_profile(tmp_path / Path(group["profile"])).model.warm
+    assert load_profile(tmp_path / Path(group["profile"])).model.samples
 
 
 # --- sorting -----------------------------------------------------------------------------------

@@ -16,10 +16,7 @@ from lab.reproduce.measure import FAIR_OVERSHOOT
 from lab.reproduce.tables import (
     DENOISED,
     GENERAL,
-    NOTHING_DB,
     PAPER_WAY,
-    TOLERATED_DB,
-    TOLERATED_L2,
     deconvolution,
     groups,
     hard_rows,
@@ -41,8 +38,6 @@ _PAPER = [
     ("n = 5", "1076", "654"),
     ("true (measured) PSF", "1120", "696"),
 ]
-
-_COUNTED = ("zones", "worse", "clearly_worse", "ssim_worse", "unimproved")
 
 
 def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
@@ -180,28 +175,16 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
         ]
         page.table(head, [[shown(row["state"]), *_edge_cells(row)] for row in rows])
         page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
+        halo = found["halo"][method]
         page.table(
-            ["", *ZONES, *(f"{z} tan / sag" for z in ZONES), *(f"{z} overshoot beyond" for z in ZONES)],
-            _share_rows(found, method),
+            ["", *ZONES, *(f"{z} overshoot beyond" for z in ZONES)],
+            [
+                [f"n = {n}", *(number(share[z], 2) for z in ZONES), *(number(halo[n][z], 1) for z in ZONES)]
+                for n, share in found["share"][method].items()
+            ],
         )
     page.text("The paper, Canon EF 24mm f/1.4 (center, corner), for comparison of shares, not of values:")
     page.table(["", "center", "corner"], _PAPER)
-
-
-def _share_rows(found: Mapping[str, Any], method: str) -> list[list[str]]:
-    rows = []
-    for n, share in found["share"][method].items():
-        along, across = (found[f"share_{way}"][method][n] for way in ("tangential", "sagittal"))
-        beyond = found["halo"][method][n]
-        rows.append(
-            [
-                f"n = {n}",
-                *(number(share[z], 2) for z in ZONES),
-                *(f"{number(along[z], 2)} / {number(across[z], 2)}" for z in ZONES),
-                *(number(beyond[z], 1) for z in ZONES),
-            ]
-        )
-    return rows
 
 
 def _edge_cells(row: Mapping[str, Any]) -> list[str]:
@@ -234,11 +217,6 @@ def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
         for row in _count_rows(found["psf_by_channel"][channel], 3)
     ]
     page.table(["", *ZONES], by_channel)
-    right = ", ".join(f"n = {n}: {number(v, 2)}" for n, v in found["predicted_right"].items())
-    page.text(
-        "Share of places where the model's own prediction of this error is right within a factor of 1.5: "
-        f"{right}."
-    )
 
 
 def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
@@ -256,65 +234,9 @@ def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
             for row, other in zip(psnr, found["ssim"][method], strict=True)
         ]
         page.table(["", *(f"PSNR {z}" for z in ZONES), *(f"SSIM {z}" for z in ZONES)], rows)
-        page.text("Share of the gain of the true PSF, where that is measurable:")
-        kept, likeness = found["psnr_kept"][method], found["ssim_kept"][method]
-        page.table(
-            ["", *(f"PSNR {z}" for z in ZONES), *(f"SSIM {z}" for z in ZONES)],
-            [
-                [
-                    f"n = {n}",
-                    *(number(kept[n][z], 2) for z in ZONES),
-                    *(number(likeness[n][z], 2) for z in ZONES),
-                ]
-                for n in kept
-            ],
-        )
-        page.text("Zones of lenses where PSNR or SSIM fell:")
-        page.table(
-            ["", "zones", "PSNR worse", "by more than 0.05 dB", "SSIM worse", "not better despite blur"],
-            [
-                [f"n = {n}", *(str(row[name]) for name in _COUNTED)]
-                for n, row in found["worse"][method].items()
-            ],
-        )
-        off = ", ".join(f"n = {n}: {number(v, 2)}" for n, v in found["forecast_off"][method].items())
-        page.text(
-            "What the gain that a correction expects of itself in a zone is off by, dB of linear light, mean "
-            f"over zones of lenses: {off}."
-        )
-        said = "; ".join(
-            f"n = {n}: {row['said']} of {row['lenses']}, {row['wrongly']} of them wrongly, "
-            f"and left out of {row['unsaid']}"
-            for n, row in found["nothing_said"][method].items()
-        )
-        page.text(
-            '"Nothing to correct" was said of so many lenses (right where the true PSF gains less than '
-            f"{NOTHING_DB:g} dB in every zone): {said}."
-        )
-        _more_table(page, found["more_photos"].get(method))
-
-
-def _more_table(page: Page, more: Mapping[str, Any] | None) -> None:
-    """Name the zones of lenses where more photos did harm."""
-    if more is None:
-        return
-    page.text(
-        f"Five photos beside two: of {more['zones']} zones of lenses the PSF error is larger by more than "
-        f"{TOLERATED_L2:g} in {more['psf_worse']} (the worst channel), PSNR of the corrected picture lower "
-        f"by more than {TOLERATED_DB:g} dB in {more['psnr_worse']}."
-    )
-    if more["rows"]:
-        page.table(
-            ["", "zone", "PSF error", "PSNR"],
-            [
-                [row["lens"], row["zone"], _from_to(row["psf"], 3), _from_to(row["psnr"], 2)]
-                for row in more["rows"]
-            ],
-        )
-
-
-def _from_to(pair: Sequence[float] | None, digits: int) -> str:
-    return "-" if pair is None else " to ".join(number(value, digits) for value in pair)
+        page.text("Share of the gain of the true PSF in PSNR, where that is measurable:")
+        kept = found["psnr_kept"][method]
+        page.table(["", *ZONES], [[f"n = {n}", *(number(kept[n][z], 2) for z in ZONES)] for n in kept])
 
 
 def _bars_table(page: Page, every: Sequence[Bar]) -> None:

@@ -13,8 +13,8 @@ Result = Mapping[str, Any]
 
 TOLERATED_DB: Final = 0.05  # dB of a zone (chosen): less counts as equal
 
-MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
-"""Gains of the true PSF below these say nothing of a lens."""
+MEASURABLE_DB: Final = 0.2
+"""A gain of the true PSF below this says nothing of a lens."""
 
 NOTHING_DB: Final = 0.3
 """Where the true PSF gains less than this in every zone, there is nothing to correct (chosen: a bar)."""
@@ -91,34 +91,21 @@ def summary(result: Result) -> dict[str, Any]:
         `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
         `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
         `highest_mtf`: the highest corrected MTF of any lens;
-        `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
+        `psnr_kept`: share of its gain in PSNR;
         `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
         the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
-        that a correction expects of itself in a zone, dB; `nothing_said` and `more_photos`,
-        see the functions.
+        that a correction expects of itself in a zone, dB.
     """
     methods = result["plan"]["methods"]
     return {
         "lenses": len(result["cases"]),
         "mtf": {method: _mtf(result, method) for method in methods},
         "share": {method: _by_count(result, partial(shares, method=method)) for method in methods},
-        "share_tangential": {
-            method: _by_count(result, partial(shares, method=method, edge="tangential_mtf50"))
-            for method in methods
-        },
-        "share_sagittal": {
-            method: _by_count(result, partial(shares, method=method, edge="sagittal_mtf50"))
-            for method in methods
-        },
         "halo": {method: _by_count(result, partial(halo, method=method)) for method in methods},
         "highest_mtf": {method: _highest_mtf(result, method) for method in methods},
         "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
         "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
-        "psnr_control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in result["cases"])),
         "psnr_kept": {method: _by_count(result, partial(kept, method=method)) for method in methods},
-        "ssim_kept": {
-            method: _by_count(result, partial(kept, method=method, of="ssim")) for method in methods
-        },
         "worse": {method: worse(result, method) for method in methods},
         "psf_others": _psf_of_others(result),
         "psf": _by_count(result, partial(_psf, channel="g")),
@@ -128,12 +115,6 @@ def summary(result: Result) -> dict[str, Any]:
             for n in counts(result)
         },
         "forecast_off": {method: _forecast_off(result, method) for method in methods},
-        "nothing_said": {method: nothing_said(result, method) for method in methods},
-        "more_photos": {
-            method: more_photos(_having(result, int(FEWER)), method)
-            for method in methods
-            if int(MORE) in counts(result)
-        },
     }
 
 
@@ -183,13 +164,13 @@ def others(case: Result) -> dict[str, Result]:
     return found
 
 
-def shares(case: Result, n: int, method: str, edge: str = "mtf50") -> dict[str, float | None]:
+def shares(case: Result, n: int, method: str) -> dict[str, float | None]:
     """Share of the gain of the true PSF in MTF50 that one lens reaches; None where that gain is small."""
     found: dict[str, float | None] = {}
     for zone in ZONES:
-        before = _edge(case["truth"]["before"], zone, edge)
-        true = _edge(case["truth"]["true"][method], zone, edge)
-        after = _edge(case["learned"][str(n)]["methods"][method], zone, edge)
+        before = _edge(case["truth"]["before"], zone, "mtf50")
+        true = _edge(case["truth"]["true"][method], zone, "mtf50")
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, "mtf50")
         if before is None or true is None or after is None or true - before < SMALL_GAIN * before:
             found[zone] = None
         else:
@@ -207,13 +188,13 @@ def halo(case: Result, n: int, method: str) -> dict[str, float | None]:
     return found
 
 
-def kept(case: Result, n: int, method: str, of: str = "psnr") -> dict[str, float | None]:
-    """Share of the gain of the true PSF in PSNR or SSIM; None where that gain is small."""
+def kept(case: Result, n: int, method: str) -> dict[str, float | None]:
+    """Share of the gain of the true PSF in PSNR; None where that gain is small."""
     found: dict[str, float | None] = {}
     for zone in ZONES:
-        true = gain(case, case["truth"]["true"][method], zone, of)
-        after = gain(case, case["learned"][str(n)]["methods"][method], zone, of)
-        found[zone] = None if true is None or after is None or true < MEASURABLE[of] else after / true
+        true = gain(case, case["truth"]["true"][method], zone)
+        after = gain(case, case["learned"][str(n)]["methods"][method], zone)
+        found[zone] = None if true is None or after is None or true < MEASURABLE_DB else after / true
     return found
 
 
@@ -403,7 +384,7 @@ def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int
         found["worse"] += psnr < 0.0
         found["clearly_worse"] += psnr < -TOLERATED_DB
         found["ssim_worse"] += ssim < 0.0
-        found["unimproved"] += possible >= MEASURABLE["psnr"] and (psnr <= 0.0 or ssim <= 0.0)
+        found["unimproved"] += possible >= MEASURABLE_DB and (psnr <= 0.0 or ssim <= 0.0)
     return found
 
 

@@ -427,11 +427,9 @@ def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None
         "ssim_worse": 6,
         "unimproved": 6,
     }
-    assert found["ssim_kept"]["paper"]["1"]["mid"] == pytest.approx((0.5 - 0.005 - 0.25) / 3)
     assert found["halo"]["paper"]["1"]["mid"] == pytest.approx(0.0)
     assert found["psf_others"]["kee, n = 1"]["corner"] == pytest.approx(0.5)
     assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
-    assert found["psnr_control"]["center"] == pytest.approx(0.5)
 
 
 def test_bars_are_two_sided() -> None:
@@ -471,7 +469,7 @@ UNSAID = "lenses not said to, though the true PSF gains less in all zones"
     [(True, 0.29, 0, 0), (True, 0.31, 1, 0), (False, 0.29, 0, 1), (False, 0.31, 0, 0)],
 )
 def test_nothing_to_correct_is_judged_by_the_true_psf_in_both_directions(
-    said: bool, possible: float, wrongly: int, unsaid: int, tmp_path: Path
+    said: bool, possible: float, wrongly: int, unsaid: int
 ) -> None:
     made = result((100, 30.0))
     one = made["cases"][0]
@@ -481,15 +479,6 @@ def test_nothing_to_correct_is_judged_by_the_true_psf_in_both_directions(
     found = {bar.name: bar for bar in bars(made) if bar.n == "1"}
     assert (found[NOTHING].value, found[UNSAID].value) == (wrongly, unsaid)
     assert [found[name].met for name in (NOTHING, UNSAID)] == [wrongly == 0, unsaid == 0]
-    assert summary(made)["nothing_said"]["paper"]["1"] == {
-        "lenses": 1,
-        "said": int(said),
-        "wrongly": wrongly,
-        "unsaid": unsaid,
-    }
-    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
-    words = f"n = 1: {int(said)} of 1, {wrongly} of them wrongly, and left out of {unsaid}"
-    assert words in " ".join(text.split())
 
 
 def after(two: tuple[float, float], five: tuple[float, float]) -> dict[str, Any]:
@@ -514,7 +503,7 @@ def after(two: tuple[float, float], five: tuple[float, float]) -> dict[str, Any]
     ],
 )
 def test_five_photos_are_never_worse_than_two(
-    two: tuple[float, float], five: tuple[float, float], psf_worse: int, psnr_worse: int, tmp_path: Path
+    two: tuple[float, float], five: tuple[float, float], psf_worse: int, psnr_worse: int
 ) -> None:
     made = after(two, five)
     found = [bar for bar in bars(made) if bar.name.startswith("zones where five photos")]
@@ -522,9 +511,6 @@ def test_five_photos_are_never_worse_than_two(
         ("5", "of 3 zones", psf_worse),
         ("5", "of 3 zones", psnr_worse),
     ]
-    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
-    row = f"| Lens &lt;0&gt; | corner | 0.200 to {five[0]:.3f} | {two[1]:.2f} to {five[1]:.2f} |"
-    assert (row in text) is bool(psf_worse or psnr_worse)
     where = [line for line in missed(made) if line.startswith("five photos worse than two: Lens <0>, corner")]
     assert len(where) == (psf_worse or psnr_worse)
 

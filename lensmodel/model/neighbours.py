@@ -50,22 +50,29 @@ class Neighbourhood:
 
     def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
         """Weigh the samples near each of some places."""
-        from lensmodel.model.loops import near  # noqa: PLC0415 - Numba takes a while to load
+        chosen = [self._weighed(va.point(position, settings)) for position in positions]
+        ends = np.cumsum([len(rows) for rows, _ in chosen])
+        return Answers(
+            np.concatenate([rows for rows, _ in chosen]),
+            np.concatenate([weights for _, weights in chosen]),
+            np.concatenate([[0], ends]).astype(np.intp),
+        )
 
-        asked = np.array([va.point(position, settings) for position in positions])
-        limits = (self.scale, REACH**2, _FEW, DROPPED)
-        if len(self.points) <= _MANY:
-            return Answers(*near(self.points, self.weights, asked, *limits))
-        rows, weights = [], []
-        for point in asked:
-            part = self.within(point, REACH)
-            if np.count_nonzero(self.weights[part] > 0) < _FEW:
-                part = np.arange(len(self.points))
-            own, weight, _ = near(self.points[part], self.weights[part], point[None], *limits)
-            rows.append(part[own])
-            weights.append(weight)
-        starts = np.concatenate([[0], np.cumsum([len(own) for own in rows])]).astype(np.intp)
-        return Answers(np.concatenate(rows), np.concatenate(weights), starts)
+    def _weighed(self, asked: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Rows and weights of sum 1 for one question, the least first."""
+        rows = np.arange(len(self.points)) if len(self.points) <= _MANY else self.within(asked, REACH)
+        squared = va.squared_distances(self.points[rows], asked, self.scale)
+        near = np.flatnonzero((squared <= REACH**2) & (self.weights[rows] > 0.0))
+        if len(near) < _FEW:  # the nearest few, however far
+            rows = np.arange(len(self.points))
+            squared = va.squared_distances(self.points, asked, self.scale)
+            squared[self.weights <= 0.0] = np.inf
+            near = np.argsort(squared, kind="stable")[: min(_FEW, np.count_nonzero(self.weights > 0.0))]
+        rows, squared = rows[near], squared[near]
+        weight = self.weights[rows] * np.exp(-0.5 * (squared - squared.min()))
+        order = np.argsort(weight, kind="stable")
+        kept = order[np.cumsum(weight[order]) > DROPPED * weight.sum()]
+        return rows[kept], weight[kept] / weight[kept].sum()
 
     def within(self, asked: NDArray[np.float64], reach: float) -> NDArray[np.intp]:
         """Rows within `reach` bandwidths of a point, and some beyond that do not know all its variables."""

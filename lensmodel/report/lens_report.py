@@ -152,51 +152,27 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class ApertureReport:
-    """What was found at one aperture, in one colour.
-
-    Parameters
-    ----------
-    settings : LensSettings
-    aspect : float
-        Width over height of the map.
-    rows, cols : int
-    positions : tuple of FieldPosition
-        Of the map, row by row from the top left.
-    tangential, sagittal : tuple of float
-        MTF50 at each place, cycles/pixel.
-    tangential_error, sagittal_error : tuple of float
-        Their standard errors; empty where they are not known.
-    predicted_error : tuple of float
-        Expected relative L2 of the kernel at each place.
-    extrapolated : tuple of bool
-        Whether no photo shows a place.
-    radii : tuple of float
-    curves : tuple of Curve
-    along_u, along_v : tuple of float
-        Root mean square widths of a point by radius, pixels. Where they part there is astigmatism (W. T.
-        Welford, "Aberrations of Optical Systems", 1986, sec. 8.3); photos of one focus cannot tell how far
-        each focal surface lies from the sensor.
-    spots : tuple of Spot
-        The centre and the four corners.
-    centring : Centring
-    """
+    """What was found at one aperture, in one colour."""
 
     settings: LensSettings
-    aspect: float
+    aspect: float  # width over height of the map
     rows: int
     cols: int
-    positions: tuple[FieldPosition, ...]
-    tangential: tuple[float, ...]
+    positions: tuple[FieldPosition, ...]  # of the map, row by row from the top left
+    tangential: tuple[float, ...]  # MTF50 at each place, cycles/pixel
     sagittal: tuple[float, ...]
-    tangential_error: tuple[float, ...]
+    tangential_error: tuple[float, ...]  # their standard errors; empty where they are not known
     sagittal_error: tuple[float, ...]
-    predicted_error: tuple[float, ...]
-    extrapolated: tuple[bool, ...]
+    predicted_error: tuple[float, ...]  # expected relative L2 of the kernel at each place
+    extrapolated: tuple[bool, ...]  # whether no photo shows a place
     radii: tuple[float, ...]
     curves: tuple[Curve, ...]
+    # Root mean square widths of a point by radius, pixels. Where they part there is astigmatism (W. T.
+    # Welford, "Aberrations of Optical Systems", 1986, sec. 8.3); photos of one focus cannot tell how far each
+    # focal surface lies from the sensor.
     along_u: tuple[float, ...]
     along_v: tuple[float, ...]
-    spots: tuple[Spot, ...]
+    spots: tuple[Spot, ...]  # the centre and the four corners
     centring: Centring
 
     @property
@@ -247,40 +223,20 @@ class LateralColourCurve:
 
 @dataclass(frozen=True, slots=True)
 class LensReport:
-    """A whole report.
+    """A whole report."""
 
-    Parameters
-    ----------
-    name : str
-        Of the lens.
-    verdict : str
-        For photographers.
-    photos, samples : int
-        That it rests on.
-    sensor : SensorGeometry
-        For other units than cycles/pixel.
-    tested : tuple of ApertureReport
-        By aperture, ascending, and by colour, green first.
-    lateral : LateralColourCurve or None
-        None where no photo showed it.
-    advice : Advice
-        Which photo would help most.
-    drawn : {"photos", "patches", ""}
-        What was drawn again for the standard errors; with fewer than three photos patches, which share their
-        photo's focus, so that errors come out too small.
-    details : mapping of str to str
-        What else stands on the page: camera, serial, names of photos.
-    """
-
-    name: str
-    verdict: str
-    photos: int
+    name: str  # of the lens
+    verdict: str  # for photographers
+    photos: int  # that it rests on
     samples: int
-    sensor: SensorGeometry
-    tested: tuple[ApertureReport, ...]
-    lateral: LateralColourCurve | None
-    advice: Advice
+    sensor: SensorGeometry  # for other units than cycles/pixel
+    tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
+    lateral: LateralColourCurve | None  # None where no photo showed it
+    advice: Advice  # which photo would help most
+    # what was drawn again for the standard errors; with fewer than three photos patches, which share their
+    # photo's focus, so that errors come out too small
     drawn: str = ""
+    # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, aperture: float | None, channel: Channel = "g") -> ApertureReport:

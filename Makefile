@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help install demo test test-slow test-tools test-all serve check security torture fuzz format bench docs notebooks \
-  wheel-check gallery lock \
+  wheel-check lowest-check gallery lock \
   container-check clean
 
 help: ## list the targets
@@ -80,6 +80,9 @@ notebooks: install ## run the notebooks of docs/notebooks anew, minutes
 
 wheel-check: ## build the wheel and use it in clean environments (asks the network)
 	@tools/wheel_check.sh $(PYTHON)
+
+lowest-check: ## a part of the tests with the lowest versions that pyproject.toml allows (asks the network)
+	@tools/lowest_check.sh $(PYTHON)
 
 gallery: install ## pictures to look at, gallery-output/index.html (real ones with LENSMODEL_TEST_DATA)
 	@$(BIN)/lensmodel bench gallery --output gallery-output

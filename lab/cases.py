@@ -35,31 +35,16 @@ _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 
 @dataclass(frozen=True, slots=True)
 class BlindCase:
-    """One question: a photo, a PSF and a noise level.
-
-    Parameters
-    ----------
-    photo : Path
-    psf_number : int
-        Row of the PSF file.
-    noise : float
-        Standard deviation as a share of full range.
-    patch : int
-        Side of a window in pixels.
-    seed : int
-        For the noise.
-    choice : {"r-map", "good-regions"}
-        Selector of `lensmodel.patches`, which sees the blurred and noisy photograph only.
-    window : int
-        Which window of the photograph: 0 is the best one that the selector finds, 1 the next beside it.
-    """
+    """One question: a photo, a PSF and a noise level."""
 
     photo: Path
-    psf_number: int
-    noise: float
-    patch: int
-    seed: int
+    psf_number: int  # row of the PSF file
+    noise: float  # standard deviation as a share of full range
+    patch: int  # side of a window in pixels
+    seed: int  # for the noise
+    # selector of `lensmodel.patches`, which sees the blurred and noisy photograph only
     choice: Choice = "r-map"
+    # which window of the photograph: 0 is the best one that the selector finds, 1 the next beside it
     window: int = 0
 
     @property

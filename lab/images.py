@@ -161,26 +161,13 @@ def fidelity(
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """What a correction gained against the truth in dB of PSNR; positive is better.
-
-    Parameters
-    ----------
-    zones : dict of str to float
-    worst_db : float
-        Gain of the worst block.
-    worst_at : tuple of int
-        Its first row and column.
-    loss_share : float
-        Share of blocks that lose more than `LOSS_DB`.
-    blocks : int
-        How many there are.
-    """
+    """What a correction gained against the truth in dB of PSNR; positive is better."""
 
     zones: dict[Zone, float]
-    worst_db: float
-    worst_at: tuple[int, int]
-    loss_share: float
-    blocks: int
+    worst_db: float  # gain of the worst block
+    worst_at: tuple[int, int]  # its first row and column
+    loss_share: float  # share of blocks that lose more than `LOSS_DB`
+    blocks: int  # how many there are
 
 
 def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:

@@ -34,30 +34,15 @@ Command = Callable[[Path, Path, Path, float], list[str]]
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A program with one setting that matters.
+    """A program with one setting that matters."""
 
-    Parameters
-    ----------
-    name : str
-        For tables.
-    program : str
-        What must be on the path.
-    command : callable
-        The command line; a setting of 0 switches the sharpening off and leaves everything else.
-    settings : tuple of float
-        What to try when the best is chosen against the truth.
-    usual : float
-        The setting that is timed.
-    raw : bool
-        Whether it takes a mosaic in a DNG; else a 16-bit TIFF, sRGB-encoded.
-    """
-
-    name: str
-    program: str
+    name: str  # for tables
+    program: str  # what must be on the path
+    # the command line; a setting of 0 switches the sharpening off and leaves everything else
     command: Command
-    settings: tuple[float, ...]
-    usual: float
-    raw: bool = False
+    settings: tuple[float, ...]  # what to try when the best is chosen against the truth
+    usual: float  # the setting that is timed
+    raw: bool = False  # whether it takes a mosaic in a DNG; else a 16-bit TIFF, sRGB-encoded
 
     @property
     def installed(self) -> bool:

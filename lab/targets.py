@@ -34,30 +34,16 @@ LIFT: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """How a page or a chart stands before the camera: none of it is ideal.
+    """How a page or a chart stands before the camera: none of it is ideal."""
 
-    Parameters
-    ----------
-    turn_deg : float
-        Rotation.
-    keystone : tuple of float
-        Perspective: relative change of scale over half the frame, along rows and columns.
-    distortion : float
-        Radial, third power: displacement of the corner in half diagonals.
-    falloff : tuple of float
-        Light lost towards the bottom, the right, and the corners, as shares.
-    gamma : float
-        Tones of the print.
-    fill : float
-        Height of the page over that of the frame.
-    """
-
-    turn_deg: float = 0.7
+    turn_deg: float = 0.7  # rotation
+    # perspective: relative change of scale over half the frame, along rows and columns
     keystone: tuple[float, float] = (0.012, -0.018)
-    distortion: float = -0.008
+    distortion: float = -0.008  # radial, third power: displacement of the corner in half diagonals
+    # light lost towards the bottom, the right, and the corners, as shares
     falloff: tuple[float, float, float] = (0.12, 0.08, 0.25)
-    gamma: float = 1.15
-    fill: float = 1.0
+    gamma: float = 1.15  # tones of the print
+    fill: float = 1.0  # height of the page over that of the frame
 
 
 def target_scene(page: TargetPage, shape: tuple[int, int], setup: Setup) -> Planes:

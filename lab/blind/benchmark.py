@@ -31,10 +31,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lab.blind.judges import Judge, judges, squared_error
-from lab.blind.methods import compared
+from lab.blind.methods import BlindMethod, compared
 from lab.cases import CHOICES, HALVES, BlindCase, Choice, Half, list_photos, load_psfs, make_cases, observe
 from lab.page import table
-from lensmodel.blind import PsfEstimator
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.registry import Registry
@@ -51,46 +50,20 @@ UNTOUCHED = "none"
 
 @dataclass(frozen=True, slots=True)
 class BlindBenchmark:
-    """What to run.
+    """What to run."""
 
-    Parameters
-    ----------
-    photos : Path or None
-        Folder of sharp photographs; None means those of the library.
-    psfs : Path or None
-        .npz file with `psf` (n, k, k); None means the library's twelve.
-    noise : tuple of float
-        Standard deviations as shares of full range.
-    methods : tuple of str
-        Names of blind estimators; "none" is always added.
-    half : {"dev", "test", "all"}
-        Which half of photos and PSFs.
-    cases : int or None
-        At most so many, spread over photos and PSFs.
-    patch, kernel_size : int
-        Sides in pixels; the kernel's is odd.
-    judge : str
-        Non-blind deconvolution: "hyper-laplacian" or "epll".
-    seed : int
-        For noise and the choice of cases.
-    selection : {"r-map", "good-regions"}
-        Selector that chooses the windows in the blurred photograph.
-    scenes : int or None
-        So many windows of the photographs in turn; None means one of each.
-    """
-
-    photos: Path | None = None
-    psfs: Path | None = None
-    noise: tuple[float, ...] = (0.01,)
-    methods: tuple[str, ...] = ("default",)
-    half: Half = "test"
-    cases: int | None = None
-    patch: int = 256
+    photos: Path | None = None  # folder of sharp photographs; None means those of the library
+    psfs: Path | None = None  # .npz file with `psf` (n, k, k); None means the library's twelve
+    noise: tuple[float, ...] = (0.01,)  # standard deviations as shares of full range
+    methods: tuple[str, ...] = ("default",)  # names of blind estimators; "none" is always added
+    half: Half = "test"  # which half of photos and PSFs
+    cases: int | None = None  # at most so many, spread over photos and PSFs
+    patch: int = 256  # sides in pixels; the kernel's is odd
     kernel_size: int = 31
-    judge: str = "hyper-laplacian"
-    seed: int = 0
-    selection: Choice = "r-map"
-    scenes: int | None = None
+    judge: str = "hyper-laplacian"  # non-blind deconvolution: "hyper-laplacian" or "epll"
+    seed: int = 0  # for noise and the choice of cases
+    selection: Choice = "r-map"  # selector that chooses the windows in the blurred photograph
+    scenes: int | None = None  # so many windows of the photographs in turn; None means one of each
 
     def __post_init__(self) -> None:
         checks = {
@@ -111,40 +84,22 @@ class BlindBenchmark:
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """One method on one case.
-
-    Parameters
-    ----------
-    case, method : str
-    noise : float
-    error_ratio, untouched_ratio : float
-        ER with the estimated kernel, and of the blurred patch as it is.
-    ncc, rel_l2, mtf_rmse : float
-        Against the true kernel after sub-pixel alignment; see `psf.distance`.
-    width_px, true_width_px : float
-        RMS widths.
-    confidence, predicted_error : float
-        What the estimator says of itself; NaN for "none".
-    declined : bool
-        The estimator gave no answer; the patch then stays as it is.
-    seconds : float
-        Of the estimate alone.
-    """
+    """One method on one case."""
 
     case: str
     method: str
     noise: float
-    error_ratio: float
+    error_ratio: float  # ER with the estimated kernel, and of the blurred patch as it is
     untouched_ratio: float
-    ncc: float
+    ncc: float  # against the true kernel after sub-pixel alignment; see `psf.distance`
     rel_l2: float
     mtf_rmse: float
-    width_px: float
+    width_px: float  # RMS widths
     true_width_px: float
-    confidence: float
+    confidence: float  # what the estimator says of itself; NaN for "none"
     predicted_error: float
-    declined: bool
-    seconds: float
+    declined: bool  # the estimator gave no answer; the patch then stays as it is
+    seconds: float  # of the estimate alone
 
     @property
     def improved(self) -> bool:
@@ -250,12 +205,12 @@ class ResultStore:
             self._known = dict(_stored(self._file)) if self._file.exists() else {}
 
     def find(
-        self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None
+        self, case: BlindCase, kernel: Kernel, name: str, method: BlindMethod | None
     ) -> CaseResult | None:
         """Return the stored result, or None."""
         return self._known.get(self._key(case, kernel, name, method))
 
-    def add(self, case: BlindCase, kernel: Kernel, method: PsfEstimator | None, result: CaseResult) -> None:
+    def add(self, case: BlindCase, kernel: Kernel, method: BlindMethod | None, result: CaseResult) -> None:
         """Keep a result, and write it out at once."""
         key = self._key(case, kernel, result.method, method)
         self._known[key] = result
@@ -263,7 +218,7 @@ class ResultStore:
             with self._file.open("a", encoding="utf-8") as out:
                 out.write(json.dumps({"key": key, **plain(asdict(result))}) + "\n")
 
-    def _key(self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None) -> str:
+    def _key(self, case: BlindCase, kernel: Kernel, name: str, method: BlindMethod | None) -> str:
         described = repr(method) if is_dataclass(method) else type(method).__qualname__
         parts = (
             PROTOCOL,
@@ -296,7 +251,7 @@ def run_blind_benchmark(
     *,
     workers: int = 1,
     cache: Path | None = None,
-    methods: Registry[PsfEstimator] | None = None,
+    methods: Registry[BlindMethod] | None = None,
     on_step: StepHook = ignore_step,
 ) -> BlindReport:
     """Run the benchmark; what the cache folder already holds is not computed again."""
@@ -351,7 +306,7 @@ class _Job:
 
     case: BlindCase
     kernel: Kernel
-    methods: Mapping[str, PsfEstimator | None]
+    methods: Mapping[str, BlindMethod | None]
     judge: Judge
     kernel_size: int
 

@@ -37,18 +37,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class RecurrenceLine:
-    """error = at_agreement + by_disagreement * disagreement, all relative L2 distances.
-
-    Parameters
-    ----------
-    at_agreement, by_disagreement : float
-    spread : tuple of float
-        Standard errors of the two.
-    """
+    """error = at_agreement + by_disagreement * disagreement, all relative L2 distances."""
 
     at_agreement: float
     by_disagreement: float
-    spread: tuple[float, float]
+    spread: tuple[float, float]  # standard errors of the two
 
 
 def line_through(disagreement: Floats, error: Floats) -> RecurrenceLine:

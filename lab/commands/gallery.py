@@ -64,16 +64,16 @@ def gallery(
     folder = data or (Path(named) if named else None)
     began = time.monotonic()
     with as_usage():
-        wishes = run.Wishes(mode=mode, workers=workers, fresh=fresh)
-        _ = wishes.model
+        settings = run.GallerySettings(mode=mode, workers=workers, fresh=fresh)
+        _ = settings.model
         known = [] if folder is None else pictures.real_pictures(folder)
-        hung = pictures.chosen([*known, *pictures.simulated_pictures(output / run.CACHE)], only or [])
+        chosen = pictures.chosen([*known, *pictures.simulated_pictures(output / run.CACHE)], only or [])
 
     def progress(words: str, done: int, total: int) -> None:
         shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
 
     entries = []
-    for entry in run.hang(hung, output, wishes, on_picture=progress):
+    for entry in run.entries_of(chosen, output, settings, on_picture=progress):
         entries.append(entry)
         page = write_page(entries, output)  # after each: a run that is stopped leaves a page
     shown.result(text(entries))

@@ -1,4 +1,4 @@
-"""Which pictures hang in the gallery: every real one of the test data, and frames of hard scenes."""
+"""Which pictures entries_of in the gallery: every real one of the test data, and frames of hard scenes."""
 
 from __future__ import annotations
 
@@ -37,27 +37,13 @@ SMALLEST: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class SimulatedFrame:
-    """One simulated photo.
+    """One simulated photo."""
 
-    Parameters
-    ----------
-    name : str
-        Of its file, too.
-    scene : str
-        Name in `lab.scenes.HARD_SCENES`.
-    lens : int
-        Seed of the lens.
-    jpeg : bool
-        Whether it is a camera's JPEG, else a DNG.
-    full_well_electrons, read_noise : float
-        Of the sensor at this ISO, electrons.
-    """
-
-    name: str
-    scene: str
-    lens: int
-    jpeg: bool = False
-    full_well_electrons: float = 50_000.0
+    name: str  # of its file, too
+    scene: str  # name in `lab.scenes.HARD_SCENES`
+    lens: int  # seed of the lens
+    jpeg: bool = False  # whether it is a camera's JPEG, else a DNG
+    full_well_electrons: float = 50_000.0  # of the sensor at this ISO, electrons
     read_noise: float = 50.0
 
     @property
@@ -127,26 +113,13 @@ def take(
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One picture of the gallery.
+    """One picture of the gallery."""
 
-    Parameters
-    ----------
-    name : str
-        For people: folder and file, or "simulated/" and the frame.
-    path : Path
-        The photo; of a simulated frame it is taken when its turn comes.
-    truth : Path or None
-        npy of what a perfect lens would have shown; only of simulated frames.
-    unreadable : str
-        Why the file cannot be read; "" where it can.
-    subject : tuple of int or None
-        Pixel `(row, col)` of what the picture is about, where the usual places may miss it.
-    """
-
-    name: str
-    path: Path
-    truth: Path | None = None
-    unreadable: str = ""
+    name: str  # for people: folder and file, or "simulated/" and the frame
+    path: Path  # the photo; of a simulated frame it is taken when its turn comes
+    truth: Path | None = None  # npy of what a perfect lens would have shown; only of simulated frames
+    unreadable: str = ""  # why the file cannot be read; "" where it can
+    # pixel `(row, col)` of what the picture is about, where the usual places may miss it
     subject: tuple[int, int] | None = None
 
     @property

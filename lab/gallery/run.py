@@ -1,4 +1,4 @@
-"""Hang the gallery: each picture calibrated from itself, corrected by default, given to others, and measured.
+"""The gallery: each picture calibrated from itself, corrected by default, given to others, and measured.
 
 Whatever is stored already is not made again.
 """
@@ -50,67 +50,33 @@ Words = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class PicturePlace:
-    """One place of a picture that is looked at.
+    """One place of a picture that is looked at."""
 
-    Parameters
-    ----------
-    name : str
-        Which place.
-    row, col : int
-        First pixel.
-    file : str
-        Crops side by side, in the order of `GalleryEntry.columns`, relative to the page.
-    """
-
-    name: str
-    row: int
+    name: str  # which place
+    row: int  # first pixel
     col: int
-    file: str
+    file: str  # crops side by side, in the order of `GalleryEntry.columns`, relative to the page
 
 
 @dataclass(frozen=True, slots=True)
 class GalleryEntry:
-    """What the page shows of one picture.
-
-    Parameters
-    ----------
-    picture : Picture
-    work : dict
-        How it was made, see `work`.
-    figures : dict
-        See `measured`; empty for an unreadable file.
-    bars : dict of str to bool
-        Which it keeps.
-    columns : tuple of str
-        What stands side by side in the crops.
-    places : tuple of PicturePlace
-    """
+    """What the page shows of one picture."""
 
     picture: Picture
-    work: Unit
-    figures: dict[str, Any]
-    bars: dict[str, bool]
-    columns: tuple[str, ...]
+    work: Unit  # how it was made, see `work`
+    figures: dict[str, Any]  # see `measured`; empty for an unreadable file
+    bars: dict[str, bool]  # which it keeps
+    columns: tuple[str, ...]  # what stands side by side in the crops
     places: tuple[PicturePlace, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
-    """How pictures are worked on.
+class GallerySettings:
+    """How pictures are worked on."""
 
-    Parameters
-    ----------
-    mode : str or None
-        Mode of the lens model; None is the default one.
-    workers : int
-        Processes of a calibration, threads of a correction.
-    fresh : bool
-        Whether stored results are made anew.
-    """
-
-    mode: str | None = None
-    workers: int = 2
-    fresh: bool = False
+    mode: str | None = None  # mode of the lens model; None is the default one
+    workers: int = 2  # processes of a calibration, threads of a correction
+    fresh: bool = False  # whether stored results are made anew
 
     @property
     def model(self) -> ModelSettings:
@@ -119,7 +85,7 @@ class Wishes:
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class PictureFolder:
     """Where everything about one picture is kept."""
 
     folder: Path
@@ -149,8 +115,8 @@ class Room:
             np.save(file, values, allow_pickle=False)
 
 
-def hang(
-    pictures: Sequence[Picture], output: Path, wishes: Wishes, *, on_picture: OnPicture
+def entries_of(
+    pictures: Sequence[Picture], output: Path, settings: GallerySettings, *, on_picture: OnPicture
 ) -> Iterator[GalleryEntry]:
     """Make what the page shows, one picture after the other.
 
@@ -165,26 +131,28 @@ def hang(
         def say(words: str, done: int = done, name: str = picture.name) -> None:
             on_picture(f"{name}: {words}", done, len(pictures))
 
-        entry = _entry(picture, output, wishes, say)
+        entry = _entry(picture, output, settings, say)
         say("done", done + 1)
         yield entry
 
 
-def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], None]) -> GalleryEntry:
+def _entry(
+    picture: Picture, output: Path, settings: GallerySettings, say: Callable[[str], None]
+) -> GalleryEntry:
     if picture.unreadable:
         unit: Unit = {"state": "not read", "reason": picture.unreadable, "notes": []}
         return GalleryEntry(picture, unit, {}, {}, (), ())
-    room, unit = work(picture, output / CACHE, wishes, say)
-    before = room.picture(room.before)
+    kept, unit = work(picture, output / CACHE, settings, say)
+    before = kept.picture(kept.before)
     assert before is not None
-    after = room.picture(room.after)
+    after = kept.picture(kept.after)
     shown = before if after is None else after
     known = None if picture.truth is None else np.load(picture.truth, mmap_mode="r", allow_pickle=False)
     say("measuring")
     name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
-    found, _ = stored(room.folder / name, lambda: measure.measured(before, shown, known))
+    found, _ = stored(kept.folder / name, lambda: measure.measured(before, shown, known))
     columns, sheets = ["original", "corrected"], [before, shown]
-    for word, other in ((unit["rival"]["name"], room.picture(room.rival)), ("truth", known)):
+    for word, other in ((unit["rival"]["name"], kept.picture(kept.rival)), ("truth", known)):
         if other is not None:
             columns.append(word)
             sheets.append(other)
@@ -204,12 +172,12 @@ def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], 
     return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made))
 
 
-def work(picture: Picture, cache: Path, wishes: Wishes, say: Words) -> tuple[Room, Unit]:
+def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -> tuple[PictureFolder, Unit]:
     """Calibrate a picture from itself and correct it, unless that is stored.
 
     Returns
     -------
-    room : Room
+    kept : PictureFolder
         Where the pictures are.
     unit : dict
         `state` ("corrected" or "left alone"), `reason`, `notes`, `announced` (dB by zone), `seconds`.
@@ -217,16 +185,16 @@ def work(picture: Picture, cache: Path, wishes: Wishes, say: Words) -> tuple[Roo
     _taken(picture, say)
     content = _hash(picture.path)
     code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))
-    settings = hashlib.sha256(f"{code} {wishes.model}".encode()).hexdigest()[:8]
-    room = Room(cache / f"{picture.slug}-{content[:8]}-{settings}")
-    if wishes.fresh and room.folder.exists():
-        shutil.rmtree(room.folder)
-    room.folder.mkdir(parents=True, exist_ok=True)
-    unit, _ = stored(room.folder / "work.json", lambda: _worked(picture, room, wishes, say))
+    version = hashlib.sha256(f"{code} {settings.model}".encode()).hexdigest()[:8]
+    kept = PictureFolder(cache / f"{picture.slug}-{content[:8]}-{version}")
+    if settings.fresh and kept.folder.exists():
+        shutil.rmtree(kept.folder)
+    kept.folder.mkdir(parents=True, exist_ok=True)
+    unit, _ = stored(kept.folder / "work.json", lambda: _worked(picture, kept, settings, say))
     rival, _ = stored(
-        room.folder / f"rival-{version_of('lab.peers')[:12]}.json", lambda: _rival(picture, room, unit, say)
+        kept.folder / f"rival-{version_of('lab.peers')[:12]}.json", lambda: _rival(picture, kept, unit, say)
     )
-    return room, {**unit, "rival": rival}
+    return kept, {**unit, "rival": rival}
 
 
 def _taken(picture: Picture, say: Words) -> None:
@@ -237,10 +205,10 @@ def _taken(picture: Picture, say: Words) -> None:
     take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
 
 
-def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
+def _worked(picture: Picture, kept: PictureFolder, settings: GallerySettings, say: Words) -> Unit:
     say("developing")
     developed = develop(picture.path)
-    room.save(room.before, rendered(developed.planes, developed.encoding))
+    kept.save(kept.before, rendered(developed.planes, developed.encoding))
     notes = []
     override = LensSettings()
     if developed.info.metadata.aperture is None:
@@ -256,7 +224,7 @@ def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
     }
     began = time.monotonic()
     try:
-        model = _model(picture, room, wishes, override, say)
+        model = _model(picture, kept, settings, override, say)
     except LensModelError as error:
         return {**unit, "reason": f"calibration was refused: {error}", "seconds": [_since(began), 0.0]}
     calibrated = _since(began)
@@ -271,19 +239,21 @@ def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
                 output,
                 aperture=override.aperture,
                 color_space="srgb",
-                workers=wishes.workers,
+                workers=settings.workers,
             )
         except LensModelError as error:
             reason = f"correction was refused: {error}"
             return {**unit, "reason": reason, "seconds": [calibrated, _since(began)]}
         seconds = [calibrated, _since(began)]
-        room.save(room.after, read_rendered(output))
+        kept.save(kept.after, read_rendered(output))
     announced = {zone: _finite(report.expected_gain_db) for zone, report in corrected.zones.items()}
     return {**unit, "state": "corrected", "announced": announced, "seconds": seconds}
 
 
-def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings, say: Words) -> LensModel:
-    path = room.folder / "own.lensprofile"
+def _model(
+    picture: Picture, kept: PictureFolder, settings: GallerySettings, override: LensSettings, say: Words
+) -> LensModel:
+    path = kept.folder / "own.lensprofile"
     if path.exists():
         return load_profile(path).model
     reasons: list[str] = []
@@ -301,8 +271,8 @@ def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings,
         model = lensmodel.calibrate(
             picture.path,
             aperture=override.aperture,
-            model=wishes.model,
-            workers=wishes.workers,
+            model=settings.model,
+            workers=settings.workers,
             on_event=heard,
         ).model
     except LensModelError as error:
@@ -311,9 +281,9 @@ def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings,
     return model
 
 
-def _rival(picture: Picture, room: Room, unit: Unit, say: Words) -> Unit:
+def _rival(picture: Picture, kept: PictureFolder, unit: Unit, say: Words) -> Unit:
     peer = next(p for p in peers.PEERS if p.name == RIVALS[0 if unit["raw"] else 1])
-    room.rival.unlink(missing_ok=True)
+    kept.rival.unlink(missing_ok=True)
     if not peer.installed:
         return {"name": peer.name, "reason": f"{peer.program} is not installed"}
     say(peer.name)
@@ -323,9 +293,9 @@ def _rival(picture: Picture, room: Room, unit: Unit, say: Words) -> Unit:
             picture_of_it = read_rendered(made)
         except (LensModelError, OSError, ValueError) as error:
             return {"name": peer.name, "reason": str(error)}
-    before = room.picture(room.before)
+    before = kept.picture(kept.before)
     assert before is not None
-    room.save(room.rival, aligned(picture_of_it, before, unit["orientation"]))
+    kept.save(kept.rival, aligned(picture_of_it, before, unit["orientation"]))
     return {"name": peer.name, "reason": ""}
 
 

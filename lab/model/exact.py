@@ -82,27 +82,13 @@ def factorised(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperModel:
-    """The paper's regression: a flat cloud of pixels, eq. (8) to the letter, k nearest points.
+    """The paper's regression: a flat cloud of pixels, eq. (8) to the letter, k nearest points."""
 
-    Parameters
-    ----------
-    tree : cKDTree
-        Points (u, v, r, cos phi, sin phi, Phi) in bandwidths.
-    values : ndarray
-        Intensity of each point.
-    scale : ndarray
-        Bandwidths of the columns.
-    columns : tuple of int
-        Which settings vary and take part.
-    neighbours : int
-        k.
-    """
-
-    tree: cKDTree
-    values: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    columns: tuple[int, ...]
-    neighbours: int = 200
+    tree: cKDTree  # points (u, v, r, cos phi, sin phi, Phi) in bandwidths
+    values: NDArray[np.float64]  # intensity of each point
+    scale: NDArray[np.float64]  # bandwidths of the columns
+    columns: tuple[int, ...]  # which settings vary and take part
+    neighbours: int = 200  # k
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], *, neighbours: int = 200) -> PaperModel:

@@ -45,31 +45,15 @@ _MORE_HELPS: Final = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One bar.
+    """One bar."""
 
-    Parameters
-    ----------
-    name : str
-        What is asked.
-    place : str
-        Zone, or the part of the run.
-    value : float or None
-        What was measured; None where this run does not tell.
-    low, high : float or None
-        The band in which it has to lie.
-    n : str
-        How many photos the lens was learned from.
-    family : str
-        Family of the lenses; empty for scenes and paths that hurt.
-    """
-
-    name: str
-    place: str
-    value: float | None
-    low: float | None = None
+    name: str  # what is asked
+    place: str  # zone, or the part of the run
+    value: float | None  # what was measured; None where this run does not tell
+    low: float | None = None  # the band in which it has to lie
     high: float | None = None
-    n: str = "1"
-    family: str = ""
+    n: str = "1"  # how many photos the lens was learned from
+    family: str = ""  # family of the lenses; empty for scenes and paths that hurt
 
     @property
     def met(self) -> bool | None:

@@ -67,25 +67,14 @@ _TRACED_EACH: Final = {"default": 2, "full": 2}
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What is different from a photo of a photograph, in raw, at base ISO.
+    """What is different from a photo of a photograph, in raw, at base ISO."""
 
-    Parameters
-    ----------
-    title : str
-        For people.
-    full_well_electrons, read_noise : float
-        Of the sensor at the photo's ISO, electrons.
-    container : {"dng", "tiff", "jpeg"}
-        The file; TIFF (16 bits) and JPEG (quality 92) are the developed DNG in sRGB.
-    scene : str
-        Name in `lab.scenes.HARD_SCENES` of what is drawn over the photograph, or empty.
-    """
-
-    title: str
-    full_well_electrons: float = 50_000.0
+    title: str  # for people
+    full_well_electrons: float = 50_000.0  # of the sensor at the photo's ISO, electrons
     read_noise: float = 50.0
+    # the file; TIFF (16 bits) and JPEG (quality 92) are the developed DNG in sRGB
     container: Container = "dng"
-    scene: str = ""
+    scene: str = ""  # name in `lab.scenes.HARD_SCENES` of what is drawn over the photograph, or empty
 
     @property
     def with_chart(self) -> bool:
@@ -137,35 +126,19 @@ def design(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One lens at one setting, and the numbers of photos it is learned from.
+    """One lens at one setting, and the numbers of photos it is learned from."""
 
-    Parameters
-    ----------
-    seed : int
-        Of `draw_lens`, or the number of a ray-traced lens; it also mixes the order of the photographs.
-    focal_mm, aperture : float
-        How the lens is set.
-    photos : tuple of int
-        Ascending: the model is measured after each of these numbers of photos.
-    height, width : int
-        Of the camera, pixels.
-    layout : Layout
-        How frames are made of photographs.
-    condition : str
-        Name of a `Condition`: what is photographed, at which ISO, into which kind of file.
-    grid : Path or None
-        PSFs of a ray-traced lens; None means a lens of third order.
-    """
-
+    # of `draw_lens`, or the number of a ray-traced lens; it also mixes the order of the photographs
     seed: int
-    focal_mm: float
+    focal_mm: float  # how the lens is set
     aperture: float
-    photos: tuple[int, ...]
-    height: int
+    photos: tuple[int, ...]  # ascending: the model is measured after each of these numbers of photos
+    height: int  # of the camera, pixels
     width: int
-    layout: Layout
+    layout: Layout  # how frames are made of photographs
+    # name of a `Condition`: what is photographed, at which ISO, into which kind of file
     condition: str = BASE
-    grid: Path | None = None
+    grid: Path | None = None  # PSFs of a ray-traced lens; None means a lens of third order
 
     def __post_init__(self) -> None:
         if not self.photos or self.photos[0] < 1 or list(self.photos) != sorted(set(self.photos)):
@@ -258,41 +231,20 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What to run.
-
-    Parameters
-    ----------
-    cases : tuple of Case
-    scenes : Path or None
-        Folder of sharp photographs, of which the test half is used; None means the library's five.
-    estimator : str
-        Blind estimator of the calibration.
-    methods : tuple of str
-        Non-blind methods of the correction.
-    rivals : tuple of str
-        Blind methods of others, names in `lab.rivals`; each sees one photo.
-    programs : tuple of str
-        Programs of others that correct the same photos, names in `lab.peers`.
-    size : {"quick", "small", "default", "full"}
-        How it was planned, for the page.
-    paper : bool
-        Whether each lens is learned and corrected the paper's own way from end to end too.
-    general : bool
-        Whether a general profile of the lens model is compared with, see `fields.general_field`.
-    target : bool
-        Whether each lens is measured with a printed target too.
-    """
+    """What to run."""
 
     cases: tuple[Case, ...]
+    # folder of sharp photographs, of which the test half is used; None means the library's five
     scenes: Path | None = None
-    estimator: str = "default"
-    methods: tuple[str, ...] = METHODS
-    rivals: tuple[str, ...] = RIVALS
-    programs: tuple[str, ...] = ()
-    size: Size = "default"
-    paper: bool = True
+    estimator: str = "default"  # blind estimator of the calibration
+    methods: tuple[str, ...] = METHODS  # non-blind methods of the correction
+    rivals: tuple[str, ...] = RIVALS  # blind methods of others, names in `lab.rivals`; each sees one photo
+    programs: tuple[str, ...] = ()  # programs of others that correct the same photos, names in `lab.peers`
+    size: Size = "default"  # how it was planned, for the page
+    paper: bool = True  # whether each lens is learned and corrected the paper's own way from end to end too
+    # whether a general profile of the lens model is compared with, see `fields.general_field`
     general: bool = True
-    target: bool = True
+    target: bool = True  # whether each lens is measured with a printed target too
 
     def files(self) -> tuple[Path, ...]:
         """Return the photographs."""

@@ -38,22 +38,12 @@ _GRIDS: Final = {1: (1, 1), 2: (1, 2), 4: (2, 2)}  # rows and columns of so many
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How frames are made of photographs.
+    """How frames are made of photographs."""
 
-    Parameters
-    ----------
-    rows, cols : int
-        Grid of photographs in one frame.
-    pieces : int
-        Parts that one photograph is cut into; each part serves as if it were a photograph.
-    tile : tuple of int
-        (height, width) that is cut from the middle of each.
-    """
-
-    rows: int
+    rows: int  # grid of photographs in one frame
     cols: int
-    pieces: int
-    tile: tuple[int, int]
+    pieces: int  # parts that one photograph is cut into; each part serves as if it were a photograph
+    tile: tuple[int, int]  # (height, width) that is cut from the middle of each
 
     @property
     def frame(self) -> tuple[int, int]:
@@ -170,22 +160,12 @@ def _turned_size(path: Path, pieces: int, *, upright: bool) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Shots:
-    """Files of the photos of one case.
+    """Files of the photos of one case."""
 
-    Parameters
-    ----------
-    learn : tuple of Path
-        In the order in which the lens learns from them.
-    held_out, chart : Path
-        Never used for calibration; the chart is None where the case has none.
-    sharp : Path
-        npy, the light that a perfect lens would have put on the sensor for `held_out`.
-    """
-
-    learn: tuple[Path, ...]
-    held_out: Path
+    learn: tuple[Path, ...]  # in the order in which the lens learns from them
+    held_out: Path  # never used for calibration; the chart is None where the case has none
     chart: Path | None
-    sharp: Path
+    sharp: Path  # npy, the light that a perfect lens would have put on the sensor for `held_out`
 
     @classmethod
     def of(cls, case: Case, folder: Path) -> Shots:

@@ -29,37 +29,21 @@ frames of 21 megapixels, a hundredth of their width, and take several times as l
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """A PSF as the lens model gives it.
-
-    Parameters
-    ----------
-    kernel : Kernel
-    predicted_error : float
-        Relative L2 that the model expects of it; NaN where it says nothing.
-    """
+    """A PSF as the lens model gives it."""
 
     kernel: Kernel
-    predicted_error: float
+    predicted_error: float  # relative L2 that the model expects of it; NaN where it says nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPhoto:
-    """A photo as the lens model corrects it.
+    """A photo as the lens model corrects it."""
 
-    Parameters
-    ----------
-    planes : Planes
-        In the camera's colours, linear, not white-balanced.
-    expected_db : mapping of str to float or None
-        Gain in PSNR of linear light that the correction expects of itself, by zone; None where it is not
-        sure enough to tell.
-    nothing_to_correct : bool
-        Whether the correction said so, and left every pixel as it was.
-    """
-
-    planes: Planes
+    planes: Planes  # in the camera's colours, linear, not white-balanced
+    # gain in PSNR of linear light that the correction expects of itself, by zone; None where it is not sure
+    # enough to tell
     expected_db: Mapping[str, float | None] = dataclass_field(default_factory=dict)
-    nothing_to_correct: bool = False
+    nothing_to_correct: bool = False  # whether the correction said so, and left every pixel as it was
 
 
 class Learner(Protocol):

@@ -25,20 +25,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadialBasis:
-    """Fields f(r; u, v) = mean + sum_k c_k b_k, on a few radii, linear between them.
+    """Fields f(r; u, v) = mean + sum_k c_k b_k, on a few radii, linear between them."""
 
-    Parameters
-    ----------
-    radii : ndarray, shape (J,)
-        Ascending, from 0 to 1.
-    mean : ndarray, shape (J, K, K)
-        In the local frame: columns grow along u, rows against v.
-    parts : ndarray, shape (m, J, K, K)
-        Principal components times their standard deviation, so that a usual lens has c_k around 1.
-    """
-
-    radii: Floats
-    mean: Floats
+    radii: Floats  # (J,), ascending, from 0 to 1
+    mean: Floats  # (J, K, K), in the local frame: columns grow along u, rows against v
+    # (m, J, K, K), principal components times their standard deviation, so that a usual lens has c_k around 1
     parts: Floats
 
     @property
@@ -107,17 +98,10 @@ def load_basis(path: Path = STORED) -> RadialBasis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasisField:
-    """A field of the basis; coefficients may change with the angle, c(phi) = c0 + a cos + b sin.
-
-    Parameters
-    ----------
-    basis : RadialBasis
-    coefficients : mapping of channel to ndarray, shape (m, 3)
-        c0, a, b.
-    """
+    """A field of the basis; coefficients may change with the angle, c(phi) = c0 + a cos + b sin."""
 
     basis: RadialBasis
-    coefficients: dict[Channel, Floats]
+    coefficients: dict[Channel, Floats]  # (m, 3), c0, a, b
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of a place; see `PsfField`."""

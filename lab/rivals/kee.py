@@ -57,19 +57,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianField:
-    """Gaussians whose covariance is a polynomial of the place.
+    """Gaussians whose covariance is a polynomial of the place."""
 
-    Parameters
-    ----------
-    terms : mapping of channel to ndarray, shape (terms, 3)
-        C_j as (row row, row col, col col) in px², in the order of `powers`; x to the right and y
-        upwards in half diagonals.
-    degree : int
-        d.
-    """
-
+    # (terms, 3), C_j as (row row, row col, col col) in px², in the order of `powers`; x to the right and y
+    # upwards in half diagonals
     terms: dict[Channel, Floats]
-    degree: int
+    degree: int  # d of the source
 
     def covariance(self, position: FieldPosition, channel: Channel) -> Floats:
         """C(p), its eigenvalues kept positive."""
@@ -85,27 +78,13 @@ class GaussianField:
 
 @dataclass(frozen=True, slots=True)
 class Kee:
-    """Field of Gaussians from straight edges.
+    """Field of Gaussians from straight edges."""
 
-    Parameters
-    ----------
-    degree : int
-        Of the polynomial. Four would hold what third-order aberrations do, and followed noise.
-    expectile : float
-        Weight of edges wider than the fit, against those that are narrower.
-    softness_px2 : float
-        Variance that the edges of sharp photographs have.
-    pull : float
-        Weight of drawing a term to zero, in edges.
-    reach, along : int
-        Half extent of an edge across and along, pixels.
-    """
-
-    degree: int = 2
-    expectile: float = 0.02
-    softness_px2: float = 0.6
-    pull: float = 0.2
-    reach: int = 9
+    degree: int = 2  # Of the polynomial. Four would hold what third-order aberrations do, and followed noise.
+    expectile: float = 0.02  # weight of edges wider than the fit, against those that are narrower
+    softness_px2: float = 0.6  # variance that the edges of sharp photographs have
+    pull: float = 0.2  # weight of drawing a term to zero, in edges
+    reach: int = 9  # half extent of an edge across and along, pixels
     along: int = 4
 
     name = "kee"
@@ -186,21 +165,12 @@ def core_variance(spread: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeProfile:
-    """One edge: the PSF's projection onto its normal.
+    """One edge: the PSF's projection onto its normal."""
 
-    Parameters
-    ----------
-    direction : int
-        The normal lies at pi * direction / 24 counter-clockwise from the right.
-    spread : ndarray, shape (2 n,)
-        Line spread function, sum 1, centroid at 0, at (i - n + 1/2) / 4 px along the normal.
-    weight : float
-        Squared contrast over noise.
-    """
-
-    direction: int
+    direction: int  # the normal lies at pi * direction / 24 counter-clockwise from the right
+    # (2 n,), line spread function, sum 1, centroid at 0, at (i - n + 1/2) / 4 px along the normal
     spread: Floats
-    weight: float
+    weight: float  # squared contrast over noise
 
     @property
     def width_px(self) -> float:

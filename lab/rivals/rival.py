@@ -30,20 +30,11 @@ class Rival(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoWindow:
-    """A window of a photo in all channels.
+    """A window of a photo in all channels."""
 
-    Parameters
-    ----------
-    planes : Planes, shape (3, side, side)
-    noise : tuple of NoiseModel
-        One per channel.
-    position : FieldPosition
-        Of its middle.
-    """
-
-    planes: Planes
-    noise: tuple[NoiseModel, ...]
-    position: FieldPosition
+    planes: Planes  # (3, side, side)
+    noise: tuple[NoiseModel, ...]  # one per channel
+    position: FieldPosition  # of its middle
 
     def plane(self, channel: int) -> Plane:
         """One colour of it."""

@@ -53,27 +53,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Schuler:
-    """Coefficients of a basis of lens PSFs from one photo.
+    """Coefficients of a basis of lens PSFs from one photo."""
 
-    Parameters
-    ----------
-    basis : RadialBasis or None
-        None takes the stored one.
-    rounds : int
-        Of prediction, least squares and deconvolution.
-    edges : float
-        Pixels kept in each of four orientations, in sides of the kernel.
-    pull : float
-        Weight of |c|² as a share of the mean diagonal of the equations.
-    turning : float
-        How much more the change with the angle is held back.
-    """
-
-    basis: RadialBasis | None = None
-    rounds: int = 5
-    edges: float = 6.0
-    pull: float = 0.005
-    turning: float = 4.0
+    basis: RadialBasis | None = None  # none takes the stored one
+    rounds: int = 5  # of prediction, least squares and deconvolution
+    edges: float = 6.0  # pixels kept in each of four orientations, in sides of the kernel
+    pull: float = 0.005  # weight of |c|² as a share of the mean diagonal of the equations
+    turning: float = 4.0  # how much more the change with the angle is held back
 
     name = "schuler"
     source = "Schuler et al. 2012 (one photo, PSFs constrained to principal components of lenses)"
@@ -168,6 +154,6 @@ class _Patch:
         margin = inside(row.shape, kernel.shape[0] // 2 + 1)
         strong = np.hypot(row, col) >= oriented_threshold(row, col, least, margin)
         return [
-            DerivativePair(np.where(strong, row, 0.0), down(self.view.y), 1.0, 0),
-            DerivativePair(np.where(strong, col, 0.0), across(self.view.y), 1.0, 1),
+            DerivativePair(np.where(strong, row, 0.0), down(self.view.y), 1.0),
+            DerivativePair(np.where(strong, col, 0.0), across(self.view.y), 1.0),
         ]

@@ -32,27 +32,15 @@ class GridField:
 
     Nodes stand on a square grid over the disc of the field, (right, up) in half diagonals; kernels
     between are cubic splines through them, clipped at zero.
-
-    Parameters
-    ----------
-    axis : ndarray, shape (n,)
-        Ascending places of the nodes along both axes.
-    kernels : ndarray, shape (3, n, n, k, k), float16
-        Of channels r, g, b; rows of nodes run upwards, columns to the right. Each sums to 1 and has its
-        centre of mass on the middle pixel.
-    centers_px : ndarray, shape (3, n, n, 2), float32
-        Where they lie against green, (right, up): lateral colour.
-    light : ndarray, shape (n, n), float32
-        Transmission of the pupil over that in the centre.
-    facts : mapping
-        Design, source, copy, `f_number`, `focal_mm`, `pitch_um`, `half_diagonal_mm`.
     """
 
-    axis: NDArray[np.float64]
+    axis: NDArray[np.float64]  # (n,), ascending places of the nodes along both axes
+    # (3, n, n, k, k), Of channels r, g, b; rows of nodes run upwards, columns to the right. Each sums to 1
+    # and has its centre of mass on the middle pixel.
     kernels: NDArray[np.float16]
-    centers_px: NDArray[np.float32]
-    light: NDArray[np.float32]
-    facts: Mapping[str, Any]
+    centers_px: NDArray[np.float32]  # (3, n, n, 2), where they lie against green, (right, up): lateral colour
+    light: NDArray[np.float32]  # (n, n), transmission of the pupil over that in the centre
+    facts: Mapping[str, Any]  # design, source, copy, `f_number`, `focal_mm`, `pitch_um`, `half_diagonal_mm`
     _known: dict[tuple[float, float, Channel], Kernel] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -153,18 +141,10 @@ def read_grid(path: str | Path) -> GridField:
 
 @dataclass(frozen=True, eq=False)
 class GridLens:
-    """A traced lens in front of a simulated camera, at the apertures that it has grids for.
+    """A traced lens in front of a simulated camera, at the apertures that it has grids for."""
 
-    Parameters
-    ----------
-    grids : tuple of GridField
-        Of one copy, by aperture, widest first.
-    maker, model, serial : str
-        As written into the metadata of its photos.
-    """
-
-    grids: tuple[GridField, ...]
-    maker: str = "Traced Optics"
+    grids: tuple[GridField, ...]  # of one copy, by aperture, widest first
+    maker: str = "Traced Optics"  # as written into the metadata of its photos
     model: str = ""
     serial: str = "TRC0000001"
 

@@ -42,34 +42,19 @@ def spectrum(channel: Channel, count: int = 3) -> tuple[tuple[float, float], ...
 
 @dataclass(frozen=True)
 class Copy:
-    """What makes one copy of a design; see `TracedLens`.
+    """What makes one copy of a design; see `TracedLens`."""
 
-    Parameters
-    ----------
-    design : str
-        Name in `designs`.
-    f_number : float
-        Widest aperture; it may be up to two stops wider than the design's own.
-    half_diagonal_mm : float
-        Half the diagonal of the sensor: the design is scaled so that its largest field reaches it.
-    faults : tuple of Fault
-        Elements that are shifted and tilted.
-    sensor_tilt_um : tuple of float
-        How far the sensor lies behind its place at r = 1 to the right, and upwards.
-    corner_light : float
-        Transmission of the pupil at r = 1 over that in the centre, wide open: clear apertures of the
-        first and last surface are chosen for it. 1 means none.
-    wavelengths : int
-        Per channel.
-    """
-
-    design: str
-    f_number: float
+    design: str  # name in `designs`
+    f_number: float  # widest aperture; it may be up to two stops wider than the design's own
+    # half the diagonal of the sensor: the design is scaled so that its largest field reaches it
     half_diagonal_mm: float = 8.11
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Fault, ...] = ()  # elements that are shifted and tilted
+    # how far the sensor lies behind its place at r = 1 to the right, and upwards
     sensor_tilt_um: tuple[float, float] = (0.0, 0.0)
+    # Transmission of the pupil at r = 1 over that in the centre, wide open: clear apertures of the first and
+    # last surface are chosen for it. 1 means none.
     corner_light: float = 0.5
-    wavelengths: int = 3
+    wavelengths: int = 3  # per channel
 
 
 @dataclass(frozen=True)

@@ -17,30 +17,14 @@ Glass: TypeAlias = str | tuple[str, str] | tuple[float, float] | None
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """One surface and the medium behind it; lengths in the design's own unit.
+    """One surface and the medium behind it; lengths in the design's own unit."""
 
-    Parameters
-    ----------
-    radius : float
-        Of curvature; positive where the centre lies behind the surface, infinite for a plane.
-    thickness : float
-        Axial distance to the next surface.
-    glass : Glass
-        Medium behind the surface.
-    conic : float
-        Conic constant: -1 is a parabola.
-    asphere : tuple of float
-        Coefficients of h^4, h^6, h^8, ... added to the sag.
-    stop : bool
-        Whether this surface is the aperture stop.
-    """
-
-    radius: float
-    thickness: float
-    glass: Glass = None
-    conic: float = 0.0
-    asphere: tuple[float, ...] = ()
-    stop: bool = False
+    radius: float  # of curvature; positive where the centre lies behind the surface, infinite for a plane
+    thickness: float  # axial distance to the next surface
+    glass: Glass = None  # medium behind the surface
+    conic: float = 0.0  # conic constant: -1 is a parabola
+    asphere: tuple[float, ...] = ()  # Coefficients of h^4, h^6, h^8, ... added to the sag.
+    stop: bool = False  # whether this surface is the aperture stop
 
     def scaled(self, factor: float) -> Surface:
         """Return the same surface `factor` times as large."""
@@ -50,27 +34,14 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """A published design, or one made of a published design.
+    """A published design, or one made of a published design."""
 
-    Parameters
-    ----------
-    name : str
-        Short, lower case.
-    source : str
-        Where the numbers come from.
-    surfaces : tuple of Surface
-        From the first glass to the last; the last thickness is the distance to the image.
-    f_number : float
-        The design's own.
-    half_field_deg : float
-        Largest angle of an object point from the axis that the design is good for.
-    """
-
-    name: str
-    source: str
+    name: str  # short, lower case
+    source: str  # where the numbers come from
+    # from the first glass to the last; the last thickness is the distance to the image
     surfaces: tuple[Surface, ...]
-    f_number: float
-    half_field_deg: float
+    f_number: float  # the design's own
+    half_field_deg: float  # largest angle of an object point from the axis that the design is good for
 
     def __post_init__(self) -> None:
         if sum(surface.stop for surface in self.surfaces) != 1:

@@ -35,49 +35,24 @@ _AIMING_STEPS: Final = 2  # steps from a start beside, twice as many without (ch
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One element of a copy that is not where it belongs.
+    """One element of a copy that is not where it belongs."""
 
-    Parameters
-    ----------
-    element : int
-        Number of the element or cemented group from the front; negative from the back.
-    shift_um : tuple of float
-        Across the axis, (right, up), micrometres.
-    tilt_deg : tuple of float
-        About the right and the up axis through its front vertex, degrees.
-    """
-
-    element: int
-    shift_um: tuple[float, float] = (0.0, 0.0)
+    element: int  # number of the element or cemented group from the front; negative from the back
+    shift_um: tuple[float, float] = (0.0, 0.0)  # across the axis, (right, up), micrometres
+    # about the right and the up axis through its front vertex, degrees
     tilt_deg: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Rays of one object point and wavelength that reach the sensor's plane.
+    """Rays of one object point and wavelength that reach the sensor's plane."""
 
-    Parameters
-    ----------
-    cosines : ndarray, shape (2, n)
-        L (right) and M (up).
-    path_um : ndarray, shape (n,)
-        W, micrometres, less its mean.
-    stop : ndarray, shape (2, n)
-        Where they cross the stop, millimetres.
-    rims : ndarray, shape (rims, 2, n)
-        Where they cross the rims that vignette, millimetres.
-    entrance : ndarray, shape (2, n)
-        Where they start, millimetres across d.
-    landing_mm : tuple of float
-        (x0, y0), the point that W refers to.
-    """
-
-    cosines: Array
-    path_um: Array
-    stop: Array
-    rims: Array
-    entrance: Array
-    landing_mm: tuple[float, float]
+    cosines: Array  # (2, n), L (right) and M (up)
+    path_um: Array  # (n,), w, micrometres, less its mean
+    stop: Array  # (2, n), where they cross the stop, millimetres
+    rims: Array  # (rims, 2, n), where they cross the rims that vignette, millimetres
+    entrance: Array  # (2, n), where they start, millimetres across d
+    landing_mm: tuple[float, float]  # (x0, y0), the point that W refers to
 
 
 class Tracer:

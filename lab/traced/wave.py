@@ -31,29 +31,16 @@ _GUARD: Final = 1.3  # times the affine image of the stop: beyond it, polynomial
 
 @dataclass(frozen=True, slots=True)
 class TracedPupil:
-    """What one object point sees through the lens in one wavelength.
+    """What one object point sees through the lens in one wavelength."""
 
-    Parameters
-    ----------
-    center, half : tuple of float
-        Middle of the bundle's cosines and half its extent; polynomials live on [-1, 1].
-    path_um : ndarray, shape (d, d)
-        Chebyshev coefficients of W(L, M) in micrometres.
-    stop, rims : ndarray, shape (2, m, m), (rims, 2, m, m)
-        Of the places where the stop and the rims are crossed, mm.
-    entrance : ndarray, shape (2, m, m)
-        Of the places where rays start, mm.
-    residual_um : float
-        Root mean square misfit of the path.
-    """
-
+    # middle of the bundle's cosines and half its extent; polynomials live on [-1, 1]
     center: tuple[float, float]
     half: tuple[float, float]
-    path_um: Array
-    stop: Array
+    path_um: Array  # (d, d), chebyshev coefficients of W(L, M) in micrometres
+    stop: Array  # (2, m, m), of the places where the stop and the rims are crossed, mm
     rims: Array
-    entrance: Array
-    residual_um: float
+    entrance: Array  # (2, m, m), of the places where rays start, mm
+    residual_um: float  # root mean square misfit of the path
 
     @classmethod
     def of(cls, bundle: Bundle) -> TracedPupil:

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from scipy import signal, stats
 
 from lab.blind.judges import HyperLaplacian, squared_error
-from lab.blind.methods import compared
+from lab.blind.methods import BlindMethod, compared
 from lab.cases import list_photos, photo_half, scene_of
-from lensmodel.blind import PsfEstimator
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
@@ -61,7 +60,7 @@ class Labelled:
     untouched_ratio: float
 
 
-def label_group(photo: Path, number: int, estimator: PsfEstimator) -> Iterator[Labelled]:
+def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[Labelled]:
     """Blur one photo by one PSF of one lens, and judge estimates in some of its usable windows."""
     half = photo_half(photo.stem)
     rng = np.random.default_rng([number, FIRST_SEED[half]])

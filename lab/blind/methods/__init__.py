@@ -3,17 +3,35 @@
 `compared` knows them beside those of the product; `lensmodel bench blind --methods zhang,sun` runs them.
 """
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, Protocol
 
 from lab.blind.methods.cho_lee import ChoLee
 from lab.blind.methods.sun import Sun
 from lab.blind.methods.xu_jia import XuJia
 from lab.blind.methods.zhang import Zhang
-from lensmodel.blind import PsfEstimator, estimators
+from lensmodel.blind import PsfEstimate, estimators
 from lensmodel.core.registry import Registry
+from lensmodel.core.types import NoiseModel, Plane, StepHook, ignore_step
 
-compared: Final[Registry[PsfEstimator]] = estimators.extended(
-    cho_lee=ChoLee, sun=Sun, xu_jia=XuJia, zhang=Zhang
+
+class BlindMethod(Protocol):
+    """What the benchmark asks of an estimator."""
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel of odd side `size` that all patches share."""
+
+
+compared: Final[Registry[BlindMethod]] = Registry(
+    "estimator",
+    {**estimators.entries, "cho-lee": ChoLee, "sun": Sun, "xu-jia": XuJia, "zhang": Zhang},
 )
 
-__all__ = ["ChoLee", "Sun", "XuJia", "Zhang", "compared"]
+__all__ = ["BlindMethod", "ChoLee", "Sun", "XuJia", "Zhang", "compared"]

@@ -26,7 +26,6 @@ from lab.blind.steps.gradients import (
     PeriodicPlane,
     across,
     bilateral,
-    disagreement,
     down,
     estimate_by_edges,
     inside,
@@ -35,67 +34,50 @@ from lab.blind.steps.gradients import (
     shock_filtered,
 )
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick
-from lab.blind.steps.starting_from import StartingFrom
 from lensmodel.blind import PsfEstimate
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 _ORDER_WEIGHTS = (50.0, 25.0, 12.5)  # of values, first and second derivatives: as in the paper
 _ALPHA = 0.1  # as in the paper
 _BETA = 5.0  # as in the paper
-_ERROR = (0.55, 0.5)  # offset and slope by disagreement: at its mean the mean error on lens blur
 
 
 @dataclass(frozen=True, slots=True)
-class ChoLee(StartingFrom):
-    """Kernel by prediction of strong edges, conjugate gradients and fast deconvolution.
+class ChoLee:
+    """Kernel by prediction of strong edges, conjugate gradients and fast deconvolution."""
 
-    Parameters
-    ----------
-    iterations : int
-        Rounds on each level.
-    edges : float
-        r: pixels kept in each of four orientations, in sides of the kernel.
-    steps : int
-        Conjugate gradient steps of each kernel update.
-    threshold : float
-        Kernel values below this share of the peak are dropped.
-    """
-
-    iterations: int = 7
-    edges: float = 2.0
-    steps: int = 5
-    threshold: float = 0.05
+    iterations: int = 7  # rounds on each level
+    edges: float = 2.0  # r: pixels kept in each of four orientations, in sides of the kernel
+    steps: int = 5  # conjugate gradient steps of each kernel update
+    threshold: float = 0.05  # kernel values below this share of the peak are dropped
 
     name = "cho-lee"
     version = 1
 
-    def _run(
+    def estimate(
         self,
         patches: Sequence[Plane],
         noise: Sequence[NoiseModel],
-        size: int,
-        start: Kernel | None,
-        on_step: StepHook,
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `BlindMethod`."""
         return estimate_by_edges(
             _Rounds(self),
             patches,
             noise,
             size=size,
             iterations=self.iterations,
-            start=start,
-            error=_ERROR,
             on_step=on_step,
         )
 
 
 @dataclass(slots=True)
 class _Rounds:
-    """Prediction, kernel, deconvolution; the last pairs stay for the verdict."""
+    """Prediction, kernel, deconvolution."""
 
     settings: ChoLee
-    pairs: tuple[DerivativePair, ...] = ()
-    side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
         images = [_Quick.of(view.y, level.side) for view in level.views]
@@ -113,7 +95,6 @@ class _Rounds:
             pairs: list[DerivativePair] = []
             for edge, view, least_slope in zip(edges, level.views, thresholds, strict=True):
                 pairs += _pairs(edge, view.y, fade * least_slope)
-            self.pairs, self.side = tuple(pairs), level.side
             kernel = pruned(self._solved(KernelEquations.of(pairs, level.side)), self.settings.threshold)
             latents = tuple(image.deconvolved(kernel) for image in images)
             tick()
@@ -123,11 +104,6 @@ class _Rounds:
         side = equations.side
         uniform = np.full((side, side), 1.0 / side**2)
         return equations.conjugate_gradients(_BETA, uniform, steps=self.settings.steps)
-
-    def disagreement(self) -> float:
-        """How far the kernels of the vertical and the horizontal derivatives lie apart."""
-        ways = [[pair for pair in self.pairs if pair.way == way] for way in (0, 1)]
-        return disagreement([KernelEquations.of(pairs, self.side) for pairs in ways], self._solved)
 
 
 def _predicted(latent: Image, fade: float) -> tuple[Image, Image]:
@@ -144,11 +120,11 @@ def _pairs(edge: tuple[Image, Image], y: Image, threshold: float) -> list[Deriva
     y_row, y_col = down(y), across(y)
     _, first, second = _ORDER_WEIGHTS
     return [
-        DerivativePair(row, y_row, first, 0),
-        DerivativePair(col, y_col, first, 1),
-        DerivativePair(down(row), down(y_row), second, 0),
-        DerivativePair(across(col), across(y_col), second, 1),
-        DerivativePair(0.5 * (across(row) + down(col)), across(y_row), second, 2),
+        DerivativePair(row, y_row, first),
+        DerivativePair(col, y_col, first),
+        DerivativePair(down(row), down(y_row), second),
+        DerivativePair(across(col), across(y_col), second),
+        DerivativePair(0.5 * (across(row) + down(col)), across(y_row), second),
     ]
 
 

@@ -18,23 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.cleaning import cleaned
+from lab.blind.steps.cleaning import cleaned, unsure
 from lab.blind.steps.edge_patches import SIDE, EdgePatchPrior, default_prior, edge_mask, target
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
-from lab.blind.steps.starting_from import StartingFrom
-from lensmodel.blind.estimator import PsfEstimate, finished, usable
+from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import centred, distance, otf
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
+from lensmodel.core.psf import centred, otf
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 _INTENSITY_WEIGHT = 0.1  # w of values, of differences it is 1 (chosen): noise in values reaches far
 _LEAST_EDGE_PX = 30  # gradients on edges: of fewer a kernel is chance (chosen)
-_ERROR_FLOOR, _ERROR_SLOPE = 0.3, 0.5  # by disagreement (chosen): nothing is kept that fitted them
 
 
 @dataclass(frozen=True, slots=True)
-class Sun(StartingFrom):
+class Sun:
     """Kernel from the gradients of a latent image whose edges look like sharp patterns.
 
     Coarse to fine, alternating::
@@ -44,76 +42,44 @@ class Sun(StartingFrom):
 
     d: values and both differences; i: pixels on the edge mask M; q_i: the sharp window nearest to
     P_i x; (.)_M: zero away from edges.
-
-    Parameters
-    ----------
-    iterations : int
-        Alternations on each level.
-    betas : tuple of float
-        β of the image steps of one alternation, growing; each matches the windows anew.
-    smoothness : float
-        α.
-    ridge : float
-        γ over the power of the gradients on edges.
-    threshold, least_mass : float
-        Kernel values below this share of the peak, and islands of less than this mass, are dropped.
-    support : int or None
-        Odd side of the estimated kernel; None takes it from `size`.
     """
 
-    iterations: int = 5
+    iterations: int = 5  # alternations on each level
+    # β of the image steps of one alternation, growing; each matches the windows anew
     betas: tuple[float, ...] = (0.1, 0.2, 0.4)
-    smoothness: float = 0.6
-    ridge: float = 0.02
+    smoothness: float = 0.6  # α
+    ridge: float = 0.02  # γ over the power of the gradients on edges
+    # kernel values below this share of the peak, and islands of less than this mass, are dropped
     threshold: float = 0.05
     least_mass: float = 0.05
-    support: int | None = None
+    support: int | None = None  # odd side of the estimated kernel; None takes it from `size`
 
     name = "sun"
     version = 1
 
-    def _run(
+    def estimate(
         self,
         patches: Sequence[Plane],
         noise: Sequence[NoiseModel],
-        size: int,
-        start: Kernel | None,
-        on_step: StepHook,
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `BlindMethod`."""
         kept = usable(patches, noise, size)
         views = [View.of(patch, model) for patch, model in kept]
         side = self.support or size
-        schedule = Schedule(side, self.iterations, coarsest=5 if start is None else side)
-        solver = _Alternation(self, default_prior())
-        found = coarse_to_fine(views, solver, schedule, start=start, on_step=on_step)
-        disagreement = self._disagreement(solver.terms, found.kernel)
-        return finished(
-            cleaned(found.kernel, self.threshold, self.least_mass),
-            size=size,
-            error=_ERROR_FLOOR + _ERROR_SLOPE * disagreement,
-            diagnostics={
-                "support": float(side),
-                "disagreement": disagreement,
-                "edge_px": float(sum(np.count_nonzero(term.x) for term in solver.terms)),
-                "misfit": _misfit(solver.terms, found.kernel),
-            },
-        )
-
-    def _disagreement(self, terms: Sequence[Term], kernel: Kernel) -> float:
-        """Relative L2 distance of the kernels that the two gradient directions give alone."""
-        down, across = (least_squares_kernel(terms[i::2], kernel) for i in (0, 1))
-        if not min(down.sum(), across.sum()) > 0:
-            return 1.0
-        return distance(down, across).rel_l2
+        schedule = Schedule(side, self.iterations)
+        found = coarse_to_fine(views, _Alternation(self, default_prior()), schedule, on_step=on_step)
+        return unsure(cleaned(found.kernel, self.threshold, self.least_mass), size)
 
 
 @dataclass(slots=True)
 class _Alternation:
-    """The alternation on one level; its last kernel step stays for the verdict."""
+    """The alternation on one level."""
 
     method: Sun
     prior: EdgePatchPrior
-    terms: tuple[Term, ...] = ()
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
         kernel, now = centred(kernel), list(latents)
@@ -125,7 +91,6 @@ class _Alternation:
                     q, count = target(now[i], mask, self.prior)
                     now[i] = image_step(view.y, kernel, q, count, beta, self.method.smoothness)
                 terms.extend(edge_terms(now[i], view, level.side, self.method.ridge))
-            self.terms = tuple(terms)
             if sum(np.count_nonzero(term.x) for term in terms) < _LEAST_EDGE_PX:
                 raise NotEnoughEvidenceError("the patches hold no edge; choose parts with edges")
             kernel = centred(cleaned(least_squares_kernel(terms, kernel), 0.0))
@@ -201,9 +166,3 @@ def _laplacian(shape: tuple[int, int]) -> NDArray[np.float64]:
     down = 4.0 * np.sin(math.pi * fft.fftfreq(shape[0])) ** 2
     across = 4.0 * np.sin(math.pi * fft.rfftfreq(shape[1])) ** 2
     return np.asarray(down[:, None] + across[None, :])
-
-
-def _misfit(terms: Sequence[Term], kernel: Kernel) -> float:
-    """Share of the gradients' power that the edges, blurred, do not explain."""
-    left = sum(float(np.square(t.y - t.grid.blurred(kernel, t.x)).sum()) for t in terms)
-    return left / max(sum(float(np.square(t.y).sum()) for t in terms), 1e-12)

@@ -28,7 +28,6 @@ from lab.blind.steps.gradients import (
     Mask,
     PeriodicPlane,
     across,
-    disagreement,
     down,
     estimate_by_edges,
     inside,
@@ -37,9 +36,8 @@ from lab.blind.steps.gradients import (
     shock_filtered,
 )
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
-from lab.blind.steps.starting_from import StartingFrom
 from lensmodel.blind import PsfEstimate
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 _WINDOW = 5  # pixels: h of the paper
 _OFFSET = 0.5  # as in the paper: keeps flat regions from standing out
@@ -50,60 +48,44 @@ _SHOCKS, _SHOCK_STEP = 5, 0.5  # steps of the shock filter, and their size (chos
 _SMOOTHING_PX = 1.0  # before the shock filter: noise would be steepened (chosen)
 _REWEIGHTINGS = 3  # solutions weighted by the last sizes of |k| (chosen)
 _LEAST_VALUE = 1e-4  # keeps the weight of an empty pixel finite (chosen)
-_ERROR = (0.55, 0.5)  # offset and slope by disagreement: at its mean the mean error on lens blur
 
 
 @dataclass(frozen=True, slots=True)
-class XuJia(StartingFrom):
-    """Coarse kernel from useful edges, refined by iterative support detection.
+class XuJia:
+    """Coarse kernel from useful edges, refined by iterative support detection."""
 
-    Parameters
-    ----------
-    iterations : int
-        Rounds of phase one on each level.
-    detections : int
-        Supports that phase two detects at most, on the finest level.
-    sparsity : float
-        Weight of |k| outside the support, phase two.
-    threshold : float
-        Kernel values below this share of the peak are dropped.
-    """
-
-    iterations: int = 5
-    detections: int = 4
-    sparsity: float = 1.0
-    threshold: float = 0.05
+    iterations: int = 5  # rounds of phase one on each level
+    detections: int = 4  # supports that phase two detects at most, on the finest level
+    sparsity: float = 1.0  # weight of |k| outside the support, phase two
+    threshold: float = 0.05  # kernel values below this share of the peak are dropped
 
     name = "xu-jia"
     version = 1
 
-    def _run(
+    def estimate(
         self,
         patches: Sequence[Plane],
         noise: Sequence[NoiseModel],
-        size: int,
-        start: Kernel | None,
-        on_step: StepHook,
+        *,
+        size: int = 31,
+        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `BlindMethod`."""
         return estimate_by_edges(
             _Phases(self),
             patches,
             noise,
             size=size,
             iterations=self.iterations,
-            start=start,
-            error=_ERROR,
             on_step=on_step,
         )
 
 
 @dataclass(slots=True)
 class _Phases:
-    """Phase one on every level, phase two at the end of the finest; the last pairs stay for the verdict."""
+    """Phase one on every level, phase two at the end of the finest."""
 
     settings: XuJia
-    pairs: tuple[DerivativePair, ...] = ()
-    side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
         patches = [_PatchLevel.of(view, level.side) for view in level.views]
@@ -112,9 +94,8 @@ class _Phases:
             latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
         for i in range(level.iterations):
             edges = [s.selected(x, _FADE**-i) for s, x in zip(patches, latents, strict=True)]
-            self.pairs = tuple(p for s, e in zip(patches, edges, strict=True) for p in s.pairs(e))
-            self.side = level.side
-            equations = KernelEquations.of(self.pairs, level.side)
+            pairs = [p for s, e in zip(patches, edges, strict=True) for p in s.pairs(e)]
+            equations = KernelEquations.of(pairs, level.side)
             kernel = pruned(equations.divided(_GAMMA), self.settings.threshold)
             if level.number == 0 and i == level.iterations - 1:
                 kernel = self._refined(equations, kernel)
@@ -135,12 +116,6 @@ class _Phases:
             if np.linalg.norm(kernel - before) < 1e-3 * np.linalg.norm(before):
                 break
         return pruned(kernel, self.settings.threshold)
-
-    def disagreement(self) -> float:
-        """How far the kernels of the vertical and the horizontal derivatives lie apart."""
-        ways = [[pair for pair in self.pairs if pair.way == way] for way in (0, 1)]
-        halves = [KernelEquations.of(pairs, self.side) for pairs in ways]
-        return disagreement(halves, lambda half: half.divided(_GAMMA))
 
 
 def support(kernel: NDArray[np.float64], turn: int) -> Mask:
@@ -194,7 +169,7 @@ class _PatchLevel:
 
     def pairs(self, edge: tuple[Image, Image]) -> tuple[DerivativePair, DerivativePair]:
         """Derivatives, selected and observed."""
-        return DerivativePair(edge[0], self.y_row, 1.0, 0), DerivativePair(edge[1], self.y_col, 1.0, 1)
+        return DerivativePair(edge[0], self.y_row, 1.0), DerivativePair(edge[1], self.y_col, 1.0)
 
     def deconvolved(self, kernel: Kernel, edge: tuple[Image, Image]) -> Image:
         """Coarse image with the selected gradients as its prior, one division of spectra; eq. (7)."""

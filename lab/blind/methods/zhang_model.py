@@ -33,19 +33,11 @@ _FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientPosterior:
-    """What is believed of one gradient image: x, γ, c.
-
-    Parameters
-    ----------
-    grid : Grid
-    y : ndarray of float32, shape grid.frame
-    x, gamma, variance : ndarray of float32, shape grid.latent
-        Posterior means, prior variances γ, posterior variances c.
-    """
+    """What is believed of one gradient image: x, γ, c."""
 
     grid: Grid
     y: Floats
-    x: Floats
+    x: Floats  # posterior means, prior variances γ, posterior variances c
     gamma: Floats
     variance: Floats
 
@@ -118,22 +110,12 @@ class GradientPosterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientBeliefs:
-    """Beliefs on the two gradient images of one patch, with the noise variance λ of both.
+    """Beliefs on the two gradient images of one patch, with the noise variance λ of both."""
 
-    Parameters
-    ----------
-    down, across : GradientPosterior
-        Differences between neighbouring rows and columns.
-    noise : float
-        λ; differences of white noise of variance σ² have 2 σ².
-    floor : float
-        d over the number of pixels.
-    """
-
-    down: GradientPosterior
+    down: GradientPosterior  # differences between neighbouring rows and columns
     across: GradientPosterior
-    noise: float
-    floor: float
+    noise: float  # λ; differences of white noise of variance σ² have 2 σ²
+    floor: float  # d over the number of pixels
 
     @classmethod
     def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> GradientBeliefs:

@@ -36,18 +36,10 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePatchPrior:
-    """Patterns of sharp edges and the distribution of their contrast.
+    """Patterns of sharp edges and the distribution of their contrast."""
 
-    Parameters
-    ----------
-    patches : ndarray of float64, shape (n, 25)
-        Zero mean, unit norm; closed under turns by 90 degrees and change of sign.
-    steepness : ndarray of float64, shape (q,)
-        Quantiles at (i + 1/2) / q of σ over the local range.
-    """
-
-    patches: Image
-    steepness: Image
+    patches: Image  # (n, 25), zero mean, unit norm; closed under turns by 90 degrees and change of sign
+    steepness: Image  # (q,), quantiles at (i + 1/2) / q of σ over the local range
 
     @classmethod
     def load(cls, path: Path = _DATA) -> EdgePatchPrior:
@@ -80,12 +72,6 @@ def default_prior() -> EdgePatchPrior:
 
 def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
     """Mark thin edges: strongest responses to elongated derivative filters, local maxima across.
-
-    Parameters
-    ----------
-    x : ndarray, shape (H, W)
-    share : float
-        Of all pixels.
 
     Returns
     -------

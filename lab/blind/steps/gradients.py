@@ -9,27 +9,25 @@ image steps, and no edge within half a kernel of the border counts in kernel ste
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.cleaning import cleaned
+from lab.blind.steps.cleaning import cleaned, unsure
 from lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
-from lensmodel.blind.estimator import PsfEstimate, finished, usable
+from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import as_kernel, centred, centroid, distance, otf
+from lensmodel.core.psf import as_kernel, centroid, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 
 _ORIENTATIONS = 4  # as in Cho and Lee
 _TINY = 1e-12  # keeps divisions finite: far below any gradient
 
 Mask = NDArray[np.bool_]
-KernelSolver = Callable[["KernelEquations"], NDArray[np.float64]]
 
 
 def down(image: Image) -> Image:
@@ -119,18 +117,10 @@ def inside(shape: tuple[int, ...], margin: int) -> Mask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeriodicPlane:
-    """A periodic plane that shows an image in its middle, for image steps by FFT.
+    """A periodic plane that shows an image in its middle, for image steps by FFT."""
 
-    Parameters
-    ----------
-    frame : tuple of int
-        Shape of the image.
-    pad : tuple of int
-        Pixels added on either side of the rows and columns.
-    """
-
-    frame: tuple[int, int]
-    pad: tuple[int, int]
+    frame: tuple[int, int]  # shape of the image
+    pad: tuple[int, int]  # pixels added on either side of the rows and columns
 
     @classmethod
     def around(cls, image: Image, side: int) -> PeriodicPlane:
@@ -210,42 +200,21 @@ def _mirrored(place: int, length: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DerivativePair:
-    """A predicted derivative of the sharp image, and the same derivative as observed.
+    """A predicted derivative of the sharp image, and the same derivative as observed."""
 
-    Parameters
-    ----------
-    sharp, observed : ndarray, shape (H, W)
-    weight : float
-    way : int
-        0 down the rows, 1 across the columns, 2 both: what a verdict tells apart.
-    """
-
-    sharp: Image
+    sharp: Image  # (H, W)
     observed: Image
     weight: float
-    way: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KernelEquations:
-    """Normal equations of sum w |s * k - b|², pooled over derivatives and patches.
+    """Normal equations of sum w |s * k - b|², pooled over derivatives and patches."""
 
-    Parameters
-    ----------
-    side : int
-        Odd side of the kernel.
-    power : ndarray of float64
-        sum w |S|² on a common grid, which no patch wraps on.
-    cross : ndarray of complex128
-        sum w conj(S) B.
-    grid : tuple of int
-        Shape of the common grid.
-    """
-
-    side: int
-    power: Image
-    cross: NDArray[np.complex128]
-    grid: tuple[int, int]
+    side: int  # odd side of the kernel
+    power: Image  # sum w |S|² on a common grid, which no patch wraps on
+    cross: NDArray[np.complex128]  # sum w conj(S) B
+    grid: tuple[int, int]  # shape of the common grid
 
     @classmethod
     def of(cls, pairs: Sequence[DerivativePair], side: int) -> KernelEquations:
@@ -322,45 +291,16 @@ def pruned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.
     return as_kernel(kept)
 
 
-def disagreement(halves: Sequence[KernelEquations], solve: KernelSolver) -> float:
-    """Relative L2 distance of the kernels that two parts of the evidence give alone; 1 if one fails."""
-    first, second = (np.maximum(solve(half), 0.0) for half in halves)
-    if not min(first.max(), second.max()) > 0:
-        return 1.0
-    found = distance(centred(first), centred(second)).rel_l2
-    return min(found, 1.0) if math.isfinite(found) else 1.0
-
-
-class EdgeSolver(LevelSolver, Protocol):
-    """A method's alternation on one level that can tell how far its evidence agrees."""
-
-    def disagreement(self) -> float:
-        """Relative L2 distance of kernels from parts of the evidence, after the last level."""
-
-
 def estimate_by_edges(
-    solver: EdgeSolver,
+    solver: LevelSolver,
     patches: Sequence[Plane],
     noise: Sequence[NoiseModel],
     *,
     size: int,
     iterations: int,
-    start: Kernel | None,
-    error: tuple[float, float],
     on_step: StepHook,
 ) -> PsfEstimate:
-    """Run a method coarse to fine, or from a first kernel on the finest level alone.
-
-    `error` is offset and slope of the expected relative L2 error by the disagreement.
-    """
-    kept = usable(patches, noise, size)
-    views = [View.of(patch, model) for patch, model in kept]
-    schedule = Schedule(size, iterations, coarsest=size if start is not None or size < 5 else 5)
-    found = coarse_to_fine(views, solver, schedule, start=start, on_step=on_step)
-    apart = solver.disagreement()
-    return finished(
-        found.kernel,
-        size=size,
-        error=error[0] + error[1] * apart,
-        diagnostics={"support": float(size), "disagreement": apart},
-    )
+    """Run a method coarse to fine."""
+    views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
+    found = coarse_to_fine(views, solver, Schedule(size, iterations, coarsest=min(size, 5)), on_step=on_step)
+    return unsure(found.kernel, size)

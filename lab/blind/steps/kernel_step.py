@@ -21,18 +21,10 @@ _TINY = 1e-12  # keeps divisions finite: far below any power
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Shapes of one valid convolution y = k * x, and its products by FFT.
+    """Shapes of one valid convolution y = k * x, and its products by FFT."""
 
-    Parameters
-    ----------
-    frame : tuple of int
-        Shape of y.
-    side : int
-        Odd side of k; x is wider than y by `side - 1`.
-    """
-
-    frame: tuple[int, int]
-    side: int
+    frame: tuple[int, int]  # shape of y
+    side: int  # odd side of k; x is wider than y by `side - 1`
 
     @property
     def latent(self) -> tuple[int, int]:
@@ -90,24 +82,13 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """One summand w (|y - k * x|² + sum_j q_j k_j²) of the kernel step.
-
-    Parameters
-    ----------
-    grid : Grid
-    y : ndarray of float32, shape grid.frame
-    x : ndarray of float32, shape grid.latent
-    weight : float
-        w.
-    quadratic : ndarray of float64, shape (side, side), or float
-        q.
-    """
+    """One summand w (|y - k * x|² + sum_j q_j k_j²) of the kernel step."""
 
     grid: Grid
     y: Floats
     x: Floats
-    weight: float
-    quadratic: Kernelish | float = 0.0
+    weight: float  # w
+    quadratic: Kernelish | float = 0.0  # (side, side), q
 
 
 def least_squares_kernel(

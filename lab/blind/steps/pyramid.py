@@ -42,18 +42,10 @@ _REACH = 2  # of the cubic, in pixels of the coarser grid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One patch on one level.
+    """One patch on one level."""
 
-    Parameters
-    ----------
-    y : ndarray of float64, shape (H, W)
-        Observed, zero mean, its 1 to 99 percent range scaled to 1.
-    noise : float
-        Standard deviation of the noise of y, same units.
-    """
-
-    y: Image
-    noise: float
+    y: Image  # (H, W), observed, zero mean, its 1 to 99 percent range scaled to 1
+    noise: float  # standard deviation of the noise of y, same units
 
     @classmethod
     def of(cls, patch: Plane, model: NoiseModel) -> View:
@@ -73,27 +65,13 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """One level of the pyramid.
+    """One level of the pyramid."""
 
-    Parameters
-    ----------
-    number : int
-        0 is the finest.
-    count : int
-        How many levels there are.
-    side : int
-        Odd side of the kernel on this level.
-    iterations : int
-        How many alternations the schedule gives it.
-    views : tuple of View
-        The patches, all of which share the kernel.
-    """
-
-    number: int
-    count: int
-    side: int
-    iterations: int
-    views: tuple[View, ...]
+    number: int  # 0 is the finest
+    count: int  # how many levels there are
+    side: int  # odd side of the kernel on this level
+    iterations: int  # how many alternations the schedule gives it
+    views: tuple[View, ...]  # the patches, all of which share the kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,24 +94,12 @@ class LevelSolver(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Levels and iterations.
+    """Levels and iterations."""
 
-    Parameters
-    ----------
-    side : int
-        Odd side of the kernel on the finest level.
-    iterations : int
-        Alternations on each level.
-    coarsest : int
-        The coarsest level is the last whose kernel is not smaller than this, in pixels.
-    ratio : float
-        Size of a level over that of the next finer one, below 1.
-    """
-
-    side: int
-    iterations: int
-    coarsest: int = 5
-    ratio: float = RATIO
+    side: int  # odd side of the kernel on the finest level
+    iterations: int  # alternations on each level
+    coarsest: int = 5  # the coarsest level is the last whose kernel is not smaller than this, in pixels
+    ratio: float = RATIO  # size of a level over that of the next finer one, below 1
 
     def __post_init__(self) -> None:
         if self.side < 3 or self.side % 2 == 0 or self.coarsest < 3:
@@ -164,21 +130,7 @@ def coarse_to_fine(
     start: Kernel | None = None,
     on_step: StepHook = ignore_step,
 ) -> LevelResult:
-    """Run a method on every level, coarsest first.
-
-    Parameters
-    ----------
-    views : sequence of View
-        The patches at full size; they may differ in shape.
-    solve : LevelSolver
-        The method's alternation on one level.
-    schedule : Schedule
-        Levels and iterations.
-    start : Kernel, optional
-        First kernel, on the finest grid; a delta when None. It is shrunk to the coarsest level.
-    on_step : StepHook
-        Called after each iteration; raising `CancelledError` there stops the work.
-    """
+    """Run a method on every level, coarsest first."""
     if not views:
         raise InvalidInputError("coarse to fine needs at least one patch")
     sides = schedule.sides(min(min(view.y.shape) for view in views))

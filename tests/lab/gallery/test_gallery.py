@@ -31,7 +31,7 @@ from lab.gallery.measure import TILE, bars, measured
 from lab.gallery.page import text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, take
 from lab.gallery.rendering import aligned, rendered
-from lab.gallery.run import Wishes, hang
+from lab.gallery.run import GallerySettings, entries_of
 from lab.images import gains
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
@@ -450,7 +450,11 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     monkeypatch.setattr(peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
-    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
+    entries = list(
+        entries_of(
+            real_pictures(folder), output, GallerySettings(mode="default", workers=1), on_picture=ignore
+        )
+    )
     page = write_page(entries, output).read_text(encoding="utf-8")
 
     assert entries[0].work["state"] == "corrected"
@@ -469,7 +473,9 @@ def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
     monkeypatch.setattr(lensmodel, "calibrate", refused)
     monkeypatch.setattr(peers.Peer, "installed", property(lambda _: False))
 
-    entries = list(hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore))
+    entries = list(
+        entries_of(real_pictures(folder), tmp_path / "gallery", GallerySettings(), on_picture=ignore)
+    )
 
     assert entries[0].work["state"] == "left alone"
     assert "calibration was refused: no photo could be used" in write_page(
@@ -493,7 +499,7 @@ def test_what_is_stored_is_not_made_again_unless_asked(
     pictures = real_pictures(folder)
 
     for fresh in (False, False, True):
-        list(hang(pictures, tmp_path / "gallery", Wishes(fresh=fresh), on_picture=ignore))
+        list(entries_of(pictures, tmp_path / "gallery", GallerySettings(fresh=fresh), on_picture=ignore))
 
     assert len(calls) == 2
 
@@ -501,7 +507,7 @@ def test_what_is_stored_is_not_made_again_unless_asked(
 def test_an_unreadable_file_is_named_with_its_reason(tmp_path: Path) -> None:
     picture = Picture("raw/odd.gpr", tmp_path / "odd.gpr", unreadable="packed as VC-5 is not read")
 
-    entries = list(hang([picture], tmp_path / "gallery", Wishes(), on_picture=ignore))
+    entries = list(entries_of([picture], tmp_path / "gallery", GallerySettings(), on_picture=ignore))
 
     assert "packed as VC-5 is not read" in write_page(entries, tmp_path / "gallery").read_text(
         encoding="utf-8"

@@ -220,12 +220,12 @@ def colour_remarks(step: tuple[int, int]) -> list[str]:
 def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
     """Tell in words what the edges of a chart gained; nothing of any other photo."""
     return [
-        f"{ZONE_WORDS[zone]} of the chart: MTF50 from {mtf50_words(edges.mtf50_before)} "
+        f"{ZONE_WORDS[zone]} of the chart, {edges.direction}: MTF50 from {mtf50_words(edges.mtf50_before)} "
         f"to {mtf50_words(edges.mtf50_after)} cycles/pixel, {edges.gain:.1f} times "
         f"(median of {edges.edges} edges), overshoot {edges.overshoot_after:.1f} %; "
         f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
         for zone, report in zones.items()
-        if (edges := report.measured) is not None
+        for edges in report.measured
     ]
 
 

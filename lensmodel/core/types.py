@@ -26,6 +26,7 @@ CHANNELS: Final[tuple[Channel, ...]] = get_args(Channel)
 WAVELENGTH_NM: Final[dict[Channel, float]] = {"r": 610.0, "g": 540.0, "b": 465.0}
 """Effective wavelength of each colour channel of a typical sensor, in nanometres."""
 
+Direction: TypeAlias = Literal["tangential", "sagittal", "oblique"]
 Zone: TypeAlias = Literal["center", "mid", "corner"]
 ZONES: Final[tuple[Zone, ...]] = get_args(Zone)
 ZONE_WORDS: Final[dict[Zone, str]] = {"center": "centre", "mid": "mid", "corner": "corner"}
@@ -231,8 +232,9 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True)
 class EdgeGain:
-    """What a correction did to the edges of a photographed chart in one zone: medians."""
+    """What a correction did to the edges of one direction in one zone of a photographed chart: medians."""
 
+    direction: Direction
     edges: int  # how many were measured before and after
     mtf50_before: float  # cycles/pixel
     mtf50_after: float

@@ -87,8 +87,9 @@ class ZoneReport:
         the PSFs are too uncertain.
     psf_error : float
         Mean expected relative error of the PSFs.
-    measured : EdgeGain or None
-        Gain at the edges of a chart, if the photo shows one; `pipeline.correct_photo` measures it.
+    measured : tuple of EdgeGain
+        Gain at the edges of a chart by direction, if the photo shows one; `pipeline.correct_photo` measures
+        it.
     left : int
         Cells left as they were, because there was nothing to gain.
     held_back : float
@@ -100,7 +101,7 @@ class ZoneReport:
     cells: int
     expected_gain_db: float | None
     psf_error: float
-    measured: EdgeGain | None = None
+    measured: tuple[EdgeGain, ...] = ()
     left: int = 0
     held_back: float = 0.0
     reasons: tuple[str, ...] = field(default=())

@@ -6,19 +6,22 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import ZONES, FieldPosition, Zone
+from lensmodel.core.types import ZONES, Direction, FieldPosition, Zone
 from lensmodel.quality.edge import EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 
-Direction = Literal["tangential", "sagittal"]
+DIRECTIONS: Final[tuple[Direction, ...]] = ("tangential", "sagittal", "oblique")
+_ALONG: Final = math.cos(math.radians(10.0))
+"""Edges whose normal lies further from u and v belong to neither (chosen: of points three times as long as
+wide ten degrees take a tenth of the MTF50)."""
 Box = tuple[int, int, int, int]
 """(row, col, height, width) in pixels of the frame."""
 
@@ -29,7 +32,7 @@ class EdgeMeasurement:
 
     box: Box  # (row, col, height, width)
     position: FieldPosition  # of the middle of the box
-    direction: Direction  # contrast along u or along v, whichever the edge's normal is nearer to
+    direction: Direction  # contrast along u, along v, or between the two: see `direction_of`
     response: EdgeResponse  # what was measured
 
     @property
@@ -67,18 +70,25 @@ def measure_edges(
             logger.warning("no edge measured in box %s: %s", box, error)
             continue
         position = frame.position(row + (height - 1) / 2.0, col + (width - 1) / 2.0)
-        along_u = abs(math.cos(response.normal - position.phi)) >= math.sqrt(0.5)
         measured.append(
             EdgeMeasurement(
                 box=box,
                 position=position,
-                direction="tangential" if along_u else "sagittal",
+                direction=direction_of(response.normal, position),
                 response=response.compensated() if rendered else response,
             )
         )
     if not measured:
         raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
     return tuple(measured)
+
+
+def direction_of(normal: float, place: FieldPosition) -> Direction:
+    """Say which contrast an edge shows; only within 10 degrees of u or v it is tangential or sagittal."""
+    turned = normal - place.phi
+    if abs(math.cos(turned)) >= _ALONG:
+        return "tangential"
+    return "sagittal" if abs(math.sin(turned)) >= _ALONG else "oblique"
 
 
 def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:

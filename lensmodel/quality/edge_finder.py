@@ -5,9 +5,9 @@ point one way, and not along the grid,
 
     coherence = sqrt((Jxx - Jyy)² + 4 Jxy²) / (Jxx + Jyy),
 
-and whose gradients lie on one line. Then, strongest first, at full size: unclipped, flat on both
-sides, and explained by its own edge profile to a few percent of the step. Photos of anything but a
-chart hardly ever have such windows.
+and whose gradients lie on one line. Such windows form runs, one along each edge. Then, strongest first, in
+the middle of each run at full size: unclipped, flat on both sides, and explained by its own edge profile to
+a few percent of the step. Photos of anything but a chart hardly ever have such windows.
 
 Source of the structure tensor: J. Bigun, G. H. Granlund, "Optimal orientation detection of linear
 symmetry", ICCV 1987.
@@ -18,32 +18,30 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import ZONES, EdgeGain, NoiseModel, Zone
-from lensmodel.quality.charts import Box
+from lensmodel.core.types import ZONES, Direction, EdgeGain, NoiseModel, Zone
+from lensmodel.quality.charts import DIRECTIONS, Box, direction_of
 from lensmodel.quality.edge import EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 
-SIDES: Final = (64, 96, 128)
+SIDES: Final = (128, 96, 64)
 """Sides of a window in pixels: the largest that holds the edge and nothing else is taken."""
-
-LEAST_EDGES: Final = 2
-"""Edges that a zone must have: one says little."""
 
 LEAST_ON_A_CHART: Final = 4
 """Edges that a photo must have, along its rows and along its columns: other scenes have one or two."""
 
 _MEAN: Final = 4  # pixels along the side of a mean
-_WINDOW: Final = SIDES[0] // _MEAN  # of the smallest crop, in means of pixels
+_WINDOW: Final = SIDES[-1] // _MEAN  # of the smallest crop, in means of pixels
 _STRIDE: Final = _WINDOW // 4  # a quarter of a window: no edge is missed between two (chosen)
 _STRIP: Final = 1024  # rows at once: no copy of the frame is made
 _LEAST_STEP: Final = 0.02  # of full scale
@@ -52,33 +50,56 @@ _LEAST_COHERENCE: Final = 0.9  # of the structure tensor: one straight edge and 
 _LEAST_SLANT, _MOST_SLANT = math.radians(2.0), math.radians(43.0)
 _NARROW: Final = 0.2  # scatter of the gradients across the edge, in sides of a window
 _BESIDE: Final = 0.05  # of the squared gradients, further from the edge than a quarter of a window
-_MOST: Final = 4096  # windows of the grid that are looked at more closely
-_APART: Final = SIDES[0] // 2  # pixels between windows tried at full size
-_ENOUGH, _TRIED = 12, 40  # edges wanted and windows tried at full size, in a zone
+_MOST: Final = 1 << 16  # windows of the grid that are looked at more closely
+_CHUNK: Final = 4096  # of them at once, for memory
+_TRIED: Final = 2000  # edges at full size: more than any chart has
+_FIRST: Final = 60  # edges tried of which some must be a chart's, or the photo is none (chosen for time)
+_LEAST_OF_USUAL: Final = 0.25  # of the median step: a fold or a shadow on the paper is no edge of the print
 _UNEXPLAINED: Final = 0.02  # of the step, beyond what noise leaves
 _UNEVEN: Final = 0.03  # of the step, along the ground of one side
 _OVERSHOOT: Final = 15.0  # percent: cameras sharpen
 _SILENT: Final = NoiseModel(0.0, 0.0)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundEdge:
+    """One straight edge of a chart."""
+
+    box: Box  # (row, col, height, width) of the window in its middle that was measured
+    response: EdgeResponse  # what was measured there
+    # (row, col), of the straight part that was seen; corners lie up to half a window further out
+    ends: tuple[tuple[float, float], tuple[float, float]]
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Middle of the box, (row, col)."""
+        row, col, height, width = self.box
+        return row + (height - 1) / 2.0, col + (width - 1) / 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Segment:
+    """Windows along one edge: its middle, its unit direction, (row, col), and half its length, pixels."""
+
+    middle: tuple[float, float]
+    along: tuple[float, float]
+    half: float
+
+    def at(self, share: float) -> tuple[float, float]:
+        """The point at a share of the half length from the middle."""
+        distance = share * self.half
+        return self.middle[0] + distance * self.along[0], self.middle[1] + distance * self.along[1]
+
+
 def find_edges(
-    plane: NDArray[np.floating],
-    frame: Frame | None = None,
-    *,
-    origin: tuple[int, int] = (0, 0),
-    noise: NoiseModel = _SILENT,
-    clip: float = 1.0,
-) -> tuple[Box, ...]:
+    plane: NDArray[np.floating], *, noise: NoiseModel = _SILENT, clip: float = 1.0
+) -> tuple[FoundEdge, ...]:
     """Find straight slanted edges with flat ground on both sides, as charts have them.
 
     Parameters
     ----------
     plane : ndarray, shape (H, W)
         Linear light, finite; may be memory-mapped. It is read once, a strip at a time.
-    frame : Frame, optional
-        The whole frame, where `plane` is a part of it.
-    origin : tuple of int
-        Row and column of the frame at which `plane` begins.
     noise : NoiseModel
         Of the plane: so much the grounds may scatter.
     clip : float
@@ -86,40 +107,42 @@ def find_edges(
 
     Returns
     -------
-    tuple of (row, col, height, width)
-        Boxes in pixels of `plane`, not overlapping, at most 12 in a zone of the frame. None where there
-        are fewer than four, or none across the others: such a photo shows no chart.
+    tuple of FoundEdge
+        Each edge once, by the largest box in its middle that holds nothing else. None where there are fewer
+        than four, or none across the others: such a photo shows no chart.
     """
-    if min(plane.shape) < SIDES[0]:
+    if min(plane.shape) < SIDES[-1]:
         return ()
-    frame = frame or Frame(*plane.shape)
-    taken: list[Box] = []
-    upright: list[bool] = []
-    tried: dict[tuple[int, int], tuple[int, int]] = {}
-    accepted, looked = dict.fromkeys(ZONES, 0), dict.fromkeys(ZONES, 0)
+    found: list[FoundEdge] = []
     with np.errstate(all="ignore"):  # light beyond what float32 can square is no edge
-        candidates = _candidates(_means(plane))
-    for row, col in candidates:
-        zone = zone_of(frame.position(origin[0] + row, origin[1] + col).r)
-        if accepted[zone] == _ENOUGH or looked[zone] == _TRIED or _near(row, col, tried):
-            continue
-        looked[zone] += 1
-        tried[row // _APART, col // _APART] = row, col
-        best: tuple[Box, EdgeResponse] | None = None
+        segments = _segments(_means(plane))
+    for number, segment in enumerate(segments[:_TRIED]):
+        if number == _FIRST and len(found) < LEAST_ON_A_CHART:
+            return ()
+        edge = _edge_on(plane, segment, noise, clip)
+        if edge is not None:
+            found.append(edge)
+    usual = float(np.median([edge.response.step for edge in found])) if found else 0.0
+    edges = tuple(edge for edge in found if edge.response.step > _LEAST_OF_USUAL * usual)
+    upright = [abs(math.cos(edge.response.normal)) > math.sqrt(0.5) for edge in edges]
+    chart = len(edges) >= LEAST_ON_A_CHART and any(upright) and not all(upright)
+    return edges if chart else ()
+
+
+def _edge_on(
+    plane: NDArray[np.floating], segment: _Segment, noise: NoiseModel, clip: float
+) -> FoundEdge | None:
+    """Measure an edge in its middle, or beside it where the middle is spoilt."""
+    for share in (0.0, -0.5, 0.5):
+        row, col = segment.at(share)
         for side in SIDES:
-            box = (row - side // 2, col - side // 2, side, side)
-            if not _inside(box, plane.shape) or _meets(box, taken):
-                break
+            box = (round(row) - side // 2, round(col) - side // 2, side, side)
+            if not _inside(box, plane.shape):
+                continue
             response = _edge_of(plane, box, noise, clip)
-            if response is None:
-                break
-            best = box, response
-        if best is not None:
-            taken.append(best[0])
-            upright.append(abs(math.cos(best[1].normal)) > math.sqrt(0.5))
-            accepted[zone] += 1
-    chart = len(taken) >= LEAST_ON_A_CHART and any(upright) and not all(upright)
-    return tuple(taken) if chart else ()
+            if response is not None:
+                return FoundEdge(box, response, (segment.at(-1.0), segment.at(1.0)))
+    return None
 
 
 def edge_gains(
@@ -130,39 +153,31 @@ def edge_gains(
     origin: tuple[int, int] = (0, 0),
     noise: NoiseModel = _SILENT,
     clip: float = 1.0,
-) -> dict[Zone, EdgeGain]:
-    """Sharpness of a chart's edges before and after a correction, by zone of the frame.
+) -> dict[Zone, tuple[EdgeGain, ...]]:
+    """Sharpness of a chart's edges before and after a correction, by zone and direction.
 
-    The edges are those that `find_edges` finds before the correction.
+    The edges are those that `find_edges` finds before the correction; medians, one for each direction with an
+    edge that can be measured both times.
     """
-    boxes = find_edges(before, frame, origin=origin, noise=noise, clip=clip)
-    if not boxes:
+    edges = find_edges(before, noise=noise, clip=clip)
+    if not edges:
         return {}
     frame = frame or Frame(*before.shape)
-    rows: dict[Zone, list[tuple[float, float, float, float]]] = {zone: [] for zone in ZONES}
-    for box in boxes:
-        old, new = _measured(before, box), _measured(after, box)
-        if old is None or new is None or old.mtf50 <= 0.0:
+    rows: dict[tuple[Zone, Direction], list[tuple[float, float, float, float]]] = {}
+    for edge in edges:
+        old, new = edge.response, _measured(after, edge.box)
+        if new is None or old.mtf50 <= 0.0:
             continue
-        middle = (origin[0] + box[0] + box[2] / 2, origin[1] + box[1] + box[3] / 2)
-        ratio = new.mtf50 / old.mtf50
-        rows[zone_of(frame.position(*middle).r)].append((old.mtf50, new.mtf50, ratio, new.overshoot))
-    return {
-        zone: EdgeGain(len(seen), *(float(value) for value in np.median(seen, axis=0)))
-        for zone, seen in rows.items()
-        if len(seen) >= LEAST_EDGES
-    }
-
-
-def _near(row: int, col: int, tried: Mapping[tuple[int, int], tuple[int, int]]) -> bool:
-    """Whether a window as good as this one was tried."""
-    cell = row // _APART, col // _APART
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            other = tried.get((cell[0] + down, cell[1] + right))
-            if other is not None and max(abs(row - other[0]), abs(col - other[1])) < _APART:
-                return True
-    return False
+        place = frame.position(origin[0] + edge.middle[0], origin[1] + edge.middle[1])
+        key = zone_of(place.r), direction_of(old.normal, place)
+        rows.setdefault(key, []).append((old.mtf50, new.mtf50, new.mtf50 / old.mtf50, new.overshoot))
+    gains: dict[Zone, tuple[EdgeGain, ...]] = {}
+    for zone, direction in ((zone, direction) for zone in ZONES for direction in DIRECTIONS):
+        seen = rows.get((zone, direction), [])
+        if seen:
+            medians = (float(value) for value in np.median(seen, axis=0))
+            gains[zone] = (*gains.get(zone, ()), EdgeGain(direction, len(seen), *medians))
+    return gains
 
 
 def _measured(plane: NDArray[np.floating], box: Box) -> EdgeResponse | None:
@@ -191,8 +206,8 @@ def _means(plane: NDArray[np.floating]) -> NDArray[np.float32]:
     return out
 
 
-def _candidates(means: NDArray[np.float32]) -> list[tuple[int, int]]:
-    """Middles of windows that may hold an edge, as (row, col) in pixels, strongest first."""
+def _segments(means: NDArray[np.float32]) -> list[_Segment]:
+    """Edges as runs of windows that each hold one straight edge and nothing else, strongest first."""
     across = np.zeros_like(means)
     down = np.zeros_like(means)
     across[:, 1:-1] = (means[:, 2:] - means[:, :-2]) / 2
@@ -207,24 +222,58 @@ def _candidates(means: NDArray[np.float32]) -> list[tuple[int, int]]:
     good = strong & (coherence > _LEAST_COHERENCE) & (slant > _LEAST_SLANT) & (slant < _MOST_SLANT)
     order = np.flatnonzero(good)
     order = order[np.argsort(-energy.ravel()[order], kind="stable")][:_MOST]
-    if order.size == 0:
-        return []
-    rows, cols = (index * _STRIDE for index in np.unravel_index(order, energy.shape))
-    normal = angle.ravel()[order]
+    middles = np.full((*energy.shape, 2), np.nan)
+    rising = np.zeros(energy.shape, dtype=np.int8)
+    for start in range(0, order.size, _CHUNK):
+        part = order[start : start + _CHUNK]
+        index = np.unravel_index(part, energy.shape)
+        kept, middle, sign = _on_one_line(across, down, index, angle.ravel()[part])
+        kind = np.where(np.abs(np.cos(angle.ravel()[part])) > math.sqrt(0.5), 1, 2) * sign
+        rising[index[0][kept], index[1][kept]] = kind[kept]
+        middles[index[0][kept], index[1][kept]] = middle[kept]
+    found: list[tuple[float, _Segment]] = []
+    for each in (-2, -1, 1, 2):
+        labels, _ = ndimage.label(rising == each, structure=np.ones((3, 3)))
+        for number, where in enumerate(ndimage.find_objects(labels), start=1):
+            own = labels[where] == number
+            found.append((float(energy[where][own].sum()), _segment(middles[where][own])))
+    return [segment for _, segment in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _on_one_line(
+    across: NDArray[np.float32],
+    down: NDArray[np.float32],
+    index: tuple[NDArray[np.intp], ...],
+    normal: NDArray[np.float32],
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.intp]]:
+    """Whether the gradients of windows lie on one line, where it passes their middles, and its sign."""
+    rows, cols = (i * _STRIDE for i in index)
     views = [sliding_window_view(g, (_WINDOW, _WINDOW))[rows, cols] for g in (across, down)]
     weight = np.square(views[0]) + np.square(views[1])
     place = np.arange(_WINDOW, dtype=np.float32) - (_WINDOW - 1) / 2
-    distance = np.cos(normal)[:, None, None] * place + np.sin(normal)[:, None, None] * place[:, None]
+    cos, sin = np.cos(normal), np.sin(normal)
+    distance = cos[:, None, None] * place + sin[:, None, None] * place[:, None]
     total = weight.sum(axis=(1, 2))
     offset = (weight * distance).sum(axis=(1, 2)) / total
-    scatter = np.sqrt((weight * np.square(distance - offset[:, None, None])).sum(axis=(1, 2)) / total)
     across_it = np.abs(distance - offset[:, None, None])
+    scatter = np.sqrt((weight * np.square(across_it)).sum(axis=(1, 2)) / total)
     beside = np.where(across_it > _WINDOW / 4, weight, 0.0).sum(axis=(1, 2)) / total
-    one_line = (scatter < _NARROW * _WINDOW) & (np.abs(offset) < _WINDOW / 4) & (beside < _BESIDE)
-    # The window is moved so that the edge runs through its middle.
-    middle_row = (rows + _WINDOW / 2 + offset * np.sin(normal)) * _MEAN
-    middle_col = (cols + _WINDOW / 2 + offset * np.cos(normal)) * _MEAN
-    return [(round(r), round(c)) for r, c in zip(middle_row[one_line], middle_col[one_line], strict=True)]
+    kept = (scatter < _NARROW * _WINDOW) & (np.abs(offset) < _WINDOW / 4) & (beside < _BESIDE)
+    middle = np.stack([rows + _WINDOW / 2 + offset * sin, cols + _WINDOW / 2 + offset * cos], axis=1) * _MEAN
+    slope = cos * views[0].sum(axis=(1, 2)) + sin * views[1].sum(axis=(1, 2))
+    return kept, middle, np.where(slope >= 0.0, 1, -1)
+
+
+def _segment(points: NDArray[np.float64]) -> _Segment:
+    """Line through the middles of windows along one edge."""
+    center = points.mean(axis=0)
+    along = np.linalg.svd(points - center)[2][0] if len(points) > 1 else np.array([1.0, 0.0])
+    place = (points - center) @ along
+    low, high = float(place.min()), float(place.max())
+    middle = center + (low + high) / 2.0 * along
+    return _Segment(
+        (float(middle[0]), float(middle[1])), (float(along[0]), float(along[1])), (high - low) / 2.0
+    )
 
 
 def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -238,11 +287,6 @@ def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 def _inside(box: Box, shape: tuple[int, ...]) -> bool:
     row, col, height, width = box
     return row >= 0 and col >= 0 and row + height <= shape[0] and col + width <= shape[1]
-
-
-def _meets(box: Box, others: Sequence[Box]) -> bool:
-    row, col, height, width = box
-    return any(r < row + height and row < r + h and c < col + width and col < c + w for r, c, h, w in others)
 
 
 def _edge_of(plane: NDArray[np.floating], box: Box, noise: NoiseModel, clip: float) -> EdgeResponse | None:

@@ -151,7 +151,7 @@ def _with_measured_gain(
         clip=developed.clip[1],
     )
     zones = {
-        zone: dataclasses.replace(report, measured=gains.get(zone))
+        zone: dataclasses.replace(report, measured=gains.get(zone, ()))
         for zone, report in corrected.zones.items()
     }
     return dataclasses.replace(corrected, zones=zones)

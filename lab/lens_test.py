@@ -1,0 +1,116 @@
+"""The lens test against the truth: T and S of a traced lens by its chart, by its photos, by a correction.
+
+A chart of dark squares that lean is photographed through a lens whose kernels are known. Nothing of what is
+tested takes part in making it: squares are drawn by their exact areas in pixels, the pixel's own box is
+taken out again, and the truth is the transfer function of the lens's own kernel at each place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import FieldPosition, LensSettings, Planes
+from lensmodel.simulate import CameraLens
+from lensmodel.simulate.charts import edge_area
+
+MARGIN: Final = 40  # pixels of scene beyond the frame
+LEAN_DEG: Final = 5.0
+_SIZE: Final = 41  # pixels of the kernels that are the truth
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """One dark square: its middle in pixels (row, col), and its side."""
+
+    row: float
+    col: float
+    side: float
+
+
+def squares_chart(
+    frame: Frame,
+    *,
+    rows: int = 5,
+    cols: int = 7,
+    lean_deg: float = LEAN_DEG,
+    fill: float = 0.6,
+    dark: float = 0.12,
+    bright: float = 0.7,
+) -> tuple[Planes, tuple[Square, ...]]:
+    """Draw rows x cols dark squares on bright paper, the whole page turned by `lean_deg`.
+
+    Parameters
+    ----------
+    frame : Frame
+    rows, cols : int
+    lean_deg : float
+        Counter-clockwise.
+    fill : float
+        Side of a square over the distance of two.
+    dark, bright : float
+        Linear light.
+
+    Returns
+    -------
+    scene : Planes, shape (3, H + 2 MARGIN, W + 2 MARGIN)
+        Its spectrum is that of an ideal chart as far as pixels can show it: the box of the pixels in which
+        areas were counted is divided out.
+    squares : tuple of Square
+        In coordinates of the frame.
+    """
+    pitch = min(frame.height / rows, frame.width / cols) * 0.97
+    half = fill * pitch / 2.0
+    turn = math.radians(lean_deg)
+    height, width = frame.height + 2 * MARGIN, frame.width + 2 * MARGIN
+    plane = np.full((height, width), bright)
+    squares = []
+    for i in range(rows):
+        for j in range(cols):
+            right, down = (j - (cols - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch
+            row = frame.center[0] + down * math.cos(turn) - right * math.sin(turn)
+            col = frame.center[1] + right * math.cos(turn) + down * math.sin(turn)
+            squares.append(Square(row, col, 2 * half))
+            reach = math.ceil(half * 1.5) + 2
+            top, left = round(row) + MARGIN - reach, round(col) + MARGIN - reach
+            part = np.s_[max(top, 0) : top + 2 * reach, max(left, 0) : left + 2 * reach]
+            y = np.arange(height)[part[0]][:, None] - MARGIN - row
+            x = np.arange(width)[part[1]][None, :] - MARGIN - col
+            plane[part] -= (bright - dark) * _band(y, x, turn, half) * _band(y, x, turn + math.pi / 2, half)
+    return np.ascontiguousarray(np.broadcast_to(_without_box(plane), (3, height, width))), tuple(squares)
+
+
+def _band(
+    y: NDArray[np.floating], x: NDArray[np.floating], normal: float, half: float
+) -> NDArray[np.float64]:
+    """Share of each pixel between two parallel lines, each `half` from the origin."""
+    c, s = math.cos(normal), math.sin(normal)
+    return edge_area(y - half * s, x + half * c, normal) - edge_area(y + half * s, x - half * c, normal)
+
+
+def _without_box(plane: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Divide the spectrum by that of one pixel."""
+    rows, cols = fft.fftfreq(plane.shape[0]), fft.rfftfreq(plane.shape[1])
+    box = np.sinc(rows)[:, None] * np.sinc(cols)[None, :]
+    return np.asarray(fft.irfft2(fft.rfft2(plane) / box, s=plane.shape), dtype=np.float32)
+
+
+def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: float) -> float:
+    """MTF50 in cycles/pixel of the lens's own green kernel along a normal, by a plain sum over its pixels."""
+    h = (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
+    kernel = lens.kernel_at_field(
+        h, LensSettings(aperture=lens.widest(), channel="g"), _SIZE,
+        pitch_um=pitch_um, defocus=0.0, offset=(0.0, 0.0),
+    )  # fmt: skip
+    t = np.arange(_SIZE) - _SIZE // 2
+    along = t[None, :] * math.cos(normal) - t[:, None] * math.sin(normal)
+    frequencies = np.linspace(0.0, 0.75, 751)
+    mtf = np.abs(np.exp(-2j * np.pi * np.outer(frequencies, along.ravel())) @ kernel.ravel())
+    below = np.flatnonzero(mtf < 0.5 * mtf[0])
+    return float(frequencies[below[0]]) if below.size else 1.0

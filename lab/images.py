@@ -1,4 +1,4 @@
-"""How close one picture is to another: as a whole, by zone, block by block; and what its noise is."""
+"""How close one picture is to another: as a whole, by zone, block by block."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from lensmodel.core.types import ZONES, Planes, Zone
 from lensmodel.quality import best_shift, shifted, to_srgb
 
 Encoded: TypeAlias = NDArray[np.floating] | NDArray[np.uint16]
-
-_SSIM_WINDOW: Final = 11  # pixels: that of Wang et al. 2004
 
 
 def psnr(
@@ -41,25 +39,8 @@ def psnr(
     return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
 
 
-def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: bool = False) -> float:
-    """Structural similarity, mean over planes; Gaussian window of sigma 1.5, range 1.
-
-    Source: Z. Wang et al., "Image quality assessment: from error visibility to structural
-    similarity", IEEE TIP 13, 2004, with its constants.
-    """
-    _same_shape(image, reference)
-    if min(image.shape[-2:]) < _SSIM_WINDOW:
-        raise InvalidInputError(f"SSIM needs at least {_SSIM_WINDOW} pixels a side, got {image.shape}")
-    a = to_srgb(image) if srgb else np.asarray(image, dtype=np.float64)
-    b = to_srgb(reference) if srgb else np.asarray(reference, dtype=np.float64)
-    shape = (-1, *a.shape[-2:])
-    whole = _ssim_map(a.reshape(shape), b.reshape(shape))
-    rim = _SSIM_WINDOW // 2  # where the window leaves the picture
-    return float(whole[rim:-rim, rim:-rim].mean())
-
-
 def _ssim_map(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """SSIM around each pixel, mean over planes."""
+    """SSIM around each pixel (Z. Wang et al., IEEE TIP 13, 2004; Gaussian of 1.5 px), mean over planes."""
     maps = [
         structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
             x, y, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
@@ -67,31 +48,6 @@ def _ssim_map(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.fl
         for x, y in zip(a, b, strict=True)
     ]
     return np.asarray(np.mean(maps, axis=0))
-
-
-def noise_gain(corrected: NDArray[np.floating], original: NDArray[np.floating]) -> float:
-    """Standard deviation of the noise in a flat part after a correction, over that before.
-
-    Shading does not count, see `flat_noise`.
-    """
-    _same_shape(corrected, original)
-    before, after = flat_noise(original), flat_noise(corrected)
-    if before == 0.0:
-        raise InvalidInputError("the original has no noise in this part; choose a flat part of a photo")
-    return after / before
-
-
-def flat_noise(plane: NDArray[np.floating]) -> float:
-    """Standard deviation over a flat part after its best fitting paraboloid is taken off."""
-    if plane.ndim != 2 or min(plane.shape) < 8:
-        raise InvalidInputError(f"a flat part has at least 8 x 8 pixels, got {plane.shape}")
-    rows, cols = (np.linspace(-1.0, 1.0, n) for n in plane.shape)
-    y, x = np.meshgrid(rows, cols, indexing="ij")
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
-    values = np.asarray(plane, dtype=np.float64).ravel()
-    fit, *_ = np.linalg.lstsq(terms, values, rcond=None)
-    residual = values - terms @ fit
-    return float(np.sqrt(np.square(residual).sum() / (values.size - 6)))
 
 
 def _same_shape(image: NDArray[np.floating], reference: NDArray[np.floating]) -> None:

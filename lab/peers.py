@@ -10,7 +10,7 @@ import resource
 import shutil
 import struct
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -18,11 +18,8 @@ from typing import Final
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from skimage import restoration
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import gaussian
-from lensmodel.core.types import Planes
 from lensmodel.photo.dng import write_bayer_dng
 
 _LIMIT_S: Final = 1800  # seconds that a program may take (chosen): one that hangs must end
@@ -208,19 +205,3 @@ PEERS: Final[tuple[Peer, ...]] = (
     ),
 )
 """Each at the settings that are tried, and at the one that is timed."""
-
-
-def skimage_results(seen: Planes, widths: Sequence[float] = (0.7, 1.0, 1.5)) -> dict[str, list[Planes]]:
-    """Pictures of scikit-image's Richardson-Lucy and Wiener with one Gaussian, for several settings."""
-    light = np.clip(seen, 1e-4, 1.0)
-    kernels = [gaussian(15, np.eye(2) * width**2).astype(np.float32) for width in widths]
-    lucy = restoration.richardson_lucy
-    wiener = restoration.wiener
-    return {
-        "scikit-image Richardson-Lucy": [_each(lucy, light, k, steps) for k in kernels for steps in (3, 10)],
-        "scikit-image Wiener": [_each(wiener, light, k, balance) for k in kernels for balance in (0.01, 0.1)],
-    }
-
-
-def _each(method: Callable[..., NDArray[np.floating]], light: Planes, *setting: object) -> Planes:
-    return np.stack([np.clip(method(plane, *setting), 0.0, 1.0) for plane in light]).astype(np.float32)

@@ -40,22 +40,16 @@ class EfficientFilterFlow:
     The windows act on the sharp plane, so each point of the scene keeps one kernel and all of
     its light. Between window centres the kernels are interpolated linearly.
 
-    Parameters
-    ----------
-    height, width : int
-        Size of the frame in pixels.
-    kernels : tuple of tuple of Kernel
-        Grid of kernels, row by row, all of one side; `kernels[i][j]` belongs to the centre of
-        window (i, j) of an even partition of the frame.
-
     References
     ----------
     .. [1] M. Hirsch, S. Sra, B. Schölkopf, S. Harmeling, "Efficient filter flow for
        space-variant multiframe blind deconvolution", CVPR 2010.
     """
 
-    height: int
+    height: int  # size of the frame in pixels
     width: int
+    # grid of kernels, row by row, all of one side; `kernels[i][j]` belongs to the centre of window (i, j) of
+    # an even partition of the frame
     kernels: tuple[tuple[Kernel, ...], ...]
 
     def __post_init__(self) -> None:

@@ -16,11 +16,6 @@ def bartlett_hann(length: int) -> NDArray[np.float64]:
         w(s) = 0.62 - 0.48 |s - 1/2| - 0.38 cos(2 pi s),    w(s) + w(s + 1/2) = 1
 
     The symmetric variant with both end points does not sum to one.
-
-    Raises
-    ------
-    InvalidInputError
-        If `length` is odd or below 2: half an overlap must be whole pixels.
     """
     if length < 2 or length % 2:
         raise InvalidInputError(f"a window that overlaps by half needs an even length >= 2, got {length}")

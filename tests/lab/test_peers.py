@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lab import peers
-from lab.peers import PEERS, Peer, read_picture, skimage_results
+from lab.peers import PEERS, Peer, read_picture
 from lab.reproduce import programs
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
@@ -60,18 +60,6 @@ def test_mosaic_for_raw_peers_keeps_each_colour_at_its_place(tmp_path: Path) -> 
 
     numbers = np.frombuffer((tmp_path / "in.dng").read_bytes()[-16 * 16 * 2 :], dtype="<u2")
     assert set(np.unique(numbers)) >= {round(0.25 * 65535), round(0.75 * 65535)}
-
-
-def test_scikit_image_gives_pictures_of_the_same_size() -> None:
-    seen = np.moveaxis(picture(), -1, 0)
-
-    found = skimage_results(seen, widths=(0.7,))
-
-    assert {name: len(pictures) for name, pictures in found.items()} == {
-        "scikit-image Richardson-Lucy": 2,
-        "scikit-image Wiener": 2,
-    }
-    assert all(p.shape == seen.shape for pictures in found.values() for p in pictures)
 
 
 GAINS = (2.0, 1.0, 1.5)

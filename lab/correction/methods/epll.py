@@ -23,21 +23,14 @@ class EpllDeconvolver:
     were that the mixture was fitted to. The judge `lab.blind.judges.Epll` takes a patch in their own light,
     padded by mirror images. Slow: minutes per megapixel.
 
-    Parameters
-    ----------
-    betas : tuple of float
-        Couplings of the steps.
-    stride : int
-        One window in `stride`² is used, on a grid moved each time.
-
     References
     ----------
     .. [1] D. Zoran and Y. Weiss, "From learning models of natural image patches to whole image
        restoration", ICCV 2011, eq. (4) to (6).
     """
 
-    betas: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0)
-    stride: int = 3
+    betas: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0)  # couplings of the steps
+    stride: int = 3  # one window in `stride`² is used, on a grid moved each time
 
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step

@@ -29,24 +29,6 @@ def half_quadratic(
 
         X = (data + beta T(x)) / (power + beta C + floor)
 
-    Parameters
-    ----------
-    y : ndarray, shape (rows, cols)
-        The blurred grid, where x begins; x keeps its type.
-    data, power : ndarray, shape (rows, cols // 2 + 1)
-        conj(K) Y and |K|², both over the variance of the noise.
-    couplings : sequence of float
-        beta of each turn.
-    target : callable
-        From x and the number of the turn the spectrum T of what the prior makes of x, or of its gradients
-        led back by the transposed differences.
-    on_step : callable
-        Called after each turn.
-    curvature : ndarray or float
-        C: 1 where the prior answers with a picture, |D|² summed over the differences D where with gradients.
-    floor : float
-        Keeps the quotient finite where neither the data nor the prior says anything.
-
     Returns
     -------
     ndarray, shape (rows, cols)

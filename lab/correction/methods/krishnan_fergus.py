@@ -23,18 +23,13 @@ class KrishnanFergus:
 
     lambda follows the noise: 0.2 / var, which is the published 2000 at one percent.
 
-    Parameters
-    ----------
-    alpha : float
-        Exponent of the prior.
-
     References
     ----------
     .. [1] D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors",
        NIPS 2009, algorithm 1.
     """
 
-    alpha: float = 2.0 / 3.0
+    alpha: float = 2.0 / 3.0  # exponent of the prior
 
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step

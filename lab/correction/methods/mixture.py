@@ -21,20 +21,11 @@ _SHIPPED = Path(__file__).parents[2] / "data" / "epll.npz"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchMixture:
-    """Gaussian mixture over small zero-mean windows of sharp linear light.
+    """Gaussian mixture over small zero-mean windows of sharp linear light."""
 
-    Parameters
-    ----------
-    log_weights : ndarray of float32, shape (m,)
-    vectors : ndarray of float32, shape (m, d, d)
-        Eigenvectors in columns.
-    values : ndarray of float32, shape (m, d)
-        Eigenvalues.
-    """
-
-    log_weights: NDArray[np.float32]
-    vectors: NDArray[np.float32]
-    values: NDArray[np.float32]
+    log_weights: NDArray[np.float32]  # (m,)
+    vectors: NDArray[np.float32]  # (m, d, d), eigenvectors in columns
+    values: NDArray[np.float32]  # (m, d), eigenvalues
 
     @classmethod
     def load(cls, path: Path = _SHIPPED) -> PatchMixture:
@@ -114,20 +105,6 @@ class PatchMixture:
         For growing beta: clean all windows for noise of variance 1/beta, average them to z, then solve::
 
             (w |K|² + beta) X = w conj(K) Y + beta Z
-
-        Parameters
-        ----------
-        y : ndarray, shape (rows, cols)
-            The grid, a torus.
-        transfer : ndarray, shape (rows, cols // 2 + 1)
-            K.
-        weight : float
-            w, one over the variance of the noise.
-        betas : sequence of float
-            Couplings of the steps.
-        step : int
-            One window in `step`² is used, on a grid moved each time.
-        on_step : callable
 
         References
         ----------

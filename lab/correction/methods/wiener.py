@@ -19,14 +19,9 @@ class Wiener:
     """Linear minimum-mean-square-error filter for a natural image in white noise.
 
     See `wiener_spectrum`.
-
-    Parameters
-    ----------
-    caution : float
-        Factor on the noise variance; above 1 the result is smoother.
     """
 
-    caution: float = 1.0
+    caution: float = 1.0  # factor on the noise variance; above 1 the result is smoother
 
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 from app.runtime.settings import Settings
-from lensmodel.workflow.sampling import KERNEL_PATCHES, WAYS, Way
+from lensmodel.workflow.sampling import KERNEL_PATCHES, PRESETS, Preset
 
 
-def configured_way(settings: Settings, name: str) -> Way:
+def configured_way(settings: Settings, name: str) -> Preset:
     """Return estimator, kernel size, patches, model mode and correction method of a model.
 
     The settings of the service choose estimator and kernel size of the model `default`, and the patches of
     both.
     """
-    way = WAYS[name]
+    way = PRESETS[name]
     if name == "default":
         own = settings.estimator != way.estimator
         way = replace(

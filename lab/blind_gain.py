@@ -96,7 +96,7 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[
         path = folder / f"{lens.number}-{number}.dng"
         lens.shot(number, path)
         try:
-            samples.append(sampling.samples_of_photo(path, sampling.Recipe(lens.settings), workers=1))
+            samples.append(sampling.samples_of_photo(path, sampling.Config(lens.settings), workers=1))
         except NotEnoughEvidenceError:
             samples.append([])
     truth = lens.shot(max(counts), folder / "last.dng")

@@ -10,11 +10,11 @@
 The public names are those of `__all__`; each is imported when it is first used, so that importing the
 package costs nothing. docs/library.md shows them at work.
 
-Patches of photos become samples of a PSF in `estimation`, these a function of place and settings in `model`,
-both by the network of `neural`, and that is applied in `correction`; `workflow` joins the three. Photos come
-in and go out through `photo`; `quality` judges, `report` describes, `simulate` makes photos whose truth is
-known, `core` has what all share, `cli` is the command, `lab` measures it all. CONTRIBUTING.md says
-where a method is added.
+`patches` chooses patches of photos, `blind` and `measured` make samples of a PSF of them, `model` makes these
+a function of place and settings, both by the network of `neural`, and `correction` applies that; `workflow`
+joins them, and `api` has its verbs. Photos come in and go out through `photo`; `quality` judges, `report`
+describes, `simulate` makes photos whose truth is known, `core` has what all share, and `cli` is the command.
+CONTRIBUTING.md says where a method is added.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from lensmodel.api import calibrate, correct
     from lensmodel.blind import PsfEstimate, PsfEstimator, estimators
     from lensmodel.core.errors import CancelledError, LensModelError
     from lensmodel.core.psf import PsfSample
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.arrays import photo_from_array
-    from lensmodel.workflow.api import calibrate, correct
     from lensmodel.workflow.lens import Lens, field_grid
     from lensmodel.workflow.sampling import CalibrationEvent
 
@@ -67,7 +67,7 @@ __all__ = [
 ]
 
 _HOMES: Final = {
-    "lensmodel.workflow.api": ("calibrate", "correct"),
+    "lensmodel.api": ("calibrate", "correct"),
     "lensmodel.photo.arrays": ("photo_from_array",),
     "lensmodel.blind": ("PsfEstimate", "PsfEstimator", "estimators"),
     "lensmodel.patches": ("Selector", "selectors"),

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.progress import Progress, TaskID
 
+from lensmodel.api import FORMATS
 from lensmodel.cli import correction, files
 from lensmodel.cli.console import Display, gain_words
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS
-from lensmodel.workflow.api import FORMATS
 
 if TYPE_CHECKING:
     from app.client import Client

@@ -21,7 +21,7 @@ from app.store.access.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.workflow.sampling import WAYS
+from lensmodel.workflow.sampling import PRESETS
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Fitted:
     @property
     def way(self) -> PsfModel:
         """The way of the answers."""
-        return "paper" if self.model.settings.mode == WAYS["paper"].mode else "default"
+        return "paper" if self.model.settings.mode == PRESETS["paper"].mode else "default"
 
 
 class ModelCache:
@@ -127,7 +127,7 @@ def _fit(lens_id: str, state: LensState, samples: list[StoredSample]) -> Fitted:
             f"lens {lens_id} has no samples yet (version {state.version}): "
             "upload photos taken with it and wait until they are counted"
         )
-    settings = ModelSettings(mode=WAYS[state.way].mode)
+    settings = ModelSettings(mode=PRESETS[state.way].mode)
     return Fitted(lens_id, state, LensModel.fit([stored.sample for stored in samples], settings))
 
 

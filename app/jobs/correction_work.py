@@ -31,7 +31,7 @@ from app.store.tables import LensRow
 from app.store.versions import report_key
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.correction import Bounds
-from lensmodel.workflow.sampling import WAYS
+from lensmodel.workflow.sampling import PRESETS
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class CorrectionWork:
         with self._context.sandbox.folder() as folder:
             lens_id, version = plan.lens.public_id, plan.correction.lens_version
             state = self._samples(lens_id, version, folder)
-            arguments["mode"] = WAYS[state.way].mode
+            arguments["mode"] = PRESETS[state.way].mode
             done = self._context.attempt(
                 "correct",
                 arguments,
@@ -177,7 +177,7 @@ class CorrectionWork:
         try:
             with self._context.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                mode = WAYS[state.way].mode
+                mode = PRESETS[state.way].mode
                 metrics = self._context.attempt(
                     "measure",
                     {"mode": mode},

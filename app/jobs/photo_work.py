@@ -34,7 +34,7 @@ from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
 from lensmodel.workflow import sampling
-from lensmodel.workflow.sampling import Way
+from lensmodel.workflow.sampling import Preset
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ class _Steps:
         self._developed = Path()
 
     @property
-    def _way(self) -> Way:
+    def _way(self) -> Preset:
         return configured_way(self._context.settings, self._photo.way)
 
     def _wanted(self) -> bool:

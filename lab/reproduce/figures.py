@@ -96,10 +96,10 @@ def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int) -> dict[st
     with TemporaryDirectory(prefix="lensmodel-figure-") as work:
         shots = take(case, plan.files(), Path(work), first=1)
         developed = develop(shots.learn[0])
-        recipe = sampling.Recipe(estimator=plan.estimator)
-        chosen = sampling.find_patches(developed, count=recipe.patches, estimator=recipe.method)
+        config = sampling.Config(estimator=plan.estimator)
+        chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method)
         try:
-            samples = sampling.samples_of_photo(shots.learn[0], recipe, workers=workers)
+            samples = sampling.samples_of_photo(shots.learn[0], config, workers=workers)
         except LensModelError as error:
             return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]

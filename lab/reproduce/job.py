@@ -42,14 +42,14 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality.images import as_shown
-from lensmodel.workflow.sampling import WAYS, Way
+from lensmodel.workflow.sampling import PRESETS, Preset
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)
 CONTROL: Final = "standard"
 """Method whose denoising alone is the control."""
 
 _ALONE: Final = ("truth", "measured", "general")
-NewLearner: TypeAlias = Callable[[Path, Way, int], Learner]
+NewLearner: TypeAlias = Callable[[Path, Preset, int], Learner]
 """From a folder that keeps what was learned, the way of learning, and a number of processes."""
 
 
@@ -188,7 +188,7 @@ class CaseJob:
             shots = take(case, self.plan.files(), self.work / "photos", workers=self.workers)
         makers: dict[str, Callable[[str], Unit]] = {}
         if not complete:
-            own, paper = WAYS["default"], paper_way(case)
+            own, paper = PRESETS["default"], paper_way(case)
             own = replace(own, estimator=self.plan.estimator)
             makers = {
                 "truth": lambda _: self._truth(shots),
@@ -228,7 +228,7 @@ class CaseJob:
             **units,
         }
 
-    def _learning(self, name: str, way: Way) -> _Learning:
+    def _learning(self, name: str, way: Preset) -> _Learning:
         return _Learning(partial(self.learner, self.work / name, way, self.workers))
 
     def _truth(self, shots: Shots) -> Unit:
@@ -320,7 +320,7 @@ class CaseJob:
     def _learned(self, learning: _Learning, shots: Shots, number: str, *, own_way: bool) -> Unit:
         """What is known after so many photos, and what corrections with it come to."""
         case, n = self.case, int(number)
-        methods = (WAYS["paper"].method,) if own_way else self.methods
+        methods = (PRESETS["paper"].method,) if own_way else self.methods
         label = f"way-paper-n{n}" if own_way else f"n{n}"
         learner, refused, seconds = learning.of(shots.learn[:n])
         unit: Unit = {

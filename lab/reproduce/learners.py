@@ -18,7 +18,7 @@ from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile,
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.lateral import LateralColour, resample
 from lensmodel.workflow import correcting, sampling
-from lensmodel.workflow.sampling import WAYS, Way
+from lensmodel.workflow.sampling import PRESETS, Preset
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
 
@@ -62,11 +62,11 @@ class Learner(Protocol):
         """Correct a photo that takes no part in learning, with what is known now."""
 
 
-def paper_way(case: Case) -> Way:
+def paper_way(case: Case) -> Preset:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
-        return WAYS["paper"]
-    return replace(WAYS["paper"], kernel_size=sampling.DEFAULT_KERNEL_SIZE)
+        return PRESETS["paper"]
+    return replace(PRESETS["paper"], kernel_size=sampling.DEFAULT_KERNEL_SIZE)
 
 
 class LibraryLearner:
@@ -76,13 +76,13 @@ class LibraryLearner:
     ----------
     folder : Path
         Where models are kept between runs.
-    way : Way
+    way : Preset
         How the lens is learned.
     workers : int
         Processes.
     """
 
-    def __init__(self, folder: Path, way: Way, workers: int) -> None:
+    def __init__(self, folder: Path, way: Preset, workers: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._way, self._workers = folder, way, workers
         self._seen: dict[str, str] = {}
@@ -109,7 +109,7 @@ class LibraryLearner:
                 samples = tuple(
                     sampling.samples_of_photo(
                         photo,
-                        sampling.Recipe(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
+                        sampling.Config(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
                         workers=self._workers,
                     )
                 )

@@ -330,12 +330,12 @@ class PatchRecurrence:
 
     def _solved(self, parts: Sequence[Part], views: Sequence[_Scaled], begin: NDArray[np.float64]) -> Kernel:
         """Kernel of the normal equations of all patches together."""
-        votes = [1.0 / max(view.noise**2, 1e-6) for view in views]
-        a = np.asarray(sum(vote * part[0] for vote, part in zip(votes, parts, strict=True)))
-        b = np.asarray(sum(vote * part[1] for vote, part in zip(votes, parts, strict=True)))
+        weights = [1.0 / max(view.noise**2, 1e-6) for view in views]
+        a = np.asarray(sum(weight * part[0] for weight, part in zip(weights, parts, strict=True)))
+        b = np.asarray(sum(weight * part[1] for weight, part in zip(weights, parts, strict=True)))
         ridge = self.ridge * np.trace(a) / a.shape[0]
         a[np.diag_indices_from(a)] += ridge
-        taken = sum(vote * part[2] for vote, part in zip(votes, parts, strict=True))
+        taken = sum(weight * part[2] for weight, part in zip(weights, parts, strict=True))
         solved = nonnegative_least_squares(a, b, begin.ravel(), smallest=ridge - taken)
         solved[solved < 0.01 * solved.max()] = 0.0
         if not solved.max() > 0:

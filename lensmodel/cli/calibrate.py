@@ -36,7 +36,7 @@ from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.calibrating import AHEAD
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.sampling import WAYS, way_of
+from lensmodel.workflow.sampling import PRESETS, preset_of
 
 Estimator = Annotated[str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}.")]
 Selector = Annotated[
@@ -53,7 +53,7 @@ def calibrate(
         str | None,
         choice(
             "--model",
-            tuple(WAYS),
+            tuple(PRESETS),
             "paper: learn the paper's own way, kernels by Michaeli and Irani and nothing but their "
             "regression, and correct by Richardson-Lucy; to compare with. Kept from then on.",
         ),
@@ -146,7 +146,7 @@ def run(
     paths = files.photos(names)
     _refuse(target, paths)
     with files.as_usage():
-        _recipe(options).check()
+        _config(options).check()
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
@@ -173,7 +173,7 @@ def run(
         "photos": len(lens.profile.photos) if lens else 0,
         "samples": len(lens.samples) if lens else 0,
         "coverage": coverage,
-        "model": way_of(lens.model).name if lens else None,
+        "model": preset_of(lens.model).name if lens else None,
         "results": results,
     }
     if as_json:
@@ -191,12 +191,12 @@ def run(
 
 def calibration_of(target: Path, options: CalibrationOptions, pool: Executor) -> calibrating.Calibration:
     """Return the work on a profile, which may be there already, by the processes of a pool."""
-    keeper = ProfileFile(target, options)
-    return calibrating.Calibration(keeper, _recipe(options), any_lens=options.any_lens, pool=pool)
+    store = ProfileFile(target, options)
+    return calibrating.Calibration(store, _config(options), any_lens=options.any_lens, pool=pool)
 
 
-def _recipe(options: CalibrationOptions) -> sampling.Recipe:
-    return sampling.Recipe(
+def _config(options: CalibrationOptions) -> sampling.Config:
+    return sampling.Config(
         LensSettings(aperture=options.aperture),
         model=options.model,
         estimator=options.estimator,
@@ -229,7 +229,7 @@ def _refuse(target: Path, photos: Sequence[Path]) -> None:
 
 
 class ProfileFile:
-    """The keeper of a lens in a file.
+    """The store of a lens in a file.
 
     Another run may add to the same file meanwhile: the profile is read again whenever the file has
     changed, so that no run drops what another one learned.
@@ -245,7 +245,7 @@ class ProfileFile:
         stamp = _stamp(self._target)
         if stamp not in {None, self._stamp_read}:
             profile = _opened(self._target)
-            learned, asked = way_of(profile.model).name, self._options.model
+            learned, asked = preset_of(profile.model).name, self._options.model
             if asked not in {None, learned}:  # its kernels are the other model's: the two would be mixed
                 raise InvalidInputError(
                     f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "

@@ -14,6 +14,7 @@ from rich.progress import Progress, TaskID
 
 import lensmodel
 from lensmodel import correction
+from lensmodel.api import FORMATS
 from lensmodel.cli import files
 from lensmodel.cli.console import Display, gain_words, mtf50_words
 from lensmodel.cli.ending import UsageError
@@ -22,7 +23,6 @@ from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.endings import CORRECTED
-from lensmodel.workflow.api import FORMATS
 from lensmodel.workflow.calibrating import Identity, difference
 from lensmodel.workflow.lens import Lens
 

@@ -258,7 +258,7 @@ class PsfSample:
     settings : LensSettings
         Aperture, focal length, focus distance and channel of the photo.
     weight : float
-        Confidence in 0..1; scales this sample's vote.
+        Confidence in 0..1; scales its part in answers.
     photo : str
         Which photo it came from: samples of one photo share its faults.
     pixel_pitch_um : float or None

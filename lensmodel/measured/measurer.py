@@ -84,7 +84,7 @@ def samples_of(
 ) -> list[PsfSample]:
     """Make samples of measurements, as a `LensModel` takes them.
 
-    The estimator is called `measured-NAME/VERSION`; the vote is full, the error is the measurement's own.
+    The estimator is called `measured-NAME/VERSION`; the weight is 1, the error is the measurement's own.
     """
     return [
         PsfSample(

@@ -150,8 +150,8 @@ def _cell_psf(
     error = float(np.hypot(solved.error, FLOOR))
     if error >= _SURE:
         return None
-    votes = np.array([stamp.flux for stamp in stamps])
-    middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=votes)
+    weights = np.array([stamp.flux for stamp in stamps])
+    middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
     pixel = float(middle[0]), float(middle[1])
     return MeasuredPsf(centred(solved.kernel), photo.frame.position(*pixel), channel, error, pixel, size)
 

@@ -314,8 +314,8 @@ def cross_validate(
     """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
     rule = va.bandwidths(where)
     names, photo = np.unique([s.photo for s in samples], return_inverse=True)
-    voting = np.flatnonzero(base > 0)
-    several = len(np.unique(photo[voting])) >= 2
+    counting = np.flatnonzero(base > 0)
+    several = len(np.unique(photo[counting])) >= 2
     groups = held_together(samples, photo)
 
     def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
@@ -324,9 +324,9 @@ def cross_validate(
         flat = kernels.reshape(len(rows), -1)
         return HeldOut.of(flat, kernels.shape[1], where[rows], scale, weights[rows], groups[rows])
 
-    green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
+    green = counting[where[counting, 4] == _judging_channel(where[counting, 4])]
     choice = Choice(mirror=settings.mirror or 0.0)
-    automatic = settings.mode != PAPER and len(np.unique(photo[voting])) >= _CV_PHOTOS
+    automatic = settings.mode != PAPER and len(np.unique(photo[counting])) >= _CV_PHOTOS
 
     def chosen(weights: NDArray[np.float64]) -> Choice:
         if not automatic:
@@ -339,7 +339,7 @@ def cross_validate(
         )
         return factors if settings.mirror is None else replace(factors, mirror=settings.mirror)
 
-    scored = _thinned(voting, _SCORED)
+    scored = _thinned(counting, _SCORED)
     weights, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
     noise = np.zeros(len(samples))
     if len(scored) < _FEWEST:

@@ -4,16 +4,14 @@ A centred lens blurs alike all around its axis. Two signs of a fault in one copy
 themselves, not in the smoothed field, so that their errors are known:
 
 * one side is softer. The log of the width w of a sample (root mean square, pixels) is fitted by a part that
-is alike
-  all around and a slope over the field h = r (cos phi, sin phi)::
+  is alike all around and a slope over the field h = r (cos phi, sin phi)::
 
       ln w = a + b r^2 + c r^4 + g.h
 
   g points to the softer side; w at the edge r there is exp(2 |g| r) times that of the opposite side.
 * coma where there should be none. The third moment of a kernel, m = <|x|^2 x> / w^3, grows from zero with
-the field
-  in a centred lens; a part that is the same in the whole middle of the picture is the sign of a shifted
-  element (K. P. Thompson, JOSA A 22, 2005, eq. 11)::
+  the field in a centred lens; a part that is the same in the whole middle of the picture is the sign of a
+  shifted element (K. P. Thompson, JOSA A 22, 2005, eq. 11)::
 
       m = m0 + k h        for r < 0.5
 

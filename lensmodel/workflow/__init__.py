@@ -1,5 +1,5 @@
 """The parts at work together: photos to samples to a lens, a lens and a photo to a corrected one.
 
-`lensmodel.calibrate` and `lensmodel.correct` live here. The folder of the third step is called `correction`
-because a module `lensmodel.correct` would hide the function of that name.
+The folder of the third step is called `correction` because a module `lensmodel.correct` would hide the
+function of that name.
 """

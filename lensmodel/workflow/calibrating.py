@@ -22,8 +22,8 @@ from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.endings import CORRECTED
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
+    Config,
     EventHook,
-    Recipe,
     ignore_event,
     photo_id,
     require_aperture,
@@ -124,7 +124,7 @@ def _lens_words(lens: Mapping[str, str]) -> str:
     return " ".join(lens[name] for name in ("model", "serial") if lens.get(name))
 
 
-class LensKeeper(Protocol):
+class LensStore(Protocol):
     """Where a lens is kept while it learns: in memory, or in a file that other runs may add to."""
 
     def lens(self) -> Lens | None:
@@ -135,7 +135,7 @@ class LensKeeper(Protocol):
 
 
 class InMemory:
-    """The keeper of a single run, which forgets the lens with it."""
+    """The store of a single run, which forgets the lens with it."""
 
     def __init__(self, lens: Lens | None) -> None:
         self._lens = lens
@@ -163,9 +163,9 @@ class Calibration:
 
     Parameters
     ----------
-    keeper : LensKeeper
+    store : LensStore
         Keeps the lens after each photo.
-    recipe : Recipe
+    config : Config
         How each is estimated.
     begin : ModelSettings, optional
         Choices of the regression of a new lens; a known one keeps its own.
@@ -178,28 +178,28 @@ class Calibration:
     Raises
     ------
     UnknownMethodError, InvalidInputError
-        If the recipe cannot be followed.
+        If the config asks for what there is not.
     """
 
     def __init__(
         self,
-        keeper: LensKeeper,
-        recipe: Recipe,
+        store: LensStore,
+        config: Config,
         *,
         begin: ModelSettings | None = None,
         any_lens: bool = False,
         pool: Executor | None = None,
         workers: int | None = None,
     ) -> None:
-        self._keeper, self._recipe = keeper, recipe
-        self._begin = begin or ModelSettings(mode=recipe.way.mode)
+        self._store, self._config = store, config
+        self._begin = begin or ModelSettings(mode=config.preset.mode)
         self._any_lens, self._pool, self._workers = any_lens, pool, workers
-        recipe.of_lens(self.known).check()
+        config.of_lens(self.known).check()
 
     @property
     def known(self) -> Lens | None:
         """The lens as it is now, with what other runs added; None where no photo could be used."""
-        return self._keeper.lens()
+        return self._store.lens()
 
     def learn(
         self,
@@ -234,7 +234,7 @@ class Calibration:
                     return None
                 require_original(path)
                 orders[path] = key, self._admitted(photo.inspect(path).metadata)
-                return path.name, path.read_bytes(), self._recipe.of_lens(self.known), key
+                return path.name, path.read_bytes(), self._config.of_lens(self.known), key
             except (LensModelError, OSError):
                 return None
 
@@ -262,7 +262,7 @@ class Calibration:
         identities: list[Identity] = []
         samples = samples_of_photo(
             path,
-            self._recipe.of_lens(self.known),
+            self._config.of_lens(self.known),
             key=key,
             admit=lambda metadata: identities.append(self._admitted(metadata)),
             executor=self._pool,
@@ -278,7 +278,7 @@ class Calibration:
         lens = self.known
         self._require_same_lens(lens, identity)
         model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
-        self._keeper.keep(grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens))
+        self._store.keep(grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens))
         return len(samples)
 
     def _knows(self, key: str) -> bool:
@@ -291,7 +291,7 @@ class Calibration:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
         identity = Identity.of(metadata)
         self._require_same_lens(self.known, identity)
-        require_aperture(metadata, self._recipe.settings)
+        require_aperture(metadata, self._config.settings)
         return identity
 
     def _require_same_lens(self, lens: Lens | None, identity: Identity) -> None:

@@ -17,7 +17,7 @@ from lensmodel.model.bodies import ALIKE, circle_mm
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.photo.values import remarks_log
-from lensmodel.workflow.sampling import estimate_cell, find_patches, way_of
+from lensmodel.workflow.sampling import estimate_cell, find_patches, preset_of
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ def _way(
     model: LensModel, method: str | correction.Deconvolver | None
 ) -> tuple[str | correction.Deconvolver, bool]:
     """Which method is wanted, and whether all is done the paper's way and nothing else."""
-    wanted = way_of(model).method if method is None else method
+    wanted = preset_of(model).method if method is None else method
     return wanted, model.mode == PAPER and wanted == PAPER
 
 
@@ -120,16 +120,16 @@ def _own_samples(
     """Samples of a photo, unless the model has them already or the photo shows too little."""
     if photo and any(sample.photo == photo and sample.encoded is not None for sample in model.samples):
         return []
-    way = way_of(model)
+    preset = preset_of(model)
     try:
-        chosen = find_patches(developed, count=way.patches, estimator=way.estimator).patches
+        chosen = find_patches(developed, count=preset.patches, estimator=preset.estimator).patches
         made = estimate_cell(
             developed,
             chosen,
             settings=settings,
             photo_id=photo,
-            estimator=way.estimator,
-            size=way.kernel_size,
+            estimator=preset.estimator,
+            size=preset.kernel_size,
         )
     except (NoUsablePatchesError, NotEnoughEvidenceError) as error:
         log.info("the photo adds nothing to what is known of its lens: %s", error)

@@ -75,7 +75,7 @@ class Lens:
         channel : {"r", "g", "b"} or sequence of them
             Color of each, or of all.
         weight : array_like of float, shape (n,) or ()
-            Confidence 0..1, which scales the vote of a kernel.
+            Confidence 0..1, which scales its part in answers.
         photo : str or sequence of str
             What each was measured on: kernels of one photo share its faults.
         pixel_pitch_um : float, optional
@@ -107,12 +107,12 @@ class Lens:
                 centred(kernel),
                 FieldPosition(*place),
                 LensSettings(f_number, channel=color),
-                weight=vote,
+                weight=sure,
                 photo=name,
                 pixel_pitch_um=pixel_pitch_um,
                 estimator="given",
             )
-            for kernel, place, f_number, color, vote, name in zip(
+            for kernel, place, f_number, color, sure, name in zip(
                 stack,
                 places,
                 apertures,

@@ -3,7 +3,7 @@
 inspect -> develop -> choose patches -> estimate each cell of them -> samples
 
 Each step is a plain function on values, so that a script, the command and the workers of the service run the
-same code. `Way` says which parts are taken where nobody asks for others, `Recipe` what somebody asked for.
+same code. `Preset` says which parts are taken where nobody asks for others, `Config` what somebody asked for.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ KERNEL_PATCHES: Final = 24
 while each costs a second."""
 
 
-# --- which way ------------------------------------------------------------------------------
+# --- which parts --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class Preset:
     """What is taken where nobody asks for something else."""
 
     name: str  # what users call it
@@ -71,10 +71,10 @@ class Way:
     method: str  # of `deconvolvers`
 
 
-WAYS: Final[Mapping[str, Way]] = MappingProxyType(
+PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
-        "default": Way("default", "default", 55, 96, DEFAULT, "standard"),
-        "paper": Way("paper", "michaeli-irani", 55, KERNEL_PATCHES, PAPER, "paper"),
+        "default": Preset("default", "default", 55, 96, DEFAULT, "standard"),
+        "paper": Preset("paper", "michaeli-irani", 55, KERNEL_PATCHES, PAPER, "paper"),
     }
 )
 """`default` encodes patches of whole photos and attends to them. `paper` is that of M. Hirsch and
@@ -83,67 +83,67 @@ by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and Richardson-Lu
 what guards photos from errors of any of them."""
 
 
-def way_named(name: str) -> Way:
-    """Return a way."""
-    if name not in WAYS:
-        raise UnknownMethodError(f"no model {name!r}; known: {', '.join(WAYS)}")
-    return WAYS[name]
+def preset_named(name: str) -> Preset:
+    """Return a preset."""
+    if name not in PRESETS:
+        raise UnknownMethodError(f"no model {name!r}; known: {', '.join(PRESETS)}")
+    return PRESETS[name]
 
 
-def way_of(model: LensModel) -> Way:
-    """Return the way that a lens was learned."""
-    return WAYS["paper" if model.settings.mode == PAPER else "default"]
+def preset_of(model: LensModel) -> Preset:
+    """Return the preset by which a lens was learned."""
+    return PRESETS["paper" if model.settings.mode == PAPER else "default"]
 
 
-def chosen_way(name: str | None, model: LensModel | None) -> Way:
-    """Return the way to learn a lens: as asked for, else that of its model, else the usual one."""
-    return way_of(model) if name is None and model is not None else way_named(name or "default")
+def chosen_preset(name: str | None, model: LensModel | None) -> Preset:
+    """Return the preset to learn a lens by: as asked for, else that of its model, else the usual one."""
+    return preset_of(model) if name is None and model is not None else preset_named(name or "default")
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
-    """How the samples of a photo are made; what is None is as the lens is learned (`ways`)."""
+class Config:
+    """How the samples of a photo are made; what is None is as the lens is learned (its preset)."""
 
     # values for photos that do not say their own (`settings_of`)
     settings: LensSettings = field(default_factory=LensSettings)
-    model: str | None = None  # name of a way; None is that of the lens, of a new one the usual
+    model: str | None = None  # name of a preset; None is that of the lens, of a new one the usual
     estimator: str | blind.PsfEstimator | None = None  # name in `estimators`, or an object of one's own
     kernel_size: int | None = None  # odd side of the kernels in pixels
     selector: str | patches.Selector = "r-map"  # name in `selectors`, or an object of one's own
     count: int | None = None  # patches asked for
 
-    def of_lens(self, lens: Lens | None) -> Recipe:
+    def of_lens(self, lens: Lens | None) -> Config:
         """Return it as it holds for a lens."""
-        return replace(self, model=chosen_way(self.model, None if lens is None else lens.model).name)
+        return replace(self, model=chosen_preset(self.model, None if lens is None else lens.model).name)
 
     @property
-    def way(self) -> Way:
-        """The way it follows where it says nothing else."""
-        return way_named(self.model or "default")
+    def preset(self) -> Preset:
+        """What it follows where it says nothing else."""
+        return preset_named(self.model or "default")
 
     @property
     def method(self) -> str | blind.PsfEstimator:
         """The estimator that it takes."""
-        return self.way.estimator if self.estimator is None else self.estimator
+        return self.preset.estimator if self.estimator is None else self.estimator
 
     @property
     def size(self) -> int:
         """The side of its kernels in pixels."""
         if self.kernel_size is not None:
             return self.kernel_size
-        return DEFAULT_KERNEL_SIZE if self._of_own_kernels else self.way.kernel_size
+        return DEFAULT_KERNEL_SIZE if self._of_own_kernels else self.preset.kernel_size
 
     @property
     def patches(self) -> int:
         """How many patches of a photo it looks at."""
         if self.count is not None:
             return self.count
-        return KERNEL_PATCHES if self._of_own_kernels else self.way.patches
+        return KERNEL_PATCHES if self._of_own_kernels else self.preset.patches
 
     @property
     def _of_own_kernels(self) -> bool:
         """Whether an estimator of kernels takes the place of one that reads whole photos."""
-        own = blind.estimators.resolve(self.way.estimator)
+        own = blind.estimators.resolve(self.preset.estimator)
         return isinstance(own, blind.PhotoEstimator) and not isinstance(
             blind.estimators.resolve(self.method), blind.PhotoEstimator
         )
@@ -384,7 +384,7 @@ def ignore_event(event: CalibrationEvent) -> None:
 
 def samples_of_photo(
     path: Path,
-    recipe: Recipe | None = None,
+    config: Config | None = None,
     *,
     key: str = "",
     admit: Callable[[PhotoMetadata], None] | None = None,
@@ -397,7 +397,7 @@ def samples_of_photo(
     Parameters
     ----------
     path : Path
-    recipe : Recipe, optional
+    config : Config, optional
     key : str
         What samples call the photo (`photo_id`); found out if empty.
     admit : callable, optional
@@ -407,23 +407,23 @@ def samples_of_photo(
         default), for this photo alone. The result does not depend on it.
     on_event : callable
     """
-    recipe = recipe or Recipe()
-    recipe.check()
+    config = config or Config()
+    config.check()
 
     def admitted(info: photo.PhotoInfo) -> None:
-        require_aperture(info.metadata, recipe.settings)
+        require_aperture(info.metadata, config.settings)
         if admit is not None:
             admit(info.metadata)
         on_event(CalibrationEvent(path, "developing"))
 
     developed = photo.develop(path, on_info=admitted)
     on_event(CalibrationEvent(path, "selecting"))
-    method = blind.estimators.resolve(recipe.method)
-    selection = find_patches(developed, count=recipe.patches, selector=recipe.selector, estimator=method)
+    method = blind.estimators.resolve(config.method)
+    selection = find_patches(developed, count=config.patches, selector=config.selector, estimator=method)
     groups = patches_by_cell(selection)
     total, done = len(selection.patches), 0
     on_event(CalibrationEvent(path, "estimating", done, total))
-    order = (settings_of(developed, recipe.settings), key or photo_id(path), method, recipe.size)
+    order = (settings_of(developed, config.settings), key or photo_id(path), method, config.size)
     by_cell: dict[int, list[CellSample]] = {}
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         alone = len(groups) == 1
@@ -451,7 +451,7 @@ def samples_of_photo(
             f"none of the {total} patches of {path.name} determines a PSF; "
             "use a photo with more fine detail in focus"
         )
-    require_spread([cell.patch for cell in made if cell.channel == "g"], count=recipe.patches)
+    require_spread([cell.patch for cell in made if cell.channel == "g"], count=config.patches)
     return [cell.sample for cell in made]
 
 
@@ -467,9 +467,9 @@ def _cell_of(
     return estimate_cell(developed, group, settings=settings, photo_id=key, estimator=estimator, size=size)
 
 
-def samples_of_bytes(name: str, data: bytes, recipe: Recipe, key: str = "") -> list[PsfSample]:
+def samples_of_bytes(name: str, data: bytes, config: Config, key: str = "") -> list[PsfSample]:
     """Do as `samples_of_photo` in this process alone, with a photo that lies on another machine."""
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(data)
-        return samples_of_photo(path, recipe, key=key, executor=parallel.Here())
+        return samples_of_photo(path, config, key=key, executor=parallel.Here())

@@ -38,7 +38,7 @@ from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.workflow import sampling
-from lensmodel.workflow.sampling import way_of
+from lensmodel.workflow.sampling import preset_of
 
 HERE = Path(__file__).parents[1]
 PROFILE = "my-24mm.lensprofile"
@@ -158,7 +158,7 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learn from two patches of a photo, too few for a wavefront: its fit takes longer than the rest."""
-    monkeypatch.setattr("lensmodel.workflow.sampling.Recipe", partial(sampling.Recipe, count=2))
+    monkeypatch.setattr("lensmodel.workflow.sampling.Config", partial(sampling.Config, count=2))
 
 
 # --- results -----------------------------------------------------------------------------------
@@ -404,7 +404,7 @@ def test_a_picture_of_a_psf_says_what_made_it(folder: Path, suffix: str) -> None
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def estimated(path: Path, recipe: sampling.Recipe, **options: Any) -> list[PsfSample]:
+    def estimated(path: Path, config: sampling.Config, **options: Any) -> list[PsfSample]:
         options["admit"](photo.inspect(path).metadata)
         known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
@@ -700,7 +700,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
         refused = here("calibrate", "one.dng", "-p", profile, "--any-lens", *quick, "--model", asked)
         assert refused.returncode != 0
         assert f"has the model {has}, not {asked}" in refused.stderr
-        assert way_of(load_profile(folder / profile).model).name == has
+        assert preset_of(load_profile(folder / profile).model).name == has
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:

@@ -77,11 +77,11 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
-    recipe = sampling.Recipe(estimator="default", count=4)
-    here = sampling.samples_of_photo(photo, recipe, executor=parallel.Here())
+    config = sampling.Config(estimator="default", count=4)
+    here = sampling.samples_of_photo(photo, config, executor=parallel.Here())
     with ThreadPoolExecutor(2) as threads:
-        beside = sampling.samples_of_photo(photo, recipe, executor=threads)
-    sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), recipe)
+        beside = sampling.samples_of_photo(photo, config, executor=threads)
+    sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), config)
 
     np.testing.assert_array_equal(stacked(beside), stacked(here))
     np.testing.assert_array_equal(stacked(sent), stacked(here))

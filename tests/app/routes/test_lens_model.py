@@ -15,7 +15,7 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.access.owners import ANY_OWNER
 from app.ways import configured_way
-from lensmodel.workflow.sampling import WAYS
+from lensmodel.workflow.sampling import PRESETS
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(3_000)
@@ -102,7 +102,7 @@ def test_the_settings_of_the_service_decide_for_the_default_model_only(settings:
 
     default = configured_way(chosen, "default")
     assert (default.estimator, default.kernel_size) == ("michaeli-irani", 21)
-    assert configured_way(chosen, "paper") == replace(WAYS["paper"], patches=chosen.patches)
+    assert configured_way(chosen, "paper") == replace(PRESETS["paper"], patches=chosen.patches)
 
 
 def test_photos_of_the_paper_are_corrected_its_way_unless_asked_otherwise(

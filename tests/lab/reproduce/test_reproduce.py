@@ -54,7 +54,7 @@ from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, P
 from lensmodel.photo import develop
 from lensmodel.quality.images import as_shown
 from lensmodel.simulate import LENS_KINDS, edge_chart
-from lensmodel.workflow.sampling import Way
+from lensmodel.workflow.sampling import Preset
 
 
 def case(**changes: Any) -> Case:
@@ -808,7 +808,7 @@ def reproduced(
         del words, fresh
         announced.append((done, total))
 
-    def opened(work: Path, way: Way, workers: int) -> Nothing:
+    def opened(work: Path, way: Preset, workers: int) -> Nothing:
         del way, workers
         work.mkdir(parents=True, exist_ok=True)
         return learner
@@ -851,7 +851,7 @@ def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path, quick_phot
     del quick_photos
     opened: list[tuple[str, int]] = []
 
-    def open_one(folder: Path, way: Way, workers: int) -> Nothing:
+    def open_one(folder: Path, way: Preset, workers: int) -> Nothing:
         del workers
         folder.mkdir(parents=True, exist_ok=True)
         opened.append((way.estimator, way.kernel_size))

@@ -40,7 +40,7 @@ def samples_of(name: str) -> list[PsfSample]:
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two files that pass for photos; their samples are made up."""
 
-    def estimated(path: Path, recipe: object, *, key: str, admit: Admit, **_: object) -> list[PsfSample]:
+    def estimated(path: Path, config: object, *, key: str, admit: Admit, **_: object) -> list[PsfSample]:
         admit(photo.PhotoMetadata(aperture=None if path.stem == "unknown" else 2.8))
         return samples_of(key)
 
@@ -64,8 +64,8 @@ class Noting(calibrating.InMemory):
 
 
 def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
-    keeper = Noting()
-    calibration = calibrating.Calibration(keeper, sampling.Recipe())
+    store = Noting()
+    calibration = calibrating.Calibration(store, sampling.Config())
 
     verdicts = list(calibration.learn([*photos, photos[0]]))
     lens = calibration.known
@@ -73,30 +73,30 @@ def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
     assert [verdict.samples for verdict in verdicts] == [9, 9, None]
     assert lens is not None
     assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
-    assert keeper.kept == [9, 18]
+    assert store.kept == [9, 18]
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     key = sampling.photo_id(photos[0])
-    keeper = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
-    calibration = calibrating.Calibration(keeper, sampling.Recipe())
+    store = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
+    calibration = calibrating.Calibration(store, sampling.Config())
 
     assert calibration.add(photos[0]) is None
-    assert calibration.known is keeper.lens()
-    assert keeper.kept == []
+    assert calibration.known is store.lens()
+    assert store.kept == []
 
 
 def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
-    keeper = Noting()
-    calibration = calibrating.Calibration(keeper, sampling.Recipe())
+    store = Noting()
+    calibration = calibrating.Calibration(store, sampling.Config())
     calibration.add(photos[0])
-    kept = keeper.lens()
+    kept = store.lens()
     assert kept is not None
     others = Lens(
         replace(kept.profile, model=LensModel.fit([*kept.samples, *samples_of("x")]), photos={"x": "x.dng"})
     )
 
-    keeper.keep(others)
+    store.keep(others)
     calibration.add(photos[1])
     lens = calibration.known
 
@@ -108,7 +108,7 @@ def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
 def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
     photos: list[Path], tmp_path: Path
 ) -> None:
-    calibration = calibrating.Calibration(Noting(), sampling.Recipe())
+    calibration = calibrating.Calibration(Noting(), sampling.Config())
     for name in ("a-corrected.dng", "unknown.dng"):
         (tmp_path / name).write_bytes(name.encode())
 
@@ -173,7 +173,7 @@ def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(
 def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
     photos: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def cancelled(path: Path, recipe: sampling.Recipe, **options: object) -> list[PsfSample]:
+    def cancelled(path: Path, config: sampling.Config, **options: object) -> list[PsfSample]:
         raise CancelledError("enough")
 
     monkeypatch.setattr(calibrating, "samples_of_photo", cancelled)

@@ -25,12 +25,12 @@ from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
     CalibrationEvent,
+    Config,
     EventHook,
-    Recipe,
     ignore_event,
     photo_id,
+    preset_of,
     settings_of,
-    way_of,
 )
 
 FORMATS: dict[str, photo.OutputFormat] = {
@@ -125,7 +125,7 @@ def calibrate(
         path.stat()
     if lens is not None and model is not None:
         raise InvalidInputError("the lens has a model of its own; give lens or model, not both")
-    recipe = Recipe(
+    config = Config(
         LensSettings(aperture, focal_mm, focus_m),
         model=model if isinstance(model, str) else None,
         estimator=estimator,
@@ -135,8 +135,8 @@ def calibrate(
     )
     begin = None if isinstance(model, str) else model
     reasons = []
-    with processes.pool(None, workers, estimators.resolve(recipe.of_lens(lens).method)) as pool:
-        calibration = Calibration(InMemory(lens), recipe, begin=begin, any_lens=any_lens, pool=pool)
+    with processes.pool(None, workers, estimators.resolve(config.of_lens(lens).method)) as pool:
+        calibration = Calibration(InMemory(lens), config, begin=begin, any_lens=any_lens, pool=pool)
         for verdict in calibration.learn(paths, executor, on_event=on_event):
             path, count = verdict.photo, verdict.samples
             if verdict.error is not None:
@@ -251,7 +251,7 @@ def correct(
         raise InvalidInputError(f"{target} is the photo itself; name another file for the corrected one")
     beside = None if target is None or not sidecar else sidecar_for(target)  # refused before any work
     known = lens if isinstance(lens, Lens) else Lens.load(lens)
-    method = way_of(known.model).method if method is None else method
+    method = preset_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
     developed = (
         image

@@ -16,17 +16,7 @@ from lensmodel.blind import estimators
 from lensmodel.cli import files
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    AnyLens,
-    Aperture,
-    Json,
-    Photos,
-    Profile,
-    Quiet,
-    Verbose,
-    Workers,
-    choice,
-)
+from lensmodel.cli.options import AnyLens, Aperture, Json, Photos, Profile, Quiet, Verbose, Workers, choice
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings

@@ -12,17 +12,7 @@ from lensmodel.cli import correction, folder
 from lensmodel.cli.calibrate import Estimator, Selector
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    AnyLens,
-    Aperture,
-    Force,
-    Json,
-    Photos,
-    Quiet,
-    Verbose,
-    Workers,
-    choice,
-)
+from lensmodel.cli.options import AnyLens, Aperture, Force, Json, Photos, Quiet, Verbose, Workers, choice
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.photo import OutputFormat
 

@@ -89,10 +89,7 @@ EXTRAS: Final = {
 }
 """Modules by extra, as far as commands import them."""
 
-_WHAT: Final = {
-    "service": "the service",
-    "report": "drawing",
-}
+_WHAT: Final = {"service": "the service", "report": "drawing"}
 
 
 def remedy(missing: ModuleNotFoundError) -> str | None:

@@ -55,10 +55,7 @@ class Commands(OnDemand):
             "lensmodel.cli.report:export_psfs",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
         ),
-        "serve": CommandEntry(
-            "app.commands.service:serve",
-            "Run the whole service: the API and a worker.",
-        ),
+        "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
         "api": CommandEntry(
             "app.commands.service:api",
             "Run only the API process, for installations on many machines.",

@@ -11,17 +11,7 @@ import typer
 from lensmodel.cli import files
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    AnyLens,
-    Aperture,
-    Force,
-    Json,
-    Photos,
-    Profile,
-    Quiet,
-    Verbose,
-    choice,
-)
+from lensmodel.cli.options import AnyLens, Aperture, Force, Json, Photos, Profile, Quiet, Verbose, choice
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import save_profile
@@ -50,10 +40,7 @@ class MeasurementOptions:
 
 def measure(
     context: typer.Context,
-    kind: Annotated[
-        str,
-        typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show."),
-    ],
+    kind: Annotated[str, typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show.")],
     photos: Photos,
     profile: Profile,
     aperture: Aperture = None,

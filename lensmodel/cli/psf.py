@@ -71,12 +71,7 @@ def psf(
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     run(
-        profile,
-        PsfQuestion(r, phi, aperture, channel, size),
-        output,
-        shown,
-        force=force,
-        as_json=json_output,
+        profile, PsfQuestion(r, phi, aperture, channel, size), output, shown, force=force, as_json=json_output
     )
 
 

@@ -201,9 +201,7 @@ def export_psfs(
     file_format: Annotated[
         str | None,
         typer.Option(
-            "--format",
-            metavar=f"<{'|'.join(exporters)}>",
-            help="Default: by the ending of the file name.",
+            "--format", metavar=f"<{'|'.join(exporters)}>", help="Default: by the ending of the file name."
         ),
     ] = None,
     aperture: Aperture = None,

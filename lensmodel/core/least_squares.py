@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from collections.abc import Callable
+from typing import Final, TypeAlias
 
 import numpy as np
 import scipy  # its parts are loaded when they are needed
 from numpy.typing import NDArray
+
+_Vector: TypeAlias = NDArray[np.float64]
 
 _LEAST: Final = 1e-6  # of the largest eigenvalue: the least that is left (chosen, far below any noise)
 _FEW: Final = 256  # unknowns up to which all eigenvalues take no longer than the largest and least (chosen)
@@ -24,13 +28,38 @@ def nonnegative_least_squares(
     if not a.any():
         return start.copy()
     largest, lift = _largest_and_lift(a, smallest)
-    step = 1.0 / (largest + lift)
+    return fista(
+        lambda k: _product(a, k) + lift * k - b,
+        start,
+        1.0 / (largest + lift),
+        lambda k: np.maximum(k, 0.0),
+        steps=steps,
+    )
+
+
+def fista(
+    gradient: Callable[[_Vector], _Vector],
+    start: _Vector,
+    step: float,
+    project: Callable[[_Vector], _Vector],
+    *,
+    steps: int,
+    still: float = 0.0,
+) -> _Vector:
+    """Minimise over a convex set by accelerated projected gradients, until no value moves by `still`.
+
+    Source: A. Beck and M. Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging
+    Sciences 2, 2009.
+    """
     k, momentum, t = start.copy(), start.copy(), 1.0
     for _ in range(steps):
-        after = np.maximum(momentum - step * (_product(a, momentum) + lift * momentum - b), 0.0)
-        t_next = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
+        after = project(momentum - step * gradient(momentum))
+        t_next = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
         momentum = after + (t - 1.0) / t_next * (after - k)
+        moved = float(np.abs(after - k).max()) if still else 1.0
         k, t = after, t_next
+        if moved < still:
+            break
     return k
 
 

@@ -165,10 +165,7 @@ def _finer(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     cols = width // 2  # the highest frequency itself is left out: its sign is not known
     whole[:half, :cols] = spectrum[:half, :cols]
     whole[-half + 1 :, :cols] = spectrum[-half + 1 :, :cols]
-    return np.asarray(
-        fft.irfft2(whole, s=(height * DOTS, width * DOTS)) * DOTS**2,
-        dtype=np.float32,
-    )
+    return np.asarray(fft.irfft2(whole, s=(height * DOTS, width * DOTS)) * DOTS**2, dtype=np.float32)
 
 
 PAPERS: Final = {"a2": (594.0, 420.0), "a3": (420.0, 297.0), "a4": (297.0, 210.0)}

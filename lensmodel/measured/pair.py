@@ -268,9 +268,7 @@ def _covariance(power: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     return np.asarray(fft.ifft2(power).real[np.ix_(lags, lags)])
 
 
-def _power_by_frequency(
-    window: NDArray[np.floating],
-) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Mean power of a window by frequency in cycles/pixel; of white noise its variance."""
     side = min(window.shape)
     taper = np.outer(np.hanning(side), np.hanning(side))

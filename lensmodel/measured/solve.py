@@ -60,7 +60,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.least_squares import fista, nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, centroid
 from lensmodel.core.types import CHANNELS, Channel, Kernel
 from lensmodel.photo import LinearPhoto
@@ -270,16 +270,14 @@ def of_sum(
 
     `largest` bounds the eigenvalues of A.
     """
-    step = 1.0 / largest
-    k, momentum, t = start.copy(), start.copy(), 1.0
-    for _ in range(steps):
-        after = _on_simplex(momentum - step * (a @ momentum - b), light)
-        t_next = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
-        momentum = after + (t - 1.0) / t_next * (after - k)
-        if float(np.abs(after - k).max()) < _STILL * light:
-            return after
-        k, t = after, t_next
-    return k
+    return fista(
+        lambda k: a @ k - b,
+        start,
+        1.0 / largest,
+        lambda k: _on_simplex(k, light),
+        steps=steps,
+        still=_STILL * light,
+    )
 
 
 def _on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:

@@ -133,13 +133,7 @@ class Target:
         warp = placed.warp
         for degree in (1, 3, 5, 5):
             warp, _ = matched(
-                warp,
-                partial(_light, placed.page),
-                plane,
-                corners,
-                side,
-                least_clarity=_CLEAR,
-                degree=degree,
+                warp, partial(_light, placed.page), plane, corners, side, least_clarity=_CLEAR, degree=degree
             )
         return replace(placed, warp=warp)
 
@@ -312,12 +306,7 @@ class SolvedWindow:
 
 
 def solve_window(
-    photo: LinearPhoto,
-    placed: PlacedPage,
-    channel: Channel,
-    corner: tuple[int, int],
-    side: int,
-    size: int,
+    photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int, size: int
 ) -> SolvedWindow:
     """Find the light and the kernel of size `size` of a window of the page."""
     light = _light_on(photo, placed, channel, corner, side)

@@ -117,11 +117,7 @@ class LocalKernels:
         return kernels
 
     def _seen(
-        self,
-        answers: Answers,
-        angles: NDArray[np.float64],
-        widths: NDArray[np.float64],
-        mirror: float,
+        self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], mirror: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
         """Maps, weights times determinants, rows and starts; mirrored samples follow their originals."""
         asked = np.repeat(np.arange(len(angles)), answers.counts)

@@ -130,14 +130,19 @@ def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray
     """Hann window, |f|² and the band-sector number of each frequency (-1 outside)."""
     hann = np.hanning(size + 2)[1:-1]
     window = np.outer(hann, hann)
+    radius, number = _band_sectors(size, BAND_EDGES)
+    return window, (2.0 * np.pi * radius) ** 2, number
+
+
+def _band_sectors(size: int, edges: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Radius of each frequency, and the number of its band and sector (-1 outside)."""
     fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
     radius = np.hypot(fr, fc)
-    band = np.searchsorted(BAND_EDGES, radius, side="right") - 1
+    band = np.searchsorted(edges, radius, side="right") - 1
     sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
     # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
-    inside = (band >= 0) & (band < BANDS) & ((fc > 0.0) | (fr > 0.0))
-    number = np.where(inside, band * SECTORS + sector, -1)
-    return window, (2.0 * np.pi * radius) ** 2, number
+    inside = (band >= 0) & (band < len(edges) - 1) & ((fc > 0.0) | (fr > 0.0))
+    return radius, np.where(inside, band * SECTORS + sector, -1)
 
 
 def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,13 +154,8 @@ def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
 @lru_cache(maxsize=4)
 def _evidence_bins(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Number of band and sector of each frequency (-1 outside), and how many frequencies each holds."""
-    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
-    bands = len(EVIDENCE_EDGES) - 1
-    band = np.searchsorted(EVIDENCE_EDGES, np.hypot(fr, fc), side="right") - 1
-    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
-    inside = (band >= 0) & (band < bands) & ((fc > 0.0) | (fr > 0.0))
-    number = np.where(inside, band * SECTORS + sector, -1)
-    return number, np.bincount(number[inside], minlength=bands * SECTORS)
+    _, number = _band_sectors(size, EVIDENCE_EDGES)
+    return number, np.bincount(number[number >= 0], minlength=(len(EVIDENCE_EDGES) - 1) * SECTORS)
 
 
 def _evidence(power: NDArray[np.float64], noise: float) -> float:
@@ -387,10 +387,7 @@ def motion(windows: Windows) -> tuple[float, float]:
     turning = np.stack([square * np.cos(double), -square * np.sin(double)], axis=1)
     ones, zeros = np.ones_like(square), np.zeros_like(square)
     basis = np.concatenate(
-        [
-            np.stack([ones, zeros, turning[:, 0]], axis=1),
-            np.stack([zeros, ones, turning[:, 1]], axis=1),
-        ]
+        [np.stack([ones, zeros, turning[:, 0]], axis=1), np.stack([zeros, ones, turning[:, 1]], axis=1)]
     )
     target = np.concatenate([e[:, 0], e[:, 1]])
     fit = np.linalg.lstsq(basis, target, rcond=None)[0]

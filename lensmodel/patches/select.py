@@ -112,9 +112,7 @@ class RMapSelector:
 
 
 selectors: Registry[Selector] = Registry(
-    "patch selector",
-    {"r-map": RMapSelector, "good-regions": GoodRegionsSelector},
-    "lensmodel.selectors",
+    "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}, "lensmodel.selectors"
 )
 
 

@@ -211,9 +211,7 @@ def _even(value: float, most: int) -> int:
     return min(max(2 * round(value / 2.0), 0), most // 2 * 2)
 
 
-def _blocks(
-    developed: LinearPhoto,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _blocks(developed: LinearPhoto) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Power of the gradients of green, that of its noise, and the share of clipped pixels, by block."""
     height, width = (side // _BLOCK * _BLOCK for side in (developed.frame.height, developed.frame.width))
     shape = (height // _BLOCK, width // _BLOCK)

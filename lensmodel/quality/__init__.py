@@ -3,17 +3,8 @@
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
 from lensmodel.quality.edge_finder import edge_gains, find_edges
-from lensmodel.quality.images import (
-    best_shift,
-    registered_zone_psnr,
-    shifted,
-    to_srgb,
-)
-from lensmodel.quality.kernels import (
-    mtf50_from_kernel,
-    mtf_from_kernel,
-    tangential_sagittal_mtf50,
-)
+from lensmodel.quality.images import best_shift, registered_zone_psnr, shifted, to_srgb
+from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
 
 __all__ = [
     "EdgeMeasurement",

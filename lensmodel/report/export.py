@@ -197,13 +197,7 @@ class MtfTable:
 
 
 exporters: Registry[Exporter] = Registry(
-    "export format",
-    {
-        "csv": MtfTable,
-        "fits": Fits,
-        "json": JsonMatrix,
-        "npz": Npz,
-    },
+    "export format", {"csv": MtfTable, "fits": Fits, "json": JsonMatrix, "npz": Npz}
 )
 
 

@@ -13,13 +13,7 @@ from lensmodel.simulate.camera import (
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.lens import Aberrations, CameraLens, SimulatedField, SimulatedLens
-from lensmodel.simulate.scenes import (
-    DEMO_SCENES,
-    demo_data_path,
-    demo_scene,
-    load_scene,
-    srgb_to_linear,
-)
+from lensmodel.simulate.scenes import DEMO_SCENES, demo_data_path, demo_scene, load_scene, srgb_to_linear
 
 __all__ = [
     "DEMO_SCENES",

@@ -148,29 +148,15 @@ class SimulatedCamera:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is known about a simulated photo.
+    """What is known about a simulated photo."""
 
-    Parameters
-    ----------
-    lens, camera, settings
-        What it was taken with.
-    scene_sha256 : str
-        Of the scene's float32 bytes.
-    exposure : float
-        Scene values were multiplied by it.
-    options : BlurOptions
-        Focus error, which effects were simulated, and the grid of kernels.
-    mirrored_px : int
-        Width of the margin beyond the frame that had to be mirrored because the scene ended; 0 means
-        that the borders are honest.
-    """
-
-    lens: CameraLens
+    lens: CameraLens  # what it was taken with
     camera: SimulatedCamera
     settings: LensSettings
-    scene_sha256: str
-    exposure: float
-    options: BlurOptions
+    scene_sha256: str  # of the scene's float32 bytes
+    exposure: float  # scene values were multiplied by it
+    options: BlurOptions  # focus error, which effects were simulated, and the grid of kernels
+    # width of the margin that had to be mirrored because the scene ended: with 0, borders are honest
     mirrored_px: int
 
 

@@ -83,12 +83,7 @@ def slanted_edge_scene(
 
 
 def edge_chart(
-    frame: Frame,
-    *,
-    margin: int = 40,
-    guard: int = 27,
-    dark: float = 0.15,
-    bright: float = 0.75,
+    frame: Frame, *, margin: int = 40, guard: int = 27, dark: float = 0.15, bright: float = 0.75
 ) -> Chart:
     """Chart with edges in the centre, half way out and in all four corners, of both directions.
 

@@ -60,10 +60,7 @@ _KINDS: Final = {
         (1.8, 2.0, 2.8), (0.3, 0.7), (1.2, 3.0), {"coma": 0.4, "astigmatism": 0.3, "field_curvature": 3.0}
     ),
     "decentred": _Kind(
-        (1.8, 2.0, 2.8),
-        (0.4, 0.8),
-        (1.2, 2.6),
-        drawn={"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)},
+        (1.8, 2.0, 2.8), (0.4, 0.8), (1.2, 2.6), drawn={"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)}
     ),
     "tilted": _Kind(
         (1.8, 2.0, 2.8),

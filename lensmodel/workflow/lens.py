@@ -13,14 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, LensSettings
-from lensmodel.model import (
-    LensModel,
-    LensProfile,
-    ModelSettings,
-    PsfAnswer,
-    load_profile,
-    save_profile,
-)
+from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
 
 DEFAULT_SIZE = 55

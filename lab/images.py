@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -13,9 +11,19 @@ from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
+from lensmodel.core.geometry import Frame
 from lensmodel.core.types import ZONES, Planes, Zone
-from lensmodel.quality import best_shift, shifted, to_srgb
+from lensmodel.quality.images import (
+    BLOCK,
+    CORE,
+    block_error,
+    block_means,
+    blocks,
+    moved,
+    psnr_of,
+    to_srgb,
+    zone_masks,
+)
 
 Encoded: TypeAlias = NDArray[np.floating] | NDArray[np.uint16]
 
@@ -66,17 +74,13 @@ def _squared_error(
 
 # --- by zone and by block -----------------------------------------------------------------------
 
-BLOCK: Final = 128  # pixels of a side (chosen)
-BORDER: Final = 8  # pixels of a block that do not count: more than it is shifted
 EVERY: Final = 120
 """Up to so many blocks all are compared, of more every second one, as on a chessboard."""
 
 LOSS_DB: Final = 0.5
 """A block that loses more than this counts."""
 
-_LARGEST_SHIFT: Final = 3.0  # pixels (chosen): beyond, nothing in the block says where it lies
 _LEAST_ERROR: Final = 1e-8  # mean square, full scale is 1 (chosen): 80 dB, so that ratios stay finite
-_CORE: Final = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 
 
 def fidelity(
@@ -93,25 +97,14 @@ def fidelity(
         `psnr` and `ssim`, each by zone; zones of which no block was compared are left out.
     """
     found, wanted = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
-    radius = frame.radius_map()
-
-    def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
-        window = tuple(slice(start, start + BLOCK) for start in corner)
-        picture, truth = found[:, *window], _moved(wanted[:, *window], found[:, *window])
-        maps = [_error(picture, truth)]
-        if srgb:
-            maps.append(_ssim_map(picture, truth)[_CORE])
-        zones = _zones(radius[window][_CORE])
-        return {z: np.array([*(m[mask].sum() for m in maps), mask.sum()]) for z, mask in zones.items()}
-
-    sums: dict[Zone, NDArray[np.float64]] = {zone: np.zeros(2 + srgb) for zone in ZONES}
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        # in the order of the blocks: the same sum for any number of threads
-        for part in pool.map(compared, blocks(frame)):
-            for zone, values in part.items():
-                sums[zone] += values
-    means = {zone: total[:-1] / total[-1] for zone, total in sums.items() if total[-1]}
-    psnrs = {zone: -10.0 * math.log10(max(float(mean[0]), 1e-30)) for zone, mean in means.items()}
+    means = block_means(
+        found,
+        wanted,
+        frame,
+        lambda a, b: [block_error(a, b), *([_ssim_map(a, b)[CORE]] if srgb else [])],
+        blocks(frame, EVERY),
+    )
+    psnrs = {zone: psnr_of(float(mean[0])) for zone, mean in means.items()}
     return {"psnr": psnrs, **({"ssim": {z: float(mean[1]) for z, mean in means.items()}} if srgb else {})}
 
 
@@ -134,11 +127,11 @@ def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
     radius = frame.radius_map()
     errors: dict[Zone, NDArray[np.float64]] = {zone: np.zeros(2) for zone in ZONES}
     found: list[tuple[float, tuple[int, int]]] = []
-    for row, col in blocks(frame, most=None):
+    for row, col in blocks(frame):
         window = slice(row, row + BLOCK), slice(col, col + BLOCK)
         old, new, sharp = (_unit(picture[window]) for picture in (before, after, truth))
-        pair = [_error(picture, np.clip(_moved(sharp, picture), 0.0, 1.0)) for picture in (old, new)]
-        for zone, mask in _zones(radius[window][_CORE]).items():
+        pair = [block_error(picture, np.clip(moved(sharp, picture), 0.0, 1.0)) for picture in (old, new)]
+        for zone, mask in zone_masks(radius[window][CORE]).items():
             errors[zone] += [float(error[mask].sum()) for error in pair]
         found.append((_gain(*(float(error.mean()) for error in pair)), (row, col)))
     worst, at = min(found)
@@ -151,24 +144,6 @@ def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
     )
 
 
-def blocks(frame: Frame, most: int | None = EVERY) -> list[tuple[int, int]]:
-    """Top left pixels of the blocks that are compared: with their borders they cover the frame."""
-    rows, cols = ([*range(0, n - BLOCK, BLOCK - 2 * BORDER), n - BLOCK] for n in (frame.height, frame.width))
-    every = [(i + j, row, col) for i, row in enumerate(rows) for j, col in enumerate(cols)]
-    thin = most is not None and len(every) > most
-    return [(row, col) for number, row, col in every if not (thin and number % 2)]
-
-
-def _moved(truth: NDArray[np.floating], picture: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The truth where it lies best on the picture."""
-    shift = best_shift(truth, picture)
-    return shifted(truth, *(shift if max(map(abs, shift)) <= _LARGEST_SHIFT else (0.0, 0.0)))
-
-
-def _error(picture: NDArray[np.floating], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.square(picture - truth).mean(axis=0)[_CORE])
-
-
 def _unit(part: Encoded) -> NDArray[np.float64]:
     scale = 65535.0 if part.dtype == np.uint16 else 1.0
     return np.ascontiguousarray(np.moveaxis(np.asarray(part, dtype=np.float64) / scale, -1, 0))
@@ -176,8 +151,3 @@ def _unit(part: Encoded) -> NDArray[np.float64]:
 
 def _gain(old: float, new: float) -> float:
     return 10.0 * math.log10(max(old, _LEAST_ERROR) / max(new, _LEAST_ERROR))
-
-
-def _zones(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
-    masks: dict[Zone, NDArray[np.bool_]] = {"center": r < CENTER_ZONE_R, "corner": r > CORNER_ZONE_R}
-    return masks | {"mid": ~(masks["center"] | masks["corner"])}

@@ -16,9 +16,6 @@ from lensmodel.core.psf import distance
 from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
 from lensmodel.photo import develop
 
-_BORDER = 8
-"""Pixels at the edge of the picture that are left out (chosen): there the blur reaches beyond the picture."""
-
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
@@ -61,7 +58,7 @@ def psnr(planes: Planes, shot: camera.DemoShot) -> dict[Zone, float]:
     """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone, registered block by block."""
     gains = np.asarray(camera.demo_camera().white_balance, dtype=np.float32)[:, None, None]
     return quality.registered_zone_psnr(
-        planes * gains, shot.sharp() * gains, camera.demo_camera().frame, srgb=True, border=_BORDER
+        planes * gains, shot.sharp() * gains, camera.demo_camera().frame, srgb=True
     )
 
 

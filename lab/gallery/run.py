@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import lensmodel
-from lab import images, peers
+from lab import peers
 from lab.code_version import version_of
 from lab.gallery import crops, measure
 from lab.gallery.pictures import FRAMES, Picture, take
@@ -31,6 +31,7 @@ from lensmodel.core.files import atomic
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import develop
+from lensmodel.quality.images import BLOCK
 from lensmodel.workflow import sampling
 from lensmodel.workflow.lens import Lens
 
@@ -161,7 +162,7 @@ def _entry(
     named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
     named += [("most dots", found["dots_at"]), ("most hue flips", found["hue_flips_at"])]
     if found["gains"] is not None and found["gains"]["worst_db"] < 0.0:
-        middle = [k + images.BLOCK // 2 for k in found["gains"]["worst_at"]]
+        middle = [k + BLOCK // 2 for k in found["gains"]["worst_at"]]
         named.append((f"worst block, {found['gains']['worst_db']:+.2f} dB", middle))
     where = crops.places(before, shown, named)
     made = []

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 import numpy as np
@@ -15,9 +18,13 @@ from lensmodel.core.types import ZONES, Zone
 
 _SHIFT_STEPS: Final = 6  # of Newton: it begins within a pixel, and each step gains digits (chosen)
 _SHIFT_PAD: Final = 8  # pixels: more than any shift that is looked for
-_LARGEST_SHIFT = 3.0  # pixels: larger ones are no shift but another picture (chosen)
+_LARGEST_SHIFT: Final = 3.0  # pixels (chosen): beyond, nothing in the block says where it lies
 _SHIFT_WINDOW: Final = 1024  # pixels: the middle says as much as the whole
 _CROP_EDGE: Final = 4  # pixels of the border that demosaicing leaves unsure (chosen)
+
+BLOCK: Final = 128  # pixels of a side (chosen)
+BORDER: Final = 8  # pixels of a block that do not count: more than it is shifted
+CORE: Final = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 
 Picture = NDArray[np.uint8]
 """`(row, col, 3)` sRGB, as shown."""
@@ -30,77 +37,79 @@ def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def registered_zone_psnr(
+    image: NDArray[np.floating], reference: NDArray[np.floating], frame: Frame, *, srgb: bool = False
+) -> dict[Zone, float]:
+    """PSNR in dB by zone for a peak of 1, of `(..., H, W)` in linear light, or after `to_srgb`.
+
+    Zones of which the picture shows nothing are left out.
+    """
+    found, wanted = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
+    means = block_means(found, wanted, frame, lambda a, b: [block_error(a, b)], blocks(frame))
+    return {zone: psnr_of(float(mean[0])) for zone, mean in means.items()}
+
+
+def block_means(
     image: NDArray[np.floating],
     reference: NDArray[np.floating],
     frame: Frame,
-    *,
-    srgb: bool = False,
-    border: int = 8,
-    block: int = 128,
-) -> dict[Zone, float]:
-    """PSNR in dB of each zone after the best shift of every block of the picture is removed.
+    maps: Callable[[NDArray[np.floating], NDArray[np.float64]], Sequence[NDArray[np.float64]]],
+    corners: Iterable[tuple[int, int]],
+) -> dict[Zone, NDArray[np.float64]]:
+    """Means by zone of what `maps` says of the inner pixels of each block and of its truth.
 
     A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
     a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
-    distortion of the picture, not blur. Block by block it is taken out.
-
-    Parameters
-    ----------
-    image, reference : ndarray, shape (..., H, W)
-        Linear light.
-    frame : Frame
-        (H, W), no side shorter than a block and two borders.
-    srgb : bool
-        Compare after `to_srgb`, the usual figure for pictures.
-    border : int
-        Pixels along the frame, and along each block, that do not count.
-    block : int
-        Side of a block; blocks overlap by two borders, so that all pixels inside count.
-
-    Returns
-    -------
-    dict of str to float
-        dB for a peak of 1, by zone; zones outside the picture are missing.
-
-    Raises
-    ------
-    InvalidInputError
-        If shapes differ, or the picture is too small for a block.
+    distortion of the picture, not blur. So the truth of each block, which has no noise, is moved to where
+    it lies best.
     """
     _same_shape(image, reference)
-    if image.shape[-2:] != (frame.height, frame.width):
-        raise InvalidInputError(f"the pictures {image.shape} do not have the size of {frame}")
-    if min(frame.height, frame.width) < block or block <= 2 * border:
-        raise InvalidInputError(f"{frame} is too small for blocks of {block} with a border of {border}")
+    if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
+        raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
     radius = frame.radius_map()
-    wanted, tested = (to_srgb(reference), to_srgb(image)) if srgb else (reference, image)
-    total = dict.fromkeys(ZONES, 0.0)
-    count = dict.fromkeys(ZONES, 0)
-    core = (..., slice(border, -border), slice(border, -border))
-    step = block - 2 * border
-    for row in _starts(frame.height, block, step):
-        for col in _starts(frame.width, block, step):
-            window = (..., slice(row, row + block), slice(col, col + block))
-            shift = best_shift(tested[window], wanted[window])
-            if max(map(abs, shift)) > _LARGEST_SHIFT:
-                shift = (0.0, 0.0)  # nothing in the block says where it lies
-            error = np.square(shifted(tested[window], *shift) - wanted[window])[core]
-            zones = radius[window][core]
-            for zone in ZONES:
-                inside = np.broadcast_to(_in_zone(zones, zone), error.shape)
-                total[zone] += float(error[inside].sum())
-                count[zone] += int(inside.sum())
-    return {zone: -10.0 * math.log10(max(total[zone] / count[zone], 1e-30)) for zone in ZONES if count[zone]}
+    found, wanted = (picture.reshape(-1, *picture.shape[-2:]) for picture in (image, reference))
+
+    def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
+        window = tuple(slice(start, start + BLOCK) for start in corner)
+        picture = found[:, *window]
+        drawn = maps(picture, moved(wanted[:, *window], picture))
+        zones = zone_masks(radius[window][CORE])
+        return {z: np.array([*(m[mask].sum() for m in drawn), mask.sum()]) for z, mask in zones.items()}
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        # in the order of the blocks: the same sum for any number of threads
+        parts = list(pool.map(compared, corners))
+    sums = {zone: np.sum([part[zone] for part in parts], axis=0) for zone in ZONES}
+    return {zone: total[:-1] / total[-1] for zone, total in sums.items() if total[-1]}
 
 
-def _starts(length: int, block: int, step: int) -> list[int]:
-    return [*range(0, length - block, step), length - block]
+def blocks(frame: Frame, most: int | None = None) -> list[tuple[int, int]]:
+    """Top left pixels of blocks that cover the frame with their borders; of more than `most` every second."""
+    rows, cols = ([*range(0, n - BLOCK, BLOCK - 2 * BORDER), n - BLOCK] for n in (frame.height, frame.width))
+    every = [(i + j, row, col) for i, row in enumerate(rows) for j, col in enumerate(cols)]
+    thin = most is not None and len(every) > most
+    return [(row, col) for number, row, col in every if not (thin and number % 2)]
 
 
-def _in_zone(r: NDArray[np.floating], zone: Zone) -> NDArray[np.bool_]:
-    if zone == "center":
-        return r < CENTER_ZONE_R
-    return r > CORNER_ZONE_R if zone == "corner" else (r >= CENTER_ZONE_R) & (r <= CORNER_ZONE_R)
+def moved(truth: NDArray[np.floating], picture: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the truth where it lies best on the picture."""
+    shift = best_shift(truth, picture)
+    return shifted(truth, *(shift if max(map(abs, shift)) <= _LARGEST_SHIFT else (0.0, 0.0)))
+
+
+def block_error(picture: NDArray[np.floating], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared error of the inner pixels of a block, mean over its channels."""
+    return np.asarray(np.square(picture - truth).mean(axis=0)[CORE])
+
+
+def psnr_of(error: float) -> float:
+    """PSNR in dB of a mean squared error, for a peak of 1."""
+    return -10.0 * math.log10(max(error, 1e-30))
+
+
+def zone_masks(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
+    """Which pixels lie in each zone, by their radii."""
+    masks: dict[Zone, NDArray[np.bool_]] = {"center": r < CENTER_ZONE_R, "corner": r > CORNER_ZONE_R}
+    return masks | {"mid": ~(masks["center"] | masks["corner"])}
 
 
 def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import PsfAnswer
+from lensmodel.report.lens_report import UNKNOWN
 
 SIDE: Final = 1000
 """Height of the frame of a map in pixels (chosen): only its aspect ratio matters."""
@@ -39,6 +40,9 @@ HEADERS: Final = {
 
 GAP_PX: Final = 2
 """Pixels between the kernels of a map (chosen for looks)."""
+
+HATCH_PX: Final = 7
+"""Pixels between the strokes over a cell that is not known (chosen for looks)."""
 
 
 def describe(
@@ -105,12 +109,13 @@ def field_map(
 ) -> DrawnPicture:
     """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak.
 
-    `ask` answers with a kernel of side `size`.
+    `ask` answers with a kernel of side `size`. Where too little is known the cell is hatched, as in reports.
     """
     frame = Frame(SIDE, round(SIDE * aspect))
     left_edge, top_edge, wide, high = view
     pitch = size + GAP_PX
     sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
+    hatched = np.where(np.add.outer(np.arange(size), np.arange(size)) % HATCH_PX < 2, 110, 40)
     made: Counter[str] = Counter()
     for row in range(rows):
         for column in range(columns):
@@ -119,7 +124,9 @@ def field_map(
             answer = ask(place)
             made[answer.answered_by] += 1
             top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
-            sheet[top : top + size, left : left + size] = _bright(answer.kernel, gamma)
+            known = answer.predicted_error < UNKNOWN and not answer.extrapolated
+            cell = _bright(answer.kernel, gamma) if known else hatched
+            sheet[top : top + size, left : left + size] = cell
     return DrawnPicture(_png(Image.fromarray(sheet)), _made(made))
 
 

@@ -30,6 +30,7 @@ from app.store.samples import LensState
 from app.store.tables import LensRow
 from app.store.versions import report_key
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.names import full_name
 from lensmodel.correction import Bounds
 from lensmodel.workflow.sampling import PRESETS
 
@@ -224,10 +225,9 @@ class CorrectionWork:
     def _about(self, lens: LensRow) -> dict[str, Any]:
         """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""
         lenses = self._context.store.lenses
-        full_name = " ".join(word for word in (lens.maker, lens.model) if word)
         height, width = lenses.shape_of(lens) or (2, 3)
         return {
-            "name": lens.label or full_name or "Unnamed lens",
+            "name": lens.label or full_name(lens.maker, lens.model) or "Unnamed lens",
             "aspect": width / height,
             "height_px": height if height > 2 else None,
             "lateral": lenses.lateral_of(lens),
@@ -245,8 +245,7 @@ def _bounds(params: dict[str, Any]) -> dict[str, float]:
 
 def _description(plan: CorrectionPlan) -> str:
     params = plan.correction.params
-    full_name = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word)
-    lens = plan.lens.label or full_name or "unknown lens"
+    lens = plan.lens.label or full_name(plan.lens.maker, plan.lens.model) or "unknown lens"
     return (
         f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
         f"method {params['method']}, strength {params['strength']:g}"

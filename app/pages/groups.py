@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from app.store.tables import PhotoRow
+from lensmodel.core.names import camera_name, full_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,16 @@ class WaitingGroup:
     photos: list[PhotoRow]
 
     @property
+    def name(self) -> str:
+        """What to call the lens: its own name, else camera and focal length; empty where nothing is known."""
+        parts = [self.camera] if self.camera else []
+        if self.lens_model:
+            maker = self.camera.split()[0] if self.camera else None
+            return full_name(maker, self.lens_model) if self.lens_model[0].isdigit() else self.lens_model
+        parts += [f"body {self.body}"] if self.body else []
+        return ", ".join([*parts, *([f"{self.focal_mm:g} mm"] if self.focal_mm else [])])
+
+    @property
     def key(self) -> str:
         """A key that stays the same while photos join and leave."""
         first = self.photos[0]
@@ -43,20 +54,13 @@ class WaitingGroup:
         return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
-def camera_name(maker: str | None, model: str | None) -> str:
-    """Name a camera once: many models begin with their maker."""
-    known = (maker or "").strip()
-    if (model or "").lower().startswith(known.lower().split(" ")[0]):
-        known = ""
-    return f"{known} {model or ''}".strip()
-
-
 def grouped(rows: Sequence[PhotoRow]) -> list[WaitingGroup]:
-    """Group photos by body, focal length and lens name."""
+    """Group photos by body and lens name, those that name no lens by focal length."""
     groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
     for row in rows:
         camera = camera_name(row.camera_maker, row.camera_model)
-        groups[camera, row.body_key or "", row.focal_mm or 0.0, row.lens_model or ""].append(row)
+        focal = 0.0 if row.lens_model else row.focal_mm or 0.0
+        groups[camera, row.body_key or "", focal, row.lens_model or ""].append(row)
     bodies: defaultdict[str, list[str]] = defaultdict(list)
     for camera, body, *_ in sorted(groups):
         if body not in bodies[camera]:

@@ -36,37 +36,63 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/lenses/{lens_id}")
-def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
-    """Show a lens: its field of blur, its charts, its history, its photos."""
-    lens = lens_routes.read_lens(lens_id, call)
-    row = lens_routes.find_lens(call, lens_id)
-    before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
-    history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
+def lens_page(
+    lens_id: str, call: CallDep, aperture: Annotated[str, Query(max_length=20)] = ""
+) -> HTMLResponse:
+    """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
+    lens, row = lens_routes.read_lens(lens_id, call), lens_routes.find_lens(call, lens_id)
     photos, more = shown.photos(call, lens_id)
-    positions = _positions(call, photos)
-    others = [other for other in shown.lenses(call) if other.id != lens_id]
-    newest = next((event.coverage for event in reversed(history) if event.coverage), None)
-    aspect = _aspect(call, row)
-    test = _test(call, row)
-    gone = max((event.version for event in history if event.kind != "photo_added"), default=0)
+    aspect, test = _aspect(call, row), _test(call, row)
+    apertures = lens.apertures if test is None else [number for number in test.apertures if number]
+    chosen = _aperture(aperture) or (apertures[0] if apertures else None)
+    question = {"size": 25, "aspect": aspect} | ({} if chosen is None else {"aperture": chosen})
+
+    def map_of(cells: int) -> str:
+        rows = max(2, round(math.sqrt(cells / aspect)))
+        grid = f"{max(2, round(rows * aspect))}x{rows}"
+        return f"/v1/lenses/{lens_id}/field.png?{urlencode({'grid': grid, **question})}"
+
     return page(
         "lens.html",
         lens=lens,
         counting=shown.counting(call, lens_id),
         anew=shown.anew(call, lens_id),
+        photos=photos,
+        more=more,
+        others=[other for other in shown.lenses_with_photos(call) if other.id != lens_id],
+        aspect=aspect,
+        apertures=apertures,
+        aperture=chosen,
+        map_of=map_of,
+        test=test,
+        found=None if test is None else test.at(chosen),
+    )
+
+
+@router.get("/lenses/{lens_id}/tests")
+def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
+    """Show what testers and researchers ask of a lens: charts, its blur at any point, its versions."""
+    lens, row = lens_routes.read_lens(lens_id, call), lens_routes.find_lens(call, lens_id)
+    before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
+    history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
+    photos, _ = shown.photos(call, lens_id)
+    newest = next((event.coverage for event in reversed(history) if event.coverage), None)
+    aspect, test = _aspect(call, row), _test(call, row)
+    gone = max((event.version for event in history if event.kind != "photo_added"), default=0)
+    return page(
+        "lens_tests.html",
+        lens=lens,
+        counting=shown.counting(call, lens_id),
+        anew=shown.anew(call, lens_id),
         history=history,
+        curve=sum(bool(event.error) for event in history) > 1,  # one point is no curve
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         coverage=words.coverage_bars(newest),
-        seen=positions,
         aspect=aspect,
-        spots=_spots(positions, aspect),
-        photos=photos,
-        more=more,
-        others=others,
-        comparable=[other for other in others if other.samples],
+        spots=_spots(_positions(call, photos), aspect),
+        comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
         test=test,
-        centring=None if test is None else test.tested[0].centring,
         **({} if test is None else _charts(test, None, "c/px")),
     )
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Response
 
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.pages import shown
+from app.pages import batch, shown
 from app.pages.rendering import fragment
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
@@ -20,7 +20,7 @@ from app.routes.common import matches_tag
 
 router = APIRouter(include_in_schema=False)
 
-Page = Literal["home", "photo", "correction", "lens"]
+Page = Literal["home", "photo", "correction", "batch", "lens"]
 Fragments: TypeAlias = Mapping[str, str]
 """HTML by the id of the element that it replaces."""
 
@@ -29,7 +29,7 @@ Fragments: TypeAlias = Mapping[str, str]
 def parts(
     call: CallDep,
     page: Page = "home",
-    id: Annotated[str, Query(max_length=60)] = "",  # noqa: A002
+    id: batch.Ids = "",  # noqa: A002
 ) -> Response:
     """Return the parts of a page as they are now; 304 where the browser has them."""
     body = json.dumps(_DRAWERS[page](call, id)).encode()
@@ -64,6 +64,10 @@ def _correction(call: Call, correction_id: str) -> Fragments:
     }
 
 
+def _batch(call: Call, ids: str) -> Fragments:
+    return {"batch-state": fragment("_batch.html", **batch.state(call, ids))}
+
+
 def _lens(call: Call, lens_id: str) -> Fragments:
     lens = lens_routes.read_lens(lens_id, call)
     known = {"counting": shown.counting(call, lens_id), "anew": shown.anew(call, lens_id)}
@@ -74,5 +78,6 @@ _DRAWERS: Final[Mapping[Page, Callable[[Call, str], Fragments]]] = {
     "home": _home,
     "photo": _photo,
     "correction": _correction,
+    "batch": _batch,
     "lens": _lens,
 }

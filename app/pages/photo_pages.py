@@ -15,6 +15,7 @@ from app.http.dependencies import CallDep
 from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown, words
 from app.pages.audit_words import held_places, held_squares
+from app.pages.groups import grouped
 from app.pages.rendering import page
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
@@ -56,8 +57,12 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
     candidates = []
     if photo.lens_id is None:
-        candidates = [lens for lens in shown.lenses(call) if lens.samples or photo.state == "needs_lens"]
+        candidates = [
+            lens for lens in shown.lenses_with_photos(call) if lens.samples or photo.state == "needs_lens"
+        ]
     corrections = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
+    corrections = [correction for correction in corrections if correction.roi is None]
+    done = next((correction for correction in corrections if correction.state == "succeeded"), None)
     return page(
         "photo.html",
         photo=_upright(photo, row),
@@ -67,8 +72,12 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
+        proposed=grouped([row])[0].name,
         lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
-        corrections=[correction for correction in corrections if correction.roi is None],
+        corrections=corrections,
+        done=done,
+        nothing=words.nothing_words(row.kind),
+        tiles=f"/ui/photos/{photo_id}/tiles" if done is None else f"/ui/corrections/{done.id}/tiles",
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )
 
@@ -115,6 +124,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     can_look = correction.roi is None and pictures.exists(
         call.storage, f"{run_folder(plan.correction)}{SIDES['after']}"
     )
+    zones, most_gain = words.gain_bars(report.get("zones") or {})
     size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(
         "correction.html",
@@ -122,7 +132,9 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         job=views.correction_job(plan),
         photo=_upright(photo, row),
         can_look=can_look,
-        zones=words.gain_bars(report.get("zones") or {}),
+        zones=zones,
+        most_gain=most_gain,
+        nothing=words.nothing_words(row.kind),
         audit=held_places(report.get("audit") or {}, *size),
         held=held_squares(report.get("audit") or {}, *size) if can_look else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],

@@ -14,7 +14,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.http.dependencies import CallDep, call_of
-from app.pages import lens_pages, parts, photo_pages, picture_routes, shown, signing, words
+from app.pages import batch, lens_pages, parts, photo_pages, picture_routes, shown, signing, words
 from app.pages.interface import operations
 from app.pages.rendering import page
 from lensmodel.core.errors import LensModelError
@@ -27,7 +27,14 @@ router = APIRouter(include_in_schema=False)
 def include(site: APIRouter) -> None:
     """Add the pages and their files to the routes of the service."""
     site.include_router(signing.router)
-    for part in (router, parts.router, photo_pages.router, lens_pages.router, picture_routes.router):
+    for part in (
+        router,
+        parts.router,
+        photo_pages.router,
+        batch.router,
+        lens_pages.router,
+        picture_routes.router,
+    ):
         site.include_router(part, dependencies=[Depends(call_of)])
     site.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
 

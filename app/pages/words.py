@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -9,9 +10,9 @@ from typing import Any, Final
 from app.pages.groups import WaitingGroup
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
-from lensmodel.core.types import FieldPosition
+from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
-from lensmodel.report import Centring, Unit, little_seen, place_in_words
+from lensmodel.report import Centring, Unit, sharpness
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -22,7 +23,7 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "counted": "Learned from",
     "stored": "Ready to correct",
     "excluded": "You left it out of the lens",
-    "cancelled": "Cancelled",
+    "cancelled": "Left out",
 }
 FAILURES: Final[Mapping[str, str]] = {
     "no_usable_patches": "nothing in it shows the blur of the lens. A photo with fine detail in focus would",
@@ -41,12 +42,6 @@ FILES: Final[Mapping[str, str]] = {
     "jpeg": "JPEG",
     "dng": "Linear DNG",
 }
-ENOUGH_PLACES: Final = 20
-"""Places in a zone from which it counts as well covered (chosen): those of some three photos."""
-
-SHOWN_PLACES: Final = 3
-"""Places that an advice names at most (chosen): nobody photographs by a longer list."""
-
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 REASONS: Final[Mapping[str, str]] = {
@@ -67,17 +62,7 @@ def lens_name(lens: LensOut) -> str:
     """Name a lens as its owner would."""
     if lens.label:
         return lens.label
-    maker, model = lens.maker or "", lens.model or ""
-    if model.lower().startswith(maker.lower()):
-        maker = ""  # "Canon Canon EF 24mm"
-    return f"{maker} {model}".strip() or "Unnamed lens"
-
-
-def serial_words(lens: LensOut) -> str:
-    """Say how sure it is that all photos are of one copy; the serial is shown shortened."""
-    if not lens.serial:
-        return "The photos do not give a serial number, so all of them are taken to be from one copy."
-    return f"This copy: serial number ending in {lens.serial[-4:]}."
+    return full_name(lens.maker, lens.model) or "Unnamed lens"
 
 
 def f_stop(number: float) -> str:
@@ -168,11 +153,6 @@ def group_name(group: WaitingGroup) -> str:
     return f"{camera}{body}{lens}{focal}: {counted(len(group.photos), 'photo')}"
 
 
-def group_example(group: WaitingGroup) -> str:
-    """Suggest a name for the lens of a group."""
-    return f"My {group.focal_mm:g} mm" if group.focal_mm else "My 35 mm"
-
-
 def refusal(status: int, detail: str) -> tuple[str, str]:
     """Write title and text of a page that stands for one that cannot be shown."""
     if status == 404:
@@ -248,7 +228,7 @@ def changing_words(lens: LensOut, left: int) -> str:
 
 def centring_verdict(centring: Centring) -> str:
     """Say in a word or two whether a lens is centred."""
-    return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Undecided."}[
+    return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Not known yet."}[
         centring.verdict
     ]
 
@@ -265,19 +245,6 @@ def unit_name(unit: Unit) -> str:
     ]
 
 
-def history_words(history: Sequence[CalibrationOut]) -> str:
-    """Say in words what a curve cannot show: fewer than two versions with an error."""
-    tested = [event for event in history if event.error]
-    if tested:
-        error = tested[-1].error
-        zones = error if isinstance(error, Mapping) else dict.fromkeys(ZONES, error)
-        errors = ", ".join(f"{ZONES[zone].lower()} {percent(zones.get(zone))}" for zone in ZONES)
-        return f"With {counted(tested[-1].photos, 'photo')}: {errors}. The curve starts with the next photo."
-    if history and history[-1].photos > 1:
-        return "The photos are being tested on one another."
-    return "One photo so far. Once there are more, they are tested on one another."
-
-
 def coverage_words(coverage: Mapping[str, Any] | None) -> str:
     """Write the places seen in each zone."""
     return ", ".join(str(coverage.get(zone, 0)) for zone in ZONES) if coverage else ""
@@ -287,7 +254,6 @@ def coverage_words(coverage: Mapping[str, Any] | None) -> str:
 class ZoneBar:
     """One zone of the picture in a bar chart; `share` is the length of the bar in percent."""
 
-    name: str
     words: str
     share: int
     count: int = 0
@@ -300,41 +266,31 @@ def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
         return []
     counts = {zone: int(coverage.get(zone, 0)) for zone in ZONES}
     most = max(1, *counts.values())
-    return [ZoneBar(zone, ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
+    return [ZoneBar(ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
 
 
-def coverage_advice(bars: Sequence[ZoneBar], positions: Sequence[FieldPosition]) -> str:
-    """Say which photo would teach most.
-
-    Parameters
-    ----------
-    bars : sequence of ZoneBar
-        How many places were seen in each zone.
-    positions : sequence of FieldPosition
-        Those places: a zone with many may still have a corner with none.
-    """
-    if not bars:
-        return "Not counted yet."
-    few = [bar.words.lower() for bar in bars if bar.count < ENOUGH_PLACES]
-    few = few or [place_in_words(place) for place in little_seen(positions)[:SHOWN_PLACES]]
-    if not few:
-        return "Every part of the picture has been seen well."
-    return f"Little seen so far: {', '.join(few)}. A photo with fine detail there, in focus, would help most."
-
-
-def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> list[ZoneBar]:
-    """Compare the expected gains of the zones."""
+def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> tuple[list[ZoneBar], int]:
+    """Compare the expected gains of the zones, and return the whole decibels at the end of their scale."""
     gains = {zone: zones[zone].get("expected_gain_db") for zone in ZONES if zones.get(zone, {}).get("cells")}
-    most = max([1.0, *(gain for gain in gains.values() if gain is not None)])
+    most = math.ceil(max([3.0, *(gain for gain in gains.values() if gain is not None)]))
     return [
         ZoneBar(
-            zone,
             ZONES[zone],
             round(100 * max(gain or 0.0, 0.0) / most),
             gain=gain_words(gain) + held_words(zones[zone]),
         )
         for zone, gain in gains.items()
-    ]
+    ], most
+
+
+def nothing_words(kind: str) -> str:
+    """Say why a photo is left as it is."""
+    if kind == "jpeg":
+        return (
+            "The camera has sharpened and compressed this JPEG, and removing what blur is left would not "
+            "make it visibly better; the RAW file of the same shot would gain more."
+        )
+    return "Removing the blur would not make it visibly better, or the lens is not known well enough yet."
 
 
 def held_words(zone: Mapping[str, Any]) -> str:
@@ -362,11 +318,11 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
     f.__name__: f
     for f in (
         lens_name,
-        serial_words,
         f_stop,
         centring_verdict,
         centring_words,
         event_words,
+        sharpness,
         model_words,
         changing_words,
         unit_name,
@@ -379,14 +335,11 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         file_words,
         waiting_words,
         group_name,
-        group_example,
         correction_state,
         reason_words,
         patch_words,
         error_words,
-        history_words,
         coverage_words,
-        coverage_advice,
         active,
         developed,
         correctable,

@@ -22,6 +22,7 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.types import BayerPattern, NoiseModel, Plane, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
+from lensmodel.photo.headers.ciff import read_ciff
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
@@ -97,6 +98,11 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
     except LensModelError:
         raise
     except rawpy.LibRawFileUnsupportedError as error:
+        crw = read_ciff(path.read_bytes())
+        if crw is not None and crw.model is None:  # cut off, its directory is missing: that is at the end
+            raise TruncatedImageError(
+                "the RAW file ends before its data do; the upload was cut off"
+            ) from error
         raise UnsupportedFormatError(
             "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
         ) from error

@@ -15,6 +15,7 @@ from lensmodel.report.lens_report import (
     Spot,
     Unit,
     lens_report,
+    sharpness,
     widest,
 )
 from lensmodel.report.places import (
@@ -53,5 +54,6 @@ __all__ = [
     "little_seen",
     "place_in_words",
     "psf_grid",
+    "sharpness",
     "widest",
 ]

@@ -467,22 +467,7 @@ def _widths(kernels: Sequence[Kernel], rings: Sequence[Sequence[FieldPosition]])
 
 def verdict(found: ApertureReport, best: float | None = None) -> str:
     """Say what a photographer wants to know: centre, worst corner, centring, best aperture."""
-    center, worst = found.spots[0].mean, found.worst
-    if center >= _CRISP:
-        level = "as sharp as the sensor can show"
-    else:
-        level = "sharp" if center >= _SHARP else "a little soft" if center >= _SOFT else "soft"
-    sharpness = f"this copy is {level} in the centre (MTF50 {_figure(center)})"
-    share = min(worst.mean, NYQUIST) / max(min(center, NYQUIST), 1e-6)
-    if share >= _EVEN:
-        fall = "its corners are just as sharp"
-    else:
-        how = (
-            "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
-        )
-        fall = f"its worst corner, {worst.side}, is {how} ({_figure(worst.mean)})"
-    begin = f"At {found.at} {sharpness}" if found.at else f"{sharpness[0].upper()}{sharpness[1:]}"
-    words = [f"{begin}, and {fall}."]
+    words = [sharpness(found)]
     if best is not None and best != found.settings.aperture:
         words.append(f"It is sharpest over the whole picture at f/{best:g}.")
     side = found.centring.side
@@ -498,6 +483,26 @@ def verdict(found: ApertureReport, best: float | None = None) -> str:
     if not float(np.mean(found.predicted_error)) < UNKNOWN:
         words.append("Much of this is still a guess; more photos will help.")
     return " ".join(words)
+
+
+def sharpness(found: ApertureReport) -> str:
+    """Say in one sentence how sharp a copy is in the centre and in its worst corner."""
+    center, worst = found.spots[0].mean, found.worst
+    if center >= _CRISP:
+        level = "as sharp as the sensor can show"
+    else:
+        level = "sharp" if center >= _SHARP else "a little soft" if center >= _SOFT else "soft"
+    words = f"this copy is {level} in the centre (MTF50 {_figure(center)})"
+    share = min(worst.mean, NYQUIST) / max(min(center, NYQUIST), 1e-6)
+    if share >= _EVEN:
+        fall = "its corners are just as sharp"
+    else:
+        how = (
+            "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
+        )
+        fall = f"its worst corner, {worst.side}, is {how} ({_figure(worst.mean)})"
+    begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
+    return f"{begin}, and {fall}."
 
 
 def _figure(value: float) -> str:

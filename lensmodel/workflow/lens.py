@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.names import full_name
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
@@ -328,9 +329,9 @@ class Lens:
     @property
     def description(self) -> str:
         """Which lens, and how many photos it was learned from."""
-        words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
+        name = full_name(self.profile.lens.get("maker"), self.profile.lens.get("model"))
         count = len(self.profile.photos)
-        return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
+        return f"{name or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
 
 
 def field_grid(

@@ -1,7 +1,8 @@
 // Behaviour of the pages. Each part looks for its own element and does nothing where there is none.
 
+import { setUpBatch } from "./batch.js";
 import { setUpActions, setUpForms, setUpGroups, setUpSettling } from "./forms.js";
-import { setUpCharts, setUpField, setUpHistory, setUpLensActions } from "./lens.js";
+import { setUpCharts, setUpField, setUpHistory, setUpLensActions, setUpVersions } from "./lens.js";
 import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
@@ -15,9 +16,11 @@ const parts = [
   setUpForms,
   setUpGroups,
   setUpActions,
+  setUpBatch,
   setUpField,
   setUpCharts,
   setUpLensActions,
+  setUpVersions,
   setUpHistory,
   setUpPhoto,
   setUpMeasure,

@@ -40,3 +40,21 @@ export async function send(method, url, body) {
   if (!response.ok) throw new Error(await problemText(response));
   return response.status === 204 ? null : response.json();
 }
+
+// Ask before what cannot be undone: whether the answer is yes.
+export function confirmed(question, yes) {
+  const dialog = document.createElement("dialog");
+  dialog.setAttribute("aria-labelledby", "question");
+  dialog.innerHTML =
+    '<form method="dialog"><p id="question"></p><p class="actions"><button value="yes"></button><button class="quiet" value="" autofocus>Cancel</button></p></form>';
+  dialog.querySelector("p").textContent = question;
+  dialog.querySelector("[value=yes]").textContent = yes;
+  document.body.append(dialog);
+  dialog.showModal();
+  return new Promise((resolve) => {
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue === "yes");
+    });
+  });
+}

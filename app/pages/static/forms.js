@@ -1,7 +1,7 @@
 // Forms and buttons that talk to the API, and pages that wait for work to end.
 
-import { byId, send } from "./common.js";
-import { removing } from "./poll.js";
+import { byId, confirmed, send } from "./common.js";
+import { refreshed, removing } from "./poll.js";
 
 function setUpForm(id, act) {
   const form = byId(id);
@@ -45,13 +45,10 @@ export function setUpForms() {
     const made = await send("POST", "/v1/corrections", wish);
     location.assign(`/corrections/${made.id}`);
   });
-  const ends = { strength: ["none", "full"], texture: ["none", "all"], denoise: ["none", "all"] };
   for (const output of document.querySelectorAll("#correct output")) {
     const slider = byId("correct").elements[output.dataset.for];
-    const [least, most] = ends[slider.name];
     const say = () => {
-      const value = Number(slider.value);
-      output.textContent = value === 0 ? least : value === 1 ? most : `${Math.round(value * 100)} %`;
+      output.textContent = `${Math.round(slider.value * 100)} %`;
       slider.setAttribute("aria-valuetext", output.textContent);
     };
     slider.addEventListener("input", say);
@@ -79,8 +76,8 @@ export function setUpActions() {
     learn: () => send("PATCH", `/v1/photos/${photo}`, { calibrate: true }),
     include: () => send("PATCH", `/v1/photos/${photo}`, { excluded: false }),
     delete: async () => {
-      if (!window.confirm("Delete this photo, its corrections, and what the lens learned from it?")) return;
-      await removing("/", () => send("DELETE", `/v1/photos/${photo}`));
+      const question = "Delete this photo, its corrections, and what was learned from it?";
+      if (await confirmed(question, "Delete the photo")) await removing("/", () => send("DELETE", `/v1/photos/${photo}`));
     },
   };
   for (const button of holder.querySelectorAll("button")) {
@@ -107,38 +104,60 @@ export function setUpSettling() {
   };
 }
 
-// Photos that do not say their lens, named group by group. They are made anew at any moment,
-// so one listener above them serves all, and a group whose answer is still to come takes no second wish.
+// Photos that do not say their lens, group by group. The form is made anew at any moment, so that listeners stand
+// above it, and while answers are to come it takes no second wish.
 export function setUpGroups() {
-  const underWay = new Set();
-  byId("waiting")?.addEventListener("submit", async (event) => {
+  const holder = byId("waiting");
+  if (!holder) return;
+  let underWay = false;
+  const attempt = async (act) => {
+    if (underWay) return;
+    underWay = true;
+    await act().catch((reason) => complain(byId("waiting-form"), reason));
+    underWay = false;
+    await refreshed();
+    if (!holder.contains(document.activeElement)) (holder.querySelector("[data-leave]") ?? byId("photos-title")).focus();
+  };
+  holder.addEventListener("submit", (event) => {
     event.preventDefault();
-    const form = event.target;
-    if (underWay.has(form.id)) return;
-    underWay.add(form.id);
-    const error = form.querySelector(".alert");
-    error.hidden = true;
-    try {
-      const fields = new FormData(form);
-      const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
-      if (fields.has("aperture") && !change.aperture) throw new Error("Give the aperture, a number such as 2.8.");
-      if (!change.photo_ids.length) throw new Error("Choose at least one photo of this group.");
-      if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
-      await send("PATCH", "/v1/photos", change);
-      const count = change.photo_ids.length;
-      byId("announce").textContent = count === 1 ? "1 photo is being processed." : `${count} photos are being processed.`;
-    } catch (reason) {
-      error.textContent = reason.message;
-      error.hidden = false;
-    }
-    underWay.delete(form.id);
+    attempt(async () => {
+      const groups = [...event.target.querySelectorAll("fieldset")].filter((group) => group.querySelector(":checked[name=photo]"));
+      if (!groups.length) throw new Error("Tick the photos to learn from.");
+      let count = 0;
+      for (const group of groups) count += await learned(group).catch((reason) => complain(group, reason));
+      if (count) byId("announce").textContent = count === 1 ? "1 photo is being processed." : `${count} photos are being processed.`;
+    });
   });
+  holder.addEventListener("click", (event) => {
+    if (!event.target.matches("[data-leave]")) return;
+    const photos = [...event.target.closest("fieldset").querySelectorAll("[name=photo]")];
+    attempt(() => Promise.all(photos.map(({ value }) => send("POST", `/v1/jobs/${value}/cancel`))));
+  });
+}
+
+// Send what is said of a group; how many photos it has.
+async function learned(group) {
+  group.querySelector(".alert").hidden = true;
+  const fields = new FormData();
+  for (const { name, value, type, checked } of group.querySelectorAll("[name]")) if (type !== "checkbox" || checked) fields.append(name, value);
+  const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
+  if (fields.has("aperture") && !change.aperture) throw new Error("Give the aperture, a number such as 2.8.");
+  if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
+  await send("PATCH", "/v1/photos", change);
+  return change.photo_ids.length;
+}
+
+function complain(part, reason) {
+  const alert = part.querySelector(":scope > .alert");
+  alert.textContent = reason.message;
+  alert.hidden = false;
+  return 0;
 }
 
 function namedLens(fields) {
   const label = fields.get("label")?.trim();
-  if (label) return { new_lens: { label } };
-  return fields.get("lens_id") ? { lens_id: fields.get("lens_id") } : {};
+  if (fields.get("lens_id")) return { lens_id: fields.get("lens_id") };
+  return label ? { new_lens: { label } } : {};
 }
 
 function givenAperture(fields) {

@@ -1,6 +1,6 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
-import { byId, problemText, send } from "./common.js";
+import { byId, confirmed, problemText, send } from "./common.js";
 import { removing } from "./poll.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
@@ -183,25 +183,35 @@ export function setUpCharts() {
   });
 }
 
+// Let a form act, and show beside it why it could not.
+function acting(form, error, act) {
+  for (const button of form.querySelectorAll("button")) button.disabled = false;
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    error.hidden = true;
+    try {
+      await act(new FormData(form));
+    } catch (reason) {
+      error.textContent = reason.message;
+      error.hidden = false;
+    }
+  });
+}
+
 // What is done with a lens as a whole.
 export function setUpLensActions() {
   const holder = byId("lens-actions");
   if (!holder) return;
   const lens = `/v1/lenses/${holder.dataset.lens}`;
-  const error = holder.querySelector(".alert");
   const acts = {
     rename: async (fields) => {
       await send("PATCH", lens, { label: fields.get("label").trim() || null });
       location.reload();
     },
-    model: async (fields) => {
-      await send("PATCH", lens, { model: fields.get("model") });
-      location.reload();
-    },
     merge: async (fields) => {
       const into = fields.get("lens");
       if (!into) throw new Error("Choose the lens that this one is to be merged into.");
-      if (!window.confirm("Merge? All photos of this lens will then count for the other one. This cannot be undone.")) return;
+      if (!(await confirmed("All photos of this lens will count for the other one. This cannot be undone.", "Merge"))) return;
       await removing(`/lenses/${into}`, () => send("PATCH", lens, { merge_into: into }));
     },
     upload: async (fields) => {
@@ -212,39 +222,28 @@ export function setUpLensActions() {
       location.reload();
     },
     delete: async () => {
-      if (!window.confirm("Delete this lens and everything learned from its photos? The photos themselves are kept; upload them again to learn from them anew.")) return;
-      await removing("/", () => send("DELETE", lens));
+      const question = "Delete this lens and everything learned from its photos? The photos themselves are kept.";
+      if (await confirmed(question, "Delete the lens")) await removing("/", () => send("DELETE", lens));
     },
   };
-  const run = async (act, fields) => {
-    error.hidden = true;
-    try {
-      await acts[act](fields);
-    } catch (reason) {
-      error.textContent = reason.message;
-      error.hidden = false;
-    }
+  for (const form of holder.querySelectorAll("form")) acting(form, holder.querySelector(".alert"), acts[form.dataset.act]);
+}
+
+// Its model, and its earlier versions.
+export function setUpVersions() {
+  const form = byId("model");
+  if (!form) return;
+  const change = async (wish) => {
+    await send("PATCH", `/v1/lenses/${form.dataset.lens}`, wish);
+    location.reload();
   };
-  for (const button of holder.querySelectorAll("button")) button.disabled = false;
-  for (const form of holder.querySelectorAll("form"))
-    form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      run(form.dataset.act, new FormData(form));
+  acting(form, byId("model-alert"), (fields) => change({ model: fields.get("model") }));
+  for (const back of document.querySelectorAll("[data-back]"))
+    acting(back, byId("back-alert"), async () => {
+      const version = Number(back.dataset.back);
+      const question = `Go back to version ${version}? Photos that joined later are left out; they stay and can be counted again.`;
+      if (await confirmed(question, "Go back")) await change({ back_to: version });
     });
-  holder.querySelector("[data-act=delete]").addEventListener("click", () => run("delete"));
-  for (const button of document.querySelectorAll("[data-back]")) {
-    button.disabled = false;
-    button.addEventListener("click", async () => {
-      if (!window.confirm(`Go back to version ${button.dataset.back}? Photos that joined later are left out; they stay and can be counted again.`)) return;
-      try {
-        await send("PATCH", lens, { back_to: Number(button.dataset.back) });
-        location.reload();
-      } catch (reason) {
-        byId("back-alert").textContent = reason.message;
-        byId("back-alert").hidden = false;
-      }
-    });
-  }
 }
 
 function plot(holder, events) {
@@ -290,9 +289,7 @@ export async function setUpHistory() {
     all.push(...page.items);
     next = page.next;
   }
-  const known = (event) => (typeof event.error === "object" ? Object.keys(event.error ?? {}).length : true);
-  const events = all.filter(known);
-  if (events.length < 2) return; // one point is no curve: the page says it in words
+  const events = all.filter(({ error }) => (typeof error === "object" ? Object.keys(error ?? {}).length : true));
   const made = plot(holder, events);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     made.destroy();

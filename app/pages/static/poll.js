@@ -62,6 +62,9 @@ function mergeNode(old, fresh) {
   merge(old, fresh);
 }
 
+// Bring the page up to date at once.
+export let refreshed = async () => {};
+
 export function setUpPolling(onPart) {
   const { page, id } = document.body.dataset;
   if (!page) return;
@@ -102,6 +105,7 @@ export function setUpPolling(onPart) {
     clearTimeout(timer);
     timer = setTimeout(look, PAUSE_MS);
   };
+  refreshed = look;
   // a service on this very computer needs no network: ask it whether it is there
   for (const event of ["offline", "online"]) window.addEventListener(event, look);
   document.addEventListener("visibilitychange", look);

@@ -110,8 +110,10 @@ export function setUpPreview(viewer) {
       running = "";
       part = { region, layered: layers, layers: Object.fromEntries(names.map((name, k) => [name, pixels[k]])) };
       words.textContent = end.untouched
-        ? "Nothing to correct here: this part stays as it is."
-        : "This is what you get. Move the sliders to change it.";
+        ? form.dataset.nothing
+        : !seenWhole()
+          ? "The lower right shows what you get. Zoom in to see it elsewhere."
+          : "This is what you get. Sliders under More change it.";
       show();
       forget(made.id); // its pictures are here now
       if (layered() !== layers) look(); // a slider was moved meanwhile
@@ -122,22 +124,29 @@ export function setUpPreview(viewer) {
       words.textContent = `No preview: ${reason.message}`;
     }
   };
+  const seenWhole = () => viewer.region.width * viewer.region.height <= MOST;
+  // Of a view that is too large to compute: from the middle to a corner, where lenses blur most.
+  const lowerRight = () => {
+    const width = Math.min(MOST, Math.ceil(viewer.width / 2));
+    const height = Math.min(viewer.height, Math.max(1, Math.floor(MOST / width)));
+    return { x: viewer.width - width, y: viewer.height - height, width, height };
+  };
+  let wanted = !viewer.after; // a photo that is corrected already shows that until other settings are tried
   const look = () => {
     clearTimeout(timer);
+    if (!wanted || form.elements.lens_id?.value === "") return;
     timer = setTimeout(() => {
-      const region = viewer.region;
-      if (region.width * region.height > MOST) {
-        words.textContent = "Zoom in, or choose a place below, to see what a correction does there.";
-        return;
-      }
+      const region = seenWhole() ? viewer.region : lowerRight();
       if (part && covers(part, region) && (part.layered || !layered())) return;
       compute(region);
     }, PAUSE_MS);
   };
   viewer.onChange(look);
   form.addEventListener("input", () => {
+    const first = !wanted;
+    wanted = true;
     show();
-    if (part && layered() && !part.layered) look();
+    if (first || (part && layered() && !part.layered)) look();
   });
   form.elements.lens_id?.addEventListener("change", () => {
     part = null;

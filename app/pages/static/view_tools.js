@@ -37,11 +37,8 @@ function setWhole(root, on) {
 function setUpModes(root, viewer) {
   const buttons = [...root.querySelectorAll("[data-mode]")];
   const show = () => {
-    for (const button of buttons) {
-      button.setAttribute("aria-pressed", String(button.dataset.mode === viewer.mode));
-      button.disabled = !viewer.hasAfter && button.dataset.mode !== "before";
-    }
-    root.querySelector(".hold").disabled = !viewer.hasAfter;
+    for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.mode === viewer.mode));
+    for (const part of root.querySelectorAll(".modes, .hold")) part.hidden = !viewer.hasAfter;
   };
   for (const button of buttons)
     button.addEventListener("click", () => {

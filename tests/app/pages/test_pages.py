@@ -6,14 +6,17 @@ import base64
 import os
 import re
 import shutil
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # has no types
 from deadline import stretched
+from PIL import Image
 from playwright.sync_api import (
     Browser,
     ConsoleMessage,
@@ -178,6 +181,7 @@ def address_of(kind: str, learned: dict[str, Any], correction: dict[str, Any]) -
     return {
         "home": "/",
         "lens": f"/lenses/{learned['lens_id']}",
+        "tests": f"/lenses/{learned['lens_id']}/tests",
         "photo": f"/photos/{learned['id']}",
         "correction": f"/corrections/{correction['id']}",
     }[kind]
@@ -265,12 +269,11 @@ def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
     sent = service.upload(write_photo(tmp_path / "old.dng", 33, serial="", aperture=None, shape=SMALL))
     service.job(sent["id"], until=lambda job: job["state"] == "waiting")
     page.goto("/")
-    group = page.locator("[data-group]")
-    group.get_by_label("Or a new one, called").fill("Old 50 mm")
+    group = page.locator(".group")
 
     for given, hint in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
         group.get_by_label("Aperture, f/").fill(given)
-        group.get_by_role("button", name="Continue").click()
+        page.get_by_role("button", name="Learn from the ticked photos").click()
         expect(group.locator(".alert")).to_contain_text(hint)
     assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
@@ -280,24 +283,37 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
 ) -> None:
     sent = [service.upload(write_photo(tmp_path / "nameless-0.dng", 31, serial="", shape=SMALL))]
     service.job(sent[0]["id"], until=lambda job: job["state"] == "waiting")
+    Image.fromarray(np.full((200, 300, 3), 90, np.uint8)).save(tmp_path / "screenshot.png")
+    screen = service.upload(tmp_path / "screenshot.png")
+    service.job(screen["id"], until=lambda job: job["state"] == "waiting")
     page.goto("/")
-    group = page.locator("[data-group]")
-    expect(group).to_have_count(1)
-    # the group grows before the eyes, and is still one form
+    group = page.locator(".group", has=page.locator("legend", has_text="Test T-1"))
+    expect(page.locator(".group")).to_have_count(2)
+    # the group grows before the eyes
     sent.append(service.upload(write_photo(tmp_path / "nameless-1.dng", 32, serial="", shape=SMALL)))
-    expect(group.locator("legend")).to_contain_text("Test T-1, Test 35mm f/1.8, 35 mm: 2 photos")
-    expect(group).to_have_count(1)
+    expect(group.locator("legend")).to_contain_text("Test T-1, Test 35mm f/1.8: 2 photos")
     expect(group.locator("img").first).not_to_have_js_property("naturalWidth", 0)
+    expect(group.get_by_label("Its name")).to_have_value("Test 35mm f/1.8")
     assert faults(page) == []
 
-    group.get_by_role("button", name="Continue").click()
+    unknown = page.locator(".group", has=page.locator("legend", has_text="Unknown camera"))
+    expect(unknown.get_by_role("checkbox")).not_to_be_checked()
+    unknown.get_by_role("button", name="Leave out").click()
+    expect(page.locator(".group")).to_have_count(1)
+    expect(group.get_by_role("button", name="Leave out")).to_be_focused()
+    assert service.get(f"/v1/photos/{screen['id']}")["state"] == "cancelled"
+
+    learn = page.get_by_role("button", name="Learn from the ticked photos")
+    group.get_by_label("Its name").fill("")
+    learn.click()
     expect(group.locator(".alert")).to_have_text("Choose a lens, or give a new one a name.")
     wishes: list[str] = []
     page.on("request", lambda request: wishes.append(request.url) if request.method == "PATCH" else None)
-    group.get_by_label("Or a new one, called").fill("Grandfather's 35 mm")
-    group.get_by_role("button", name="Continue").click()
+    group.get_by_label("Its name").fill("Grandfather's 35 mm")
+    learn.click()
 
-    expect(page.locator("[data-group]")).to_have_count(0)
+    expect(page.locator(".group")).to_have_count(0)
+    expect(page.locator("#photos-title")).to_be_focused()
     assert [url.rpartition("/v1/")[2] for url in wishes] == ["photos"]
     for photo in sent:
         job = service.job(photo["id"], until=lambda job: job["state"] == "waiting")
@@ -320,16 +336,14 @@ def test_a_damaged_file_leaves_no_empty_lens(page: Page, service: Service, tmp_p
 
 
 def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, learned: dict[str, Any]) -> None:
-    page.goto(f"/lenses/{learned['lens_id']}")
+    page.goto(f"/lenses/{learned['lens_id']}/tests")
     expect(page.locator("#lens-state [data-settled]")).to_be_attached()
     field, words, drawn = page.locator("#field"), page.locator("#psf-words"), page.locator("#psf")
     expect(words).to_contain_text("of the way to the corner")
     expect(page.locator("#field img")).not_to_have_js_property("naturalWidth", 0)
     begun = drawn.evaluate(PICTURE)
 
-    box = field.bounding_box()
-    assert box is not None
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    field.click()
     expect(words).to_contain_text("In the centre")
     assert drawn.evaluate(PICTURE) != begun
     field.press("ArrowRight")
@@ -350,20 +364,13 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
 
 
-def test_a_lens_shows_what_it_has_seen_and_how_it_learned(page: Page, learned: dict[str, Any]) -> None:
-    def newest_alone(route: Route) -> None:
-        # two photos done at the same moment make two measured versions, whose curve replaces the words
-        answer = route.fetch()
-        route.fulfill(response=answer, json={"items": answer.json()["items"][-1:], "next": None})
-
-    page.route("**/calibrations", newest_alone)
-    page.goto(f"/lenses/{learned['lens_id']}")
+def test_a_lens_shows_where_photos_had_detail_and_its_versions(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}/tests")
 
     expect(page.locator("#lens-state [data-settled]")).to_be_attached()
     page.get_by_label("Show where photos had detail").check()
     expect(page.locator("#coverage")).to_be_visible()
     assert page.locator("#coverage ellipse").count() >= learned["patches"]["done"]
-    expect(page.locator("#history")).to_contain_text("photos")
     page.get_by_text("All versions").click()
     versions = page.get_by_role("region", name="Calibration history")
     expect(versions.locator("tbody tr").first).to_be_visible()
@@ -374,7 +381,19 @@ def test_two_measured_versions_make_a_curve(page: Page, learned: dict[str, Any])
     errors = [{}, {"center": 0.2, "mid": 0.3, "corner": 0.4}, {"center": 0.1, "mid": 0.2, "corner": 0.3}]
     items = [{"version": k, "error": error} for k, error in enumerate(errors, start=1)]
     page.route("**/calibrations", lambda route: route.fulfill(json={"items": items, "next": None}))
-    page.goto(f"/lenses/{learned['lens_id']}")
+
+    def with_a_place(route: Route) -> None:  # its versions may be measured both at once
+        answer = route.fetch()
+        body = answer.text()
+        script = '<script src="/static/vendor/uplot.min.js" defer></script>'
+        if 'id="history"' not in body:
+            body = body.replace("</head>", f"{script}</head>")
+            place = f'<div id="history" class="plot" data-lens="{learned["lens_id"]}"></div>'
+            body = body.replace("<details><summary>All versions", f"{place}<details><summary>All versions")
+        route.fulfill(response=answer, body=body)
+
+    page.route(f"**/lenses/{learned['lens_id']}/tests", with_a_place)
+    page.goto(f"/lenses/{learned['lens_id']}/tests")
 
     expect(page.locator("#history canvas")).to_be_visible()
     expect(page.locator("#history .u-legend")).to_contain_text("Corners")
@@ -433,6 +452,7 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
     page.get_by_role("button", name="After", exact=True).click()
     full = shown(page)
 
+    page.get_by_text("More", exact=True).click()
     page.get_by_label("Strength").fill("0")
     none = shown(page)
     assert none != full
@@ -444,7 +464,7 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
     assert shown(page) not in {none, full}
     assert asked == []  # mixed here, from what is there
     with page.expect_request(lambda request: request.url.endswith("/preview")) as more:
-        page.get_by_label("Grain removed").fill("1")
+        page.get_by_label("Noise reduction").fill("1")
     assert more.value.post_data_json["layers"] is True  # only now: they take as long again
     half = shown(page)
     page.wait_for_function(  # looking with each picture of the screen would take longer than the preview
@@ -459,7 +479,8 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
 
 def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], tmp_path: Path) -> None:
     page.goto(f"/photos/{learned['id']}")
-    page.get_by_text("Method", exact=True).first.click()
+    expect(page.get_by_role("button", name="Hold to see before")).to_be_hidden()  # there is nothing else yet
+    page.get_by_text("More", exact=True).click()
     page.get_by_label("Method").select_option("fast")  # the page is the same after the slow one
     page.get_by_label("File").select_option("jpeg")
     page.get_by_role("button", name="Correct this photo").click()
@@ -524,6 +545,29 @@ def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], 
     assert b"xpacket" in saved
 
 
+def test_photos_are_chosen_corrected_and_downloaded_together(
+    page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
+) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+    page.get_by_role("checkbox", name="Choose wall-0.dng").check()
+    expect(page.get_by_role("button", name="Correct 1 photo")).to_be_visible()
+    page.get_by_role("button", name="Choose all").click()
+    page.get_by_role("button", name="Correct 2 photos").click()
+    page.wait_for_url("**/batch?ids=*")
+    expect(page.locator("#batch-state .lead")).to_have_text("All done")
+    assert faults(page) == []
+
+    with page.expect_download() as got:
+        page.get_by_role("link", name="Download 2 photos").click()
+    got.value.save_as(tmp_path / "corrected.zip")
+    with zipfile.ZipFile(tmp_path / "corrected.zip") as archive:
+        assert archive.testzip() is None
+        assert sorted(archive.namelist()) == ["wall-0-corrected.tif", "wall-1-corrected.tif"]
+    page.goto(f"/photos/{learned['id']}")  # it shows its correction
+    expect(page.locator("#viewer")).to_have_attribute("data-shown", "split")
+    expect(page.get_by_role("link", name="Download the corrected photo")).to_be_visible()
+
+
 def test_fingers_zoom_and_move_the_view(page: Page, correction: dict[str, Any]) -> None:
     page.goto(f"/corrections/{correction['id']}")
     stage = page.locator(".stage")
@@ -542,16 +586,35 @@ def test_fingers_zoom_and_move_the_view(page: Page, correction: dict[str, Any]) 
     expect(page.locator(".zoom-words")).not_to_have_text(first)
 
 
-def test_a_lens_has_charts_a_verdict_and_a_report(
+def test_a_lens_answers_three_questions_on_one_screen(page: Page, learned: dict[str, Any]) -> None:
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.goto(f"/lenses/{learned['lens_id']}")
+
+    expect(page.locator("#lens-state [data-settled]")).to_be_attached()
+    expect(page.locator(".verdict")).to_contain_text("this copy is")
+    expect(page.locator("section[aria-labelledby=copy-title]")).to_contain_text(
+        re.compile("Yes|No|Not known")
+    )
+    expect(page.locator("section[aria-labelledby=next-title]")).to_contain_text("photo")
+    expect(page.locator(".map")).not_to_have_js_property("naturalWidth", 0)
+    bottom = page.evaluate("Math.max(...[...document.querySelectorAll('.answers > *')].map("
+        "(part) => part.getBoundingClientRect().bottom))")  # fmt: skip
+    assert bottom <= 900
+    page.get_by_role("link", name="f/5.6").click()
+    expect(page.locator(".verdict")).to_contain_text("At f/5.6")
+
+
+def test_a_lens_has_charts_that_are_read_and_a_report(
     page: Page, service: Service, learned: dict[str, Any]
 ) -> None:
     page.goto(f"/lenses/{learned['lens_id']}")
     expect(page.locator("#lens-state [data-settled]")).to_be_attached()
+    page.get_by_role("link", name="Charts and figures").click()
     expect(page.locator("#charts img").first).to_be_visible()
-    expect(page.locator(".verdict")).to_contain_text("this copy is")
-    expect(page.locator("section[aria-labelledby=centring-title]")).to_contain_text(
-        re.compile("Yes|No|Undecided")
-    )
+    smallest = "(image) => 7 * 96 / 72 * image.clientWidth / image.naturalWidth"  # figures in a cell of a map
+    for width in WIDTHS:
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.locator("#charts img").first.evaluate(smallest) >= 12.0, width
     charts = service.http.get(f"/ui/lenses/{learned['lens_id']}/charts?aperture=5.6&against=at%205.6").text
     assert "Compared with" not in charts  # with itself there is nothing to compare
     controls = page.locator("#chart-controls")
@@ -578,6 +641,7 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
         for k in range(2)
     ]
     page.goto(f"/lenses/{made[0]}")
+    page.get_by_text("Rename, merge").click()
     with page.expect_download() as got:
         page.get_by_role("link", name="Download the profile").click()
     got.value.save_as(tmp_path / "one.lensprofile")
@@ -585,40 +649,51 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_role("button", name="Rename").click()
     expect(page.locator("h1")).to_have_text("My first")
 
-    page.on("dialog", lambda dialog: dialog.accept())
+    page.get_by_text("Rename, merge").click()
     page.get_by_label("It is the same copy as").select_option(made[1])
     page.get_by_role("button", name="Merge into it").click()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("button", name="Merge into it")).to_be_focused()
+    page.get_by_role("button", name="Merge into it").click()
+    page.get_by_role("button", name="Merge", exact=True).click()
     page.wait_for_url(f"**/lenses/{made[1]}")
     expect(page.locator(".facts").first).to_contain_text("2 photos")
     assert service.http.get(f"/v1/lenses/{made[0]}").status_code == 404
 
     before = service.get(f"/v1/lenses/{made[1]}")
+    page.get_by_text("Rename, merge").click()
     page.get_by_label("Add a lens profile").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
     expect(page.locator(".facts").first).to_contain_text("3 photos")
     assert service.get(f"/v1/lenses/{made[1]}")["samples"] > before["samples"]
+    page.goto(f"/lenses/{made[1]}/tests")
     page.get_by_text("All versions").click()
     page.get_by_role("button", name=f"Go back to {before['version']}").click()
+    with page.expect_navigation():
+        page.get_by_role("dialog").get_by_role("button", name="Go back").click()
+    page.goto(f"/lenses/{made[1]}")
     expect(page.locator(".facts").first).to_contain_text("2 photos")
+    page.get_by_text("Rename, merge").click()
     page.get_by_role("button", name="Delete lens").click()
+    page.get_by_role("button", name="Delete the lens").click()
     page.wait_for_url("**/")
 
 
 @pytest.mark.slow  # page and request without a browser: test_parts.py, test_lens_model.py
 def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tmp_path: Path) -> None:
     lens = service.calibrated(write_photo(tmp_path / "w.dng", 71, serial="W-1"))["lens_id"]
-    page.goto(f"/lenses/{lens}")
-    expect(page.locator(".facts").first).to_contain_text("Model: default")
-    choice = page.locator("#lens-actions [data-act=model]")
-    choice.get_by_label("Model").select_option("paper")
+    page.goto(f"/lenses/{lens}/tests")
+    part, choice = page.locator("section[aria-labelledby=research-title]"), page.locator("#model")
+    expect(part).to_contain_text("Model: default")
+    choice.get_by_label("Learn it with").select_option("paper")
     choice.get_by_role("button", name="Change").click()
     expect(page.locator("#lens-state")).to_contain_text(
         "Being measured anew for the model paper: 1 photo to go"
     )
-    expect(page.locator(".facts").first).to_contain_text("Model: default")
+    expect(part).to_contain_text("Model: default")
     assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "paper"
 
-    choice.get_by_label("Model").select_option("default")
+    choice.get_by_label("Learn it with").select_option("default")
     choice.get_by_role("button", name="Change").click()
     expect(page.locator("#lens-state")).not_to_contain_text("measured anew")
     assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "default"
@@ -657,7 +732,7 @@ def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(
     visitor.complaints.clear()  # the browser notes each 404
 
 
-@pytest.mark.parametrize("kind", ["home", "lens", "photo", "correction"])
+@pytest.mark.parametrize("kind", ["home", "lens", "tests", "photo", "correction"])
 def test_a_page_is_accessible_fits_each_screen_and_shows_the_focus(
     page: Page, learned: dict[str, Any], correction: dict[str, Any], kind: str
 ) -> None:

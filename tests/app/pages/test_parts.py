@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from app.jobs import tasks
 from app.jobs.body_keys import body_key
 from app.jobs.task_files import PREVIEW, R_MAP, SIDES, THUMBNAIL
 from app.main import create_app
+from app.pages.batch import unused_name
 from app.pages.groups import grouped
 from app.pages.pictures import in_sensor, upright_point
 from app.runtime.settings import Settings
@@ -29,6 +31,7 @@ from app.store import LensName, Store
 from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.photo_steps import photo_folder
+from app.store.tables import PhotoRow
 from lensmodel.core.types import ignore_step
 from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
@@ -179,6 +182,42 @@ def test_a_corrected_dng_is_looked_at_and_its_audit_told(
     assert "open it in your RAW developer" in page
 
 
+def test_the_page_of_a_photo_shows_its_correction(client: TestClient, corrected: dict[str, Any]) -> None:
+    page = client.get(f"/photos/{corrected['photo_id']}").text
+
+    assert f'data-after="/ui/corrections/{corrected["id"]}/tiles/after"' in page
+    assert f'href="/v1/corrections/{corrected["id"]}/result" download' in page
+    assert "Nothing to correct here.</b> Removing the blur would not make it visibly better" in page
+
+
+def test_corrections_are_followed_and_fetched_together(client: TestClient, corrected: dict[str, Any]) -> None:
+    wish = {"photo_id": corrected["photo_id"], "output": {"format": "png8"}}
+    waiting = client.post("/v1/corrections", json=wish).json()["id"]
+    ids = f"{corrected['id']},{waiting}"
+
+    page, part = client.get(f"/batch?ids={ids}").text, client.get(f"/ui/parts?page=batch&id={ids}").json()
+    archive = client.get(f"/batch.zip?ids={ids},{corrected['id']}")
+
+    assert "2 corrections" in page
+    assert "1 of 2 done" in part["batch-state"]
+    assert "Nothing to correct: left as it was" in part["batch-state"]
+    with zipfile.ZipFile(io.BytesIO(archive.content)) as files:
+        assert {name: files.read(name) for name in files.namelist()} == {"p.dng": b"a"}
+    assert client.get(f"/batch.zip?ids={waiting}").status_code == 409
+    assert client.get("/batch?ids=gone").status_code == 404
+
+
+def test_files_of_one_name_have_two_in_an_archive() -> None:
+    used: set[str] = set()
+
+    assert [unused_name(name, used) for name in ("a.tif", "A.tif", "b.tif", "a.tif")] == [
+        "a.tif",
+        "A (2).tif",
+        "b.tif",
+        "a (3).tif",
+    ]
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_part_of_the_upright_photo_is_found_on_the_sensor(orientation: int) -> None:
     sensor = np.arange(30 * 50).reshape(30, 50)
@@ -262,6 +301,24 @@ def test_waiting_photos_are_grouped_by_body_and_focal_length(steps: Steps, store
     ]
     assert {g.body for g in groups} == {1, 2}
     assert all(g.needs_aperture for g in groups)
+    assert all(g.name == f"Kamera One, body {g.body}, {g.focal_mm:g} mm" for g in groups)
+
+
+@pytest.mark.parametrize(
+    ("maker", "model", "lens", "name"),
+    [
+        ("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", None, "Kodak Z612, 5.85 mm"),
+        ("NIKON CORPORATION", "NIKON D1", None, "Nikon D1, 5.85 mm"),
+        ("FUJIFILM", "X-T3", None, "Fujifilm X-T3, 5.85 mm"),
+        ("Canon", "Canon EOS D30", "16-35 mm", "Canon 16-35 mm"),
+        ("Canon", "Canon EOS 6D", "EF24-105mm f/4L IS USM", "EF24-105mm f/4L IS USM"),
+        (None, None, None, "5.85 mm"),
+    ],
+)
+def test_a_lens_is_proposed_a_name(maker: str | None, model: str | None, lens: str | None, name: str) -> None:
+    row = PhotoRow(camera_maker=maker, camera_model=model, lens_model=lens, focal_mm=5.85, aperture=2.8)
+
+    assert grouped([row])[0].name == name
 
 
 def test_a_photo_that_lacks_only_its_aperture_is_asked_for_nothing_else(
@@ -287,7 +344,7 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
         store.photos.change(photo.public_id, "local", {"aperture": 2.0})
     store.lenses.record_metrics(lens_id, 202, {"error": {}, "coverage": {"corner": 77}})
 
-    page = client.get(f"/lenses/{lens_id}").text
+    page = client.get(f"/lenses/{lens_id}/tests").text
 
     assert "<td>202</td>" in page
     assert "77 places" in page
@@ -300,17 +357,17 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     lens = steps.lens_id(photos[0])
 
     def shown() -> str:
-        answer = client.get(f"/lenses/{lens}")
+        answer = client.get(f"/lenses/{lens}/tests")
         assert answer.status_code == 200, answer.text
         return answer.text
 
-    assert "<li>Model: default</li>" in shown()
+    assert "Model: default, from" in shown()
     assert "to compare with" in shown()
     assert "measured anew" not in shown()
     client.patch(f"/v1/lenses/{lens}", json={"model": "paper"})
     page = shown()
     assert "Being measured anew for the model paper: 2 photos to go." in page
-    assert ("<li>Model: default</li>" in page, '<option value="paper" selected>' in page) == (True, True)
+    assert ("Model: default, from" in page, '<option value="paper" selected>' in page) == (True, True)
     for photo in photos:
         store.photos.fail(photo.public_id, 2, "no_usable_patches", "nothing there")
     assert "None of its photos could be measured for the model paper, so it answers" in shown()
@@ -320,10 +377,26 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     steps.plan(again)
     steps.estimate(again)
     store.photos.finish(again.public_id, again.epoch)
-    assert "<li>Model: paper</li>" in shown()
+    assert "Model: paper, from" in shown()
+    assert "Model:" not in client.get(f"/lenses/{lens}").text
     assert "learned anew from all photos, model paper" in shown()
     photo_page = client.get(f"/photos/{photos[0].public_id}").text
     assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
+
+
+def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_sections(
+    client: TestClient, steps: Steps
+) -> None:
+    lens = steps.lens_id(steps.counted(aperture=1.4))
+    steps.counted(aperture=5.6)
+
+    page = client.get(f"/lenses/{lens}?aperture=5.6").text
+
+    assert f"/v1/lenses/{lens}/field.png?grid=9x6&amp;size=25&amp;aspect=1.5&amp;aperture=5.6" in page
+    assert re.search(r'href="\?aperture=5.6" aria-current="true"', page)
+    assert "Is it a good copy?" not in page  # there is no report yet
+    assert "Which photo next?" not in page
+    assert client.get(f"/lenses/{lens}?aperture=wide").status_code == 422
 
 
 def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
@@ -349,7 +422,16 @@ def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/ui/parts?page=home", "/lenses/{lens}", "/v1/jobs", "/v1/lenses", "/v1/photos"]
+    "path",
+    [
+        "/",
+        "/ui/parts?page=home",
+        "/lenses/{lens}",
+        "/lenses/{lens}/tests",
+        "/v1/jobs",
+        "/v1/lenses",
+        "/v1/photos",
+    ],
 )
 def test_no_page_asks_the_tables_once_for_each_thing_on_it(
     client: TestClient, store: Store, steps: Steps, path: str

@@ -179,9 +179,11 @@ def test_a_report_that_is_not_made_yet_says_so(client: TestClient, steps: Steps)
 
 
 def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) -> None:
-    page = client.get(f"/lenses/{reported}").text
+    first, page = client.get(f"/lenses/{reported}").text, client.get(f"/lenses/{reported}/tests").text
 
-    assert "this copy is" in page
+    for title in ("What it does to your pictures", "Is it a good copy?", "Which photo next?"):
+        assert title in first
+    assert "this copy is" in first
     assert 'alt="MTF50 in cycles/pixel' in page
     charts = client.get(f"/ui/lenses/{reported}/charts", params={"unit": "lp/mm", "aperture": "1.4"})
     assert "MTF50 in line pairs per mm" in charts.text

@@ -294,6 +294,15 @@ def test_the_field_map_has_a_kernel_for_each_cell(client: TestClient, lens: str)
     assert same.status_code == 304
 
 
+def test_the_field_map_hatches_what_is_not_known(client: TestClient, lens: str) -> None:
+    answer = client.get(f"{lens}/field.png?aperture=22&grid=4x3&size=15")
+
+    cell = np.asarray(Image.open(io.BytesIO(answer.content)))[2:17, 2:17]
+    assert set(cell.ravel()) == {40, 110}
+    np.testing.assert_array_equal(cell, cell.T)  # strokes, not a kernel
+    assert (cell[0, :2] == 110).all()
+
+
 @pytest.mark.parametrize("grid", ["0x3", "26x1", "axb", "9", "-1x2"])
 def test_a_bad_grid_is_refused(client: TestClient, lens: str, grid: str) -> None:
     answer = client.get(f"{lens}/field.png?grid={grid}")

@@ -19,8 +19,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lensmodel import photo
+from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.headers.ciff import MAX_HEAPS, MAX_RECORDS, read_ciff
 from lensmodel.photo.mosaic import Mosaic
+from lensmodel.photo.raw import raw_size
 from lensmodel.photo.rendition import balance_of_rendition
 from lensmodel.photo.tags.metadata import read_metadata
 
@@ -247,3 +249,14 @@ def test_balance_is_unknown_where_nothing_is_grey() -> None:
     light = scene(grey=False) * np.array([1.0, 0.3, 0.1])
     mosaic = mosaic_of(light, (1.2, 1.0, 1.9))
     assert balance_of_rendition(Opened(jpeg_of(light)), mosaic, None) is None  # type: ignore[arg-type]  # as above
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.99])
+def test_a_crw_that_is_cut_off_is_damaged_not_of_an_unknown_kind(kept: float, tmp_path: Path) -> None:
+    whole = crw({**D30, 0x2005: bytes(4096)})
+    for name, data in (("whole.crw", whole), ("cut.crw", whole[: int(len(whole) * kept)])):
+        (tmp_path / name).write_bytes(data)
+
+    raw_size(tmp_path / "whole.crw")
+    with pytest.raises(TruncatedImageError, match="ends before its data"):
+        raw_size(tmp_path / "cut.crw")

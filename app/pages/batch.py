@@ -1,0 +1,107 @@
+"""Several corrections on one page, and their files in one archive."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import PurePath
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query
+from fastapi.responses import HTMLResponse, StreamingResponse
+
+from app.errors import NotReadyError
+from app.http import views
+from app.http.dependencies import Call, CallDep
+from app.pages.rendering import page
+from app.routes.corrections import find_plan
+from app.store.corrections import CorrectionPlan
+
+MAX_LENGTH: Final = 4000
+"""Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have."""
+
+Ids = Annotated[str, Query(max_length=MAX_LENGTH)]
+
+router = APIRouter(include_in_schema=False)
+
+
+def state(call: Call, ids: str) -> dict[str, Any]:
+    """Return what the page shows of corrections whose ids have commas between them."""
+    plans = _plans(call, ids)
+    jobs = [views.correction_job(plan) for plan in plans]
+    return {
+        "rows": list(zip(plans, map(views.correction_out, plans), jobs, strict=True)),
+        "left": sum(job.state in {"queued", "running"} for job in jobs),
+        "done": sum(job.state == "succeeded" for job in jobs),
+        "ids": ids,
+    }
+
+
+@router.get("/batch")
+def batch_page(ids: Ids, call: CallDep) -> HTMLResponse:
+    """Show how far several corrections are."""
+    return page("batch.html", **state(call, ids))
+
+
+@router.get("/batch.zip")
+def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
+    """Return the files of the corrections that are done."""
+    plans = [plan for plan in _plans(call, ids) if plan.correction.state == "succeeded"]
+    if not plans:
+        raise NotReadyError("none of these corrections is done yet: wait for them")
+    headers = {
+        "Content-Disposition": 'attachment; filename="corrected.zip"',
+        "X-Content-Type-Options": "nosniff",
+    }
+    return StreamingResponse(_zipped(call, plans), media_type="application/zip", headers=headers)
+
+
+def _plans(call: Call, ids: str) -> list[CorrectionPlan]:
+    return [find_plan(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
+
+
+class _Sent(io.RawIOBase):
+    """Keeps what is written until it is taken."""
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:  # noqa: ANN401 - any buffer
+        self._kept += data
+        return len(data)
+
+    def take(self) -> bytes:
+        taken, self._kept = bytes(self._kept), bytearray()
+        return taken
+
+
+def _zipped(call: Call, plans: Sequence[CorrectionPlan]) -> Iterator[bytes]:
+    """Yield an archive of files that are compressed already, part by part: none is held as a whole."""
+    sent, used = _Sent(), set[str]()
+    with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
+        for plan in plans:
+            row = plan.correction
+            assert row.result_key is not None
+            assert row.result_bytes is not None
+            entry = zipfile.ZipInfo(
+                unused_name(row.result_name or row.public_id, used), plan.photo.received_at.timetuple()[:6]
+            )
+            with archive.open(entry, "w", force_zip64=True) as file:
+                for part in call.storage.stream(row.result_key, 0, row.result_bytes):
+                    file.write(part)
+                    yield sent.take()
+    yield sent.take()
+
+
+def unused_name(name: str, used: set[str]) -> str:
+    """Return a name that no file of the archive has yet."""
+    path, count, free = PurePath(name), 1, name
+    while free.casefold() in used:
+        count += 1
+        free = f"{path.stem} ({count}){path.suffix}"
+    used.add(free.casefold())
+    return free

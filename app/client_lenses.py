@@ -90,13 +90,18 @@ class LensCalls(Connection):
         """Save what was learned of a lens as a `.lensprofile`."""
         return self._save(f"/v1/lenses/{lens_id}/profile", Path(path))
 
-    def add_profile(self, lens_id: str, path: str | Path) -> s.LensOut:
+    def create_lens(self, label: str) -> s.LensOut:
+        """Create a lens, to add a profile to."""
+        return read(s.LensOut, self._http.post("/v1/lenses", json={"label": label}))
+
+    def add_profile(self, lens_id: str, path: str | Path, *, any_lens: bool = False) -> s.LensOut:
         """Let what a `.lensprofile` knows join a lens; the same file a second time changes nothing.
 
-        Returns the lens as it is before where a worker has yet to read the file.
+        One that seems to be of another lens is refused without `any_lens`. Returns the lens as it is before
+        where a worker has yet to read the file.
         """
         headers = {"Content-Type": "application/zip"}
-        address = f"/v1/lenses/{lens_id}/profile"
+        address = f"/v1/lenses/{lens_id}/profile{'?any_lens=true' if any_lens else ''}"
         return read(s.LensOut, self._http.put(address, content=Path(path).read_bytes(), headers=headers))
 
     def save_report(

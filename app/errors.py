@@ -100,6 +100,12 @@ class ConflictError(ServiceError):
     status, code = 409, "conflict"
 
 
+class OtherLensError(ConflictError):
+    """It seems to be of another lens than the one that is named for it."""
+
+    code = "other_lens"
+
+
 class NotAcceptableError(ServiceError):
     """None of the accepted formats is available."""
 

@@ -67,6 +67,7 @@ STATUS_OF_CODE: Final[Mapping[str, int]] = {
     "unknown_lens": 404,
     "not_ready": 409,
     "conflict": 409,
+    "other_lens": 409,
     "cancelled": 409,
     "quota_exceeded": 429,
     "busy": 503,

@@ -182,6 +182,7 @@ class ReadProfile(Answer):
     mode: Annotated[str, Field(max_length=20)]
     samples: Annotated[int, Field(ge=1, le=200_000)]
     photos: Annotated[dict[Text, Text], Field(max_length=100_000)]
+    lens: Annotated[dict[Text, Text], Field(max_length=100)]
 
 
 def checked(kind: type[A], answer: Any) -> dict[str, Any]:  # noqa: ANN401 - a child's JSON

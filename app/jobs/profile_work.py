@@ -7,6 +7,7 @@ from typing import Final
 from app.jobs.answers import ReadProfile, checked
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
 from app.jobs.sample_files import DAMAGED, returned_samples
+from app.other_lens import REMEDY, Described, difference
 from app.sandbox.outcome import TaskLimits
 from app.store.access.owners import ANY_OWNER
 from app.store.profile_intake import take_in
@@ -51,6 +52,13 @@ def read_in(context: JobContext, file: PhotoRow) -> None:
     if configured_way(settings, lens.way).mode != read["mode"]:
         text = f"the profile was learned with the model {read['mode']}, lens {lens.public_id} with {lens.way}"
         raise JobFailedError("conflict", f"{text}: send it to a lens of that model")
+    if not file.given.get("any_lens"):
+        focals = store.lenses.coverage_of([lens])[lens.id][1]
+        named = {name: read["lens"].get(name) for name in ("maker", "model", "serial")}
+        other = Described(**named, focals_mm={s.settings.focal_mm for s in samples if s.settings.focal_mm})
+        why = difference(Described(lens.maker, lens.model, lens.serial, focals_mm=focals), other)
+        if why is not None:
+            raise JobFailedError("other_lens", f"the profile seems to be of another lens: {why}; {REMEDY}")
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
     if take_in(store.database, file, samples, names) is None:
         raise NotWantedError

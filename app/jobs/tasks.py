@@ -302,7 +302,8 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         read = read_profile(file, "This file")
     samples = read.model.samples
     write_samples(folder, samples)
-    return {"mode": read.model.settings.mode, "samples": len(samples), "photos": read.photos}
+    named = {"photos": read.photos, "lens": read.lens}
+    return {"mode": read.model.settings.mode, "samples": len(samples), **named}
 
 
 TASKS: Final[Mapping[str, Task]] = {

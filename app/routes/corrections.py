@@ -13,6 +13,7 @@ from app.errors import (
     ConflictError,
     InvalidParameterError,
     NotReadyError,
+    OtherLensError,
     QuotaError,
     RangeError,
     UnknownCorrectionError,
@@ -21,6 +22,7 @@ from app.http import views
 from app.http.dependencies import Call, CallDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
+from app.other_lens import REMEDY, Described, difference
 from app.routes.common import Cursor, Limit, OnlyId, matches_tag, named_lens, next_link, problems
 from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
@@ -30,6 +32,7 @@ from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
 from app.ways import configured_way
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
+from lensmodel.core.names import camera_name
 from lensmodel.correction import deconvolvers
 
 router = APIRouter(tags=["corrections"])
@@ -62,6 +65,8 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     _check_read(photo)
     _check_region(photo, options)
     lens = _lens_for(call, photo, options.lens_id)
+    if not options.any_lens and lens.id != photo.lens_id:
+        _check_lens(call, photo, lens)
     version = _version_for(call, lens, options.lens_version)
     _admit(call)
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
@@ -127,6 +132,29 @@ def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     raise MetadataMissingError(
         f"photo {photo.public_id} does not say which lens it was taken with: send lens_id"
     )
+
+
+def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
+    """Refuse a photo that seems to be of another lens, as the command line does."""
+    own = call.store.photos.page(call.owner, before=None, limit=200, lens_id=lens.public_id)
+    known = Described(
+        lens.maker,
+        lens.model,
+        lens.serial,
+        {camera_name(row.camera_maker, row.camera_model) for row in own if row.camera_model},
+        [row.focal_mm for row in own if row.focal_mm],
+    )
+    camera = camera_name(photo.camera_maker, photo.camera_model)
+    own_lens = Described(
+        photo.lens_maker,
+        photo.lens_model,
+        photo.lens_serial,
+        [camera] if photo.camera_model else [],
+        [photo.focal_mm] if photo.focal_mm else [],
+    )
+    why = difference(known, own_lens)
+    if why is not None:
+        raise OtherLensError(f"{photo.filename} seems to be of another lens: {why}; {REMEDY}")
 
 
 def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:

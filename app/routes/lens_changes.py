@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, status
 from pydantic import Field
 
 from app.errors import ConflictError, InvalidParameterError
@@ -27,6 +27,20 @@ class LensChange(Question):
     back_to: int | None = Field(
         None, ge=1, le=MAX_VERSION, description="a version: photos that joined later are left out"
     )
+
+
+class LensIn(Question):
+    """A lens of which nothing is known yet but its name."""
+
+    label: Name = Field(description="what its owner calls it")
+
+
+@router.post(
+    "/lenses", operation_id="createLens", status_code=status.HTTP_201_CREATED, responses=problems(422)
+)
+def create_lens(new: LensIn, call: CallDep) -> LensOut:
+    """Create a lens, to add a profile to; photos create theirs by themselves."""
+    return read_lens(call.store.lens_changes.create(call.owner, new.label), call)
 
 
 @router.patch("/lenses/{lens_id}", operation_id="changeLens", responses=problems(404, 409, 422))

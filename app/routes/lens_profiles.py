@@ -8,12 +8,19 @@ import io
 import re
 import time
 from collections.abc import Mapping
-from typing import Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, Query, Response, status
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import ConflictError, MalformedUploadError, ServiceError, TooLargeError, UnknownLensError
+from app.errors import (
+    ConflictError,
+    MalformedUploadError,
+    OtherLensError,
+    ServiceError,
+    TooLargeError,
+    UnknownLensError,
+)
 from app.http import upload
 from app.http.dependencies import Call, CallDep
 from app.http.views import V1
@@ -23,6 +30,7 @@ from app.routes.lenses import find_lens, read_lens
 from app.routes.photos import delete_photo, receiving, recorded
 from app.schemas import LensOut
 from app.store.tables import PHOTO_FINAL, PROFILE_FILE, PhotoRow
+from lensmodel.core.names import full_name
 from lensmodel.model.profile import LensProfile, write_profile
 
 router = APIRouter(tags=["lenses"])
@@ -39,6 +47,7 @@ _REFUSALS: Final[Mapping[str, type[ServiceError]]] = {
     "image_too_large": TooLargeError,
     "memory_limit": TooLargeError,
     "unknown_lens": UnknownLensError,
+    "other_lens": OtherLensError,
 }
 """Responses by the code with which the reading of a profile failed; all others are conflicts."""
 
@@ -61,7 +70,7 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     )
     out = io.BytesIO()
     write_profile(out, profile)
-    words = lens.label or " ".join(word for word in (lens.maker, lens.model) if word)
+    words = lens.label or full_name(lens.maker, lens.model)
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", words).strip("-") or "lens"
     headers = {
         "Content-Disposition": f'attachment; filename="{plain}.lensprofile"',
@@ -80,7 +89,11 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     ),
     openapi_extra={"requestBody": {"required": True, "content": _FILE}},
 )
-async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
+async def add_lens_profile(
+    lens_id: str,
+    call: CallDep,
+    any_lens: Annotated[bool, Query(description="also where it seems to be of another lens")] = False,
+) -> LensOut:
     """Let what a profile knows join a lens; each of its photos counts as one, without its file.
 
     A worker reads it: the answer is the lens with it, or 202 where that takes longer than a long poll.
@@ -89,7 +102,7 @@ async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     await run_in_threadpool(find_lens, call, lens_id)
     async with receiving(call) as (public_id, key):
         digest, size = await upload.receive_profile(call.request, call.storage, key, limit=MAX_BYTES)
-    file = await run_in_threadpool(_record, call, lens_id, public_id, key, digest, size)
+    file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
     end = time.monotonic() + call.settings.long_poll_seconds
     while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
         await asyncio.sleep(LOOK_S)
@@ -104,7 +117,9 @@ async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     return await run_in_threadpool(read_lens, lens_id, call)
 
 
-def _record(call: Call, lens_id: str, public_id: str, key: str, digest: str, size: int) -> PhotoRow | None:
+def _record(
+    call: Call, lens_id: str, any_lens: bool, public_id: str, key: str, digest: str, size: int
+) -> PhotoRow | None:
     """Store the file of a profile like that of a photo; another lens may be sent the same."""
     name = f"{lens_id}.lensprofile"
     same = hashlib.sha256(f"{name}|{digest}".encode()).hexdigest()
@@ -117,7 +132,7 @@ def _record(call: Call, lens_id: str, public_id: str, key: str, digest: str, siz
         kind=PROFILE_FILE,
         byte_size=size,
         calibrate=True,
-        given={"lens_id": lens_id},
+        given={"lens_id": lens_id} | ({"any_lens": True} if any_lens else {}),
     ).photo
 
 

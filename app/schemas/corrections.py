@@ -41,6 +41,7 @@ class CorrectionIn(Question):
     photo_id: Id
     lens_id: Id | None = Field(None, description="default: the lens of the photo")
     lens_version: int | None = Field(None, ge=1, le=MAX_VERSION, description="default: the newest")
+    any_lens: bool = Field(default=False, description="also where the photo seems to be of another lens")
     method: str | None = Field(
         None,
         min_length=1,

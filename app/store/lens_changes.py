@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from sqlalchemy import select
 
-from app.store.access.owners import find_to_change
+from app.store.access.owners import ensure_owner, find_to_change
 from app.store.database import Database
 from app.store.lens_ways import choose_way, photos_of
+from app.store.lenses import LensName, named
 from app.store.removal import forget
 from app.store.sample_moves import move_photo, switch
 from app.store.tables import EventRow, LensRow, PhotoRow
@@ -19,6 +20,12 @@ class LensChanges:
 
     def __init__(self, database: Database) -> None:
         self._db = database
+
+    def create(self, owner: str, label: str) -> str:
+        """Create a lens of that name; return its id."""
+        with self._db.writing() as session:
+            name = LensName(None, None, None, label=label)
+            return named(session, ensure_owner(session, owner), name).public_id
 
     def rename(self, lens_id: str, owner: str, label: str | None) -> bool:
         """Set or remove the name that an owner gives a lens; False if there is no such lens."""

@@ -2,7 +2,7 @@
 
 import { setUpBatch } from "./batch.js";
 import { setUpActions, setUpForms, setUpGroups, setUpSettling } from "./forms.js";
-import { setUpCharts, setUpField, setUpHistory, setUpLensActions, setUpVersions } from "./lens.js";
+import { setUpCharts, setUpField, setUpHistory, setUpLensActions, setUpNewLens, setUpVersions } from "./lens.js";
 import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
@@ -20,6 +20,7 @@ const parts = [
   setUpField,
   setUpCharts,
   setUpLensActions,
+  setUpNewLens,
   setUpVersions,
   setUpHistory,
   setUpPhoto,

@@ -31,13 +31,30 @@ export function refusalText(answered, status) {
   }
 }
 
+// The answer that something was refused, as an error: its text, and its code for those who know what to do.
+export async function failure(response) {
+  const problem = await response.clone().json().catch(() => ({}));
+  return Object.assign(new Error(await problemText(response)), { code: problem.code });
+}
+
+// Do what may meet another lens than the one that is named: where it does, ask, and do it all the same.
+export async function withItsLens(act) {
+  try {
+    return await act(false);
+  } catch (reason) {
+    if (reason.code !== "other_lens") throw reason;
+    const [why] = reason.message.split("; choose its own lens");
+    return (await confirmed(`${why[0].toUpperCase()}${why.slice(1)}.`, "It is the same lens")) ? act(true) : null;
+  }
+}
+
 export async function send(method, url, body) {
   const response = await fetch(url, {
     method,
     headers: { "Content-Type": "application/json" },
     body: body === undefined ? undefined : JSON.stringify(body),
   });
-  if (!response.ok) throw new Error(await problemText(response));
+  if (!response.ok) throw await failure(response);
   return response.status === 204 ? null : response.json();
 }
 

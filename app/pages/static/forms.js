@@ -1,6 +1,6 @@
 // Forms and buttons that talk to the API, and pages that wait for work to end.
 
-import { byId, confirmed, send } from "./common.js";
+import { byId, confirmed, send, withItsLens } from "./common.js";
 import { refreshed, removing } from "./poll.js";
 
 function setUpForm(id, act) {
@@ -14,7 +14,7 @@ function setUpForm(id, act) {
     error.hidden = true;
     button.disabled = true;
     try {
-      await act(new FormData(form), form.dataset.photo);
+      button.disabled = (await act(new FormData(form), form.dataset.photo)) !== false;
     } catch (reason) {
       error.textContent = reason.message;
       error.hidden = false;
@@ -42,8 +42,9 @@ export function setUpForms() {
       output: { format: fields.get("format") },
     };
     if (fields.get("lens_id")) wish.lens_id = fields.get("lens_id");
-    const made = await send("POST", "/v1/corrections", wish);
-    location.assign(`/corrections/${made.id}`);
+    const made = await withItsLens((any) => send("POST", "/v1/corrections", any ? { ...wish, any_lens: true } : wish));
+    if (made) location.assign(`/corrections/${made.id}`);
+    return Boolean(made);
   });
   for (const output of document.querySelectorAll("#correct output")) {
     const slider = byId("correct").elements[output.dataset.for];

@@ -1,6 +1,6 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
-import { byId, confirmed, problemText, send } from "./common.js";
+import { byId, confirmed, failure, problemText, send, withItsLens } from "./common.js";
 import { removing } from "./poll.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
@@ -198,6 +198,31 @@ function acting(form, error, act) {
   });
 }
 
+async function putProfile(lens, file, any = false) {
+  const headers = { "Content-Type": "application/zip" };
+  const response = await fetch(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
+  if (!response.ok) throw await failure(response);
+  return true;
+}
+
+// A lens whose profile somebody gave away.
+export function setUpNewLens() {
+  const form = byId("add-profile");
+  if (!form) return;
+  acting(form, form.querySelector(".alert"), async (fields) => {
+    const file = fields.get("profile");
+    if (!file?.size) throw new Error("Choose a profile first.");
+    const { id } = await send("POST", "/v1/lenses", { label: file.name.replace(/\.lensprofile$/i, "") });
+    try {
+      await putProfile(`/v1/lenses/${id}`, file);
+    } catch (reason) {
+      await send("DELETE", `/v1/lenses/${id}`).catch(() => {}); // it may be gone with its profile
+      throw reason;
+    }
+    location.assign(`/lenses/${id}`);
+  });
+}
+
 // What is done with a lens as a whole.
 export function setUpLensActions() {
   const holder = byId("lens-actions");
@@ -217,9 +242,7 @@ export function setUpLensActions() {
     upload: async (fields) => {
       const file = fields.get("profile");
       if (!file?.size) throw new Error("Choose a profile first.");
-      const response = await fetch(`${lens}/profile`, { method: "PUT", body: file, headers: { "Content-Type": "application/zip" } });
-      if (!response.ok) throw new Error(await problemText(response));
-      location.reload();
+      if (await withItsLens((any) => putProfile(lens, file, any))) location.reload();
     },
     delete: async () => {
       const question = "Delete this lens and everything learned from its photos? The photos themselves are kept.";

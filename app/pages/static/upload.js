@@ -13,8 +13,8 @@ function send(file, calibrate, onProgress) {
     request.upload.onprogress = (event) => onProgress(event.total ? event.loaded / event.total : 0);
     request.onerror = () => resolve("The connection was lost. Choose the photo again; nothing is counted twice.");
     request.onload = () => {
-      const taken = request.status === 202 || request.status === 200;
-      resolve(taken ? null : refusalText(request.responseText, request.status));
+      if (request.status === 200) resolve("Already used: the same photo was sent before.");
+      else resolve(request.status === 202 ? null : refusalText(request.responseText, request.status));
     };
     request.send(file);
   });
@@ -70,7 +70,7 @@ export function setUpUpload() {
     show();
     if (!idle) return; // those that are sending go on with these
     await Promise.all(Array.from({ length: AT_ONCE }, work));
-    announce.textContent = `${done - turnedAway} of ${all} photos sent${turnedAway ? `, ${turnedAway} refused` : ""}.`;
+    announce.textContent = `${done - turnedAway} of ${all} photos sent${turnedAway ? `, ${turnedAway} not taken` : ""}.`;
   };
   input.addEventListener("change", () => {
     const files = [...input.files];

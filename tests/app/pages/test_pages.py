@@ -238,12 +238,22 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     page.evaluate(DROP, ["holiday.nef", base64.b64encode(b"not a photo" * 50).decode()])
     refusal = page.locator("#uploads li")
     expect(refusal.locator(".error")).to_contain_text("This is not a photo that can be read.")
-    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 refused.")
+    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 not taken.")
     refusal.get_by_role("button", name="Dismiss").click()
     expect(refusal).to_have_count(0)
 
     assert all("415" in complaint for complaint in visitor.complaints)
     visitor.complaints.clear()
+
+
+def test_a_photo_sent_twice_is_said_to_be_used_already(page: Page, service: Service, tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "twice.dng", 3, serial="C-2", shape=SMALL)
+    sent = service.upload(photo)
+    page.goto("/")
+    page.set_input_files("#files", photo)
+
+    expect(page.locator("#uploads li")).to_contain_text("Already used: the same photo was sent before.")
+    assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
 
 def test_a_photo_without_any_lens_can_still_be_looked_at_and_deleted(
@@ -632,7 +642,7 @@ def test_a_lens_has_charts_that_are_read_and_a_report(
 
 
 def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
-    page: Page, service: Service, tmp_path: Path
+    visitor: Visitor, page: Page, service: Service, tmp_path: Path
 ) -> None:
     made = [
         service.calibrated(write_photo(tmp_path / f"m{k}.dng", 61 + k, serial=f"M-{k}", shape=SMALL))[
@@ -664,6 +674,9 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_text("Rename, merge").click()
     page.get_by_label("Add a lens profile").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
+    expect(page.get_by_role("dialog")).to_contain_text("its serial number is M-0, that of the lens M-1")
+    visitor.complaints.clear()  # the browser notes that the service refused
+    page.get_by_role("button", name="It is the same lens").click()
     expect(page.locator(".facts").first).to_contain_text("3 photos")
     assert service.get(f"/v1/lenses/{made[1]}")["samples"] > before["samples"]
     page.goto(f"/lenses/{made[1]}/tests")
@@ -677,6 +690,12 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_role("button", name="Delete lens").click()
     page.get_by_role("button", name="Delete the lens").click()
     page.wait_for_url("**/")
+    page.get_by_text("Add the profile of a lens").click()
+    page.get_by_label("A file that ends in").set_input_files(tmp_path / "one.lensprofile")
+    page.get_by_role("button", name="Add", exact=True).click()
+    page.wait_for_url("**/lenses/*")
+    expect(page.locator("h1")).to_have_text("one")
+    expect(page.locator(".facts").first).to_contain_text("1 photo")
 
 
 @pytest.mark.slow  # page and request without a browser: test_parts.py, test_lens_model.py

@@ -321,6 +321,25 @@ def test_a_lens_is_proposed_a_name(maker: str | None, model: str | None, lens: s
     assert grouped([row])[0].name == name
 
 
+def test_no_lens_is_chosen_beforehand_for_a_photo_that_names_none(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    steps.counted(serial="1")
+    ghost = steps.receive()
+    steps.inspect(ghost, serial="2")
+    store.photos.fail(ghost.public_id, ghost.epoch, "raw_decode_failed", "damaged")
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo, serial=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+
+    page = client.get(f"/photos/{photo.public_id}").text
+
+    chosen = re.search(r'<select name="lens_id" required>(.*?)</select>', page)
+    assert chosen is not None
+    assert re.findall(r'<option value="([^"]*)"', chosen[1])[0] == ""
+    assert chosen[1].count("<option") == 2  # without the lens whose only photo failed
+
+
 def test_a_photo_that_lacks_only_its_aperture_is_asked_for_nothing_else(
     client: TestClient, steps: Steps, store: Store
 ) -> None:

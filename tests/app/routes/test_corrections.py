@@ -147,6 +147,21 @@ def test_a_photo_with_other_settings_is_corrected_anew(
     assert row.params["settings"]["aperture"] == 8.0
 
 
+def test_a_photo_of_another_lens_is_refused_until_its_owner_insists(client: TestClient, steps: Steps) -> None:
+    lens_id, photo = steps.lens_id(steps.counted(serial="1")), steps.counted(serial="2")
+
+    refused = post(client, photo_id=photo.public_id, lens_id=lens_id)
+    preview = client.post(
+        f"/ui/photos/{photo.public_id}/preview",
+        json={"x": 0, "y": 0, "width": 9, "height": 9, "lens_id": lens_id},
+    )
+
+    for answer in (refused, preview):
+        assert (answer.status_code, answer.json()["code"]) == (409, "other_lens")
+        assert "its serial number is 2, that of the lens 1" in answer.json()["detail"]
+    assert post(client, photo_id=photo.public_id, lens_id=lens_id, any_lens=True).status_code == 202
+
+
 def test_a_photo_without_a_lens_must_be_told_one(client: TestClient, steps: Steps) -> None:
     photo = steps.receive(calibrate=False)
     steps.inspect(photo, serial=None)

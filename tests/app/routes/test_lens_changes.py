@@ -110,6 +110,33 @@ def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, sto
     assert {entry["kind"] for entry in listed} == {None}  # photos, and no files of profiles
 
 
+@pytest.mark.usefixtures("reading")
+def test_a_profile_of_another_lens_is_refused_until_its_owner_insists(
+    client: TestClient, steps: Steps
+) -> None:
+    first, second = (steps.lens_id(steps.counted(patches=4, serial=serial)) for serial in ("1", "2"))
+    sent = client.get(f"/v1/lenses/{first}/profile").content
+
+    refused = client.put(f"/v1/lenses/{second}/profile", content=sent)
+    assert (refused.status_code, refused.json()["code"]) == (409, "other_lens")
+    assert "its serial number is 1, that of the lens 2" in refused.json()["detail"]
+    assert client.get(f"/v1/lenses/{second}").json()["photos"] == 1
+    taken = client.put(f"/v1/lenses/{second}/profile?any_lens=true", content=sent)
+    assert (taken.status_code, taken.json()["photos"]) == (200, 2)
+
+
+@pytest.mark.usefixtures("reading")
+def test_a_lens_is_made_of_a_profile_alone(client: TestClient, steps: Steps) -> None:
+    sent = client.get(f"/v1/lenses/{steps.lens_id(steps.counted(patches=4))}/profile").content
+
+    made = client.post("/v1/lenses", json={"label": "Given away"})
+    assert (made.status_code, made.json()["label"], made.json()["photos"]) == (201, "Given away", 0)
+    taken = client.put(f"/v1/lenses/{made.json()['id']}/profile", content=sent)
+    assert (taken.status_code, taken.json()["photos"]) == (200, 1)
+    assert "Given away" in client.get("/").text
+    assert client.post("/v1/lenses", json={"label": ""}).status_code == 422
+
+
 def test_a_profile_is_not_read_beside_the_keys_of_the_database(
     client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

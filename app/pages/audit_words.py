@@ -68,7 +68,7 @@ def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: 
     listed = sorted(checks.items(), key=lambda item: -item[1])
     reasons = [f"{check_words(name)}: {part:.1%}" for name, part in listed if part >= LEAST]
     words = (
-        "Next to nothing was held back."
+        "Applied almost in full."
         if share < LEAST
         else f"{share:.0%} of the correction was held back over the whole photo."
     )

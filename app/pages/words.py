@@ -15,12 +15,12 @@ from lensmodel.correction.audit import HELD
 from lensmodel.report import Centring, Unit, sharpness
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
-    "received": "Waiting its turn",
+    "received": "In the queue",
     "inspecting": "Reading the file's details",
     "developing": "Developing the photo",
     "selecting": "Looking for parts that show the blur",
-    "needs_lens": "Waiting for you: which lens was it?",
-    "counted": "Learned from",
+    "needs_lens": "Which lens was it?",
+    "counted": "Used",
     "stored": "Ready to correct",
     "excluded": "You left it out of the lens",
     "cancelled": "Left out",
@@ -75,12 +75,12 @@ def photo_state(photo: PhotoOut) -> str:
     if photo.state == "failed":
         return f"Not used: {failure(photo.error)}"
     if photo.state == "needs_lens" and photo.lens_id is not None:
-        return "Waiting for you: at which aperture was it?"
+        return "At which aperture was it?"
     if photo.state == "estimating":
         return f"Measuring blur: {photo.patches.done} of {photo.patches.total} places"
     words = PHOTO_STATES.get(photo.state, photo.state)
     if photo.state == "counted":
-        return f"{words}, at {counted(photo.patches.done, 'place')}"
+        return f"{words}: blur measured at {counted(photo.patches.done, 'place')}"
     return words
 
 
@@ -111,7 +111,7 @@ def duration(seconds: float) -> str:
 def correction_state(correction: CorrectionOut) -> str:
     """Say where a correction stands."""
     return {
-        "queued": "Waiting its turn",
+        "queued": "In the queue",
         "running": "Removing the blur",
         "succeeded": f"Done, with version {correction.lens_version} of the lens",
         "failed": "This did not work",
@@ -191,12 +191,12 @@ def percent(share: float | None) -> str:
 
 
 EVENTS: Final[Mapping[str, str]] = {
-    "photo_added": "learned from a photo",
-    "photo_included": "counted a photo again",
-    "photo_excluded": "left a photo out",
-    "photo_removed": "a photo was deleted",
-    "photo_changed": "your details of a photo were taken over",
-    "model_changed": "learned anew from all photos",
+    "photo_added": "photo added",
+    "photo_included": "photo used again",
+    "photo_excluded": "photo left out",
+    "photo_removed": "photo deleted",
+    "photo_changed": "details of a photo changed",
+    "model_changed": "all photos measured anew",
 }
 
 
@@ -213,17 +213,17 @@ def model_words(lens: LensOut) -> str:
         "kernels and its correction alone, without what guards photos from errors."
     )
     if lens.samples:
-        words += " A change measures all photos of the lens anew; until then it answers as before."
+        words += " After a change all photos of the lens are measured again; until then nothing else changes."
     return words
 
 
 def changing_words(lens: LensOut, left: int) -> str:
     """Say what is going on while a lens changes its model; `left` photos are still to be measured."""
-    answers = f"it answers with the model {lens.answering_model}"
+    answers = f"the model {lens.answering_model} is used"
     if left:
         photos = counted(left, "photo")
         return f"Being measured anew for the model {lens.psf_model}: {photos} to go. Until then {answers}."
-    return f"None of its photos could be measured for the model {lens.psf_model}, so {answers} still."
+    return f"None of its photos could be measured for the model {lens.psf_model}, so {answers}."
 
 
 def centring_verdict(centring: Centring) -> str:

@@ -204,7 +204,7 @@ def _suggestion(model: LensModel, place: FieldPosition, settings: LensSettings) 
         reason = f"no photo shows that place at these settings yet, and {error}"
     else:
         reason = (
-            f"{'one photo speaks' if photos == 1 else f'{photos} photos speak'} for that place, and {error}"
+            f"{'one photo shows' if photos == 1 else f'{photos} photos show'} that place so far, and {error}"
         )
     gain = answer.predicted_error * (1.0 - math.sqrt(photos / (photos + 1.0)))
     return Suggestion(text, reason, place, settings, gain)

@@ -3,8 +3,8 @@
 export const byId = (id) => document.getElementById(id);
 
 const PLAIN = {
-  not_an_image: "This is not a photo that can be read. Give RAW, DNG, TIFF, PNG or JPEG.",
-  unsupported_format: "This kind of file cannot be read. Give RAW, DNG, TIFF, PNG or JPEG.",
+  not_an_image: "Not a photo file. Send RAW, DNG, TIFF, PNG or JPEG.",
+  unsupported_format: "This kind of file cannot be read. Send RAW, DNG, TIFF, PNG or JPEG.",
   truncated_image: "The file ends too early. Copy it again from the camera or card.",
   image_too_large: "This photo is larger than the service takes.",
   decompression_bomb: "This file would unpack to far more than a photo holds.",

@@ -96,12 +96,23 @@ export function setUpActions() {
   }
 }
 
+// Whether somebody is asked, types, or waits for what a form does: then nothing may take the page away.
+const occupied = () =>
+  document.querySelector("dialog[open], form[aria-busy=true]") || document.activeElement?.matches("input:not([type=checkbox]), select");
+
+function reloadWhenFree() {
+  if (occupied()) setTimeout(reloadWhenFree, 1000);
+  else location.reload();
+}
+
 // A page whose work has come to its end shows the result.
 export function setUpSettling() {
   const open = [...document.querySelectorAll("[id$='-state']")].filter((part) => !part.querySelector("[data-settled]"));
   return (name) => {
     const part = byId(name);
-    if (open.includes(part) && part.querySelector("[data-settled]")) location.reload();
+    if (!open.includes(part) || !part.querySelector("[data-settled]")) return;
+    open.splice(open.indexOf(part), 1);
+    reloadWhenFree();
   };
 }
 
@@ -123,7 +134,7 @@ export function setUpGroups() {
     event.preventDefault();
     attempt(async () => {
       const groups = [...event.target.querySelectorAll("fieldset")].filter((group) => group.querySelector(":checked[name=photo]"));
-      if (!groups.length) throw new Error("Tick the photos to learn from.");
+      if (!groups.length) throw new Error("Tick the photos to use.");
       let count = 0;
       for (const group of groups) count += await learned(group).catch((reason) => complain(group, reason));
       if (count) byId("announce").textContent = count === 1 ? "1 photo is being processed." : `${count} photos are being processed.`;

@@ -189,12 +189,14 @@ function acting(form, error, act) {
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     error.hidden = true;
+    form.setAttribute("aria-busy", "true");
     try {
       await act(new FormData(form));
     } catch (reason) {
       error.textContent = reason.message;
       error.hidden = false;
     }
+    form.removeAttribute("aria-busy");
   });
 }
 
@@ -202,7 +204,14 @@ async function putProfile(lens, file, any = false) {
   const headers = { "Content-Type": "application/zip" };
   const response = await fetch(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
   if (!response.ok) throw await failure(response);
-  return true;
+  if (response.status !== 202) return true;
+  for (;;) { // a worker has yet to read it
+    const answer = await fetch(`${response.headers.get("Location")}?wait=20`);
+    if (!answer.ok) throw await failure(answer);
+    const { state, error } = await answer.json();
+    if (state === "succeeded") return true;
+    if (error) throw Object.assign(new Error(error.detail), { code: error.code });
+  }
 }
 
 // A lens whose profile somebody gave away.

@@ -221,13 +221,13 @@ def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
     page.evaluate(DROP, [dropped.name, base64.b64encode(dropped.read_bytes()).decode()])
     for name in ("chosen.dng", "dropped.dng"):
         row = page.locator(".row", has_text=name)
-        expect(row.locator(".state")).to_contain_text("Learned from")
+        expect(row.locator(".state")).to_contain_text("Used: blur measured")
         expect(row.locator("img")).not_to_have_js_property("naturalWidth", 0)
     expect(page.locator("#lenses .card")).to_have_count(1)
 
     states = page.evaluate("[...window.states]")  # gone if the page had been loaded again
     assert any(
-        state.startswith("Learned from") for state in states
+        state.startswith("Used: blur measured") for state in states
     )  # the only one where it ends within a poll
     assert not visitor.complaints
 
@@ -237,7 +237,7 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
 
     page.evaluate(DROP, ["holiday.nef", base64.b64encode(b"not a photo" * 50).decode()])
     refusal = page.locator("#uploads li")
-    expect(refusal.locator(".error")).to_contain_text("This is not a photo that can be read.")
+    expect(refusal.locator(".error")).to_contain_text("Not a photo file.")
     expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 not taken.")
     refusal.get_by_role("button", name="Dismiss").click()
     expect(refusal).to_have_count(0)
@@ -283,7 +283,7 @@ def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
 
     for given, hint in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
         group.get_by_label("Aperture, f/").fill(given)
-        page.get_by_role("button", name="Learn from the ticked photos").click()
+        page.get_by_role("button", name="Use the ticked photos").click()
         expect(group.locator(".alert")).to_contain_text(hint)
     assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
@@ -313,7 +313,7 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     expect(group.get_by_role("button", name="Leave out")).to_be_focused()
     assert service.get(f"/v1/photos/{screen['id']}")["state"] == "cancelled"
 
-    learn = page.get_by_role("button", name="Learn from the ticked photos")
+    learn = page.get_by_role("button", name="Use the ticked photos")
     group.get_by_label("Its name").fill("")
     learn.click()
     expect(group.locator(".alert")).to_have_text("Choose a lens, or give a new one a name.")
@@ -426,7 +426,7 @@ def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(
     reason.click()
     lit = page.locator(".overlay rect.lit")
     expect(lit).to_have_count(int(reason.locator("b").inner_text()))
-    page.get_by_label("Show where edges are sharp enough to learn from").check()
+    page.get_by_label("Show where edges are sharp enough to measure").check()
     expect(page.locator("#rmap")).not_to_have_js_property("naturalWidth", 0)
     expect(page.locator("#rmap")).to_be_visible()
 
@@ -704,7 +704,7 @@ def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tm
     page.goto(f"/lenses/{lens}/tests")
     part, choice = page.locator("section[aria-labelledby=research-title]"), page.locator("#model")
     expect(part).to_contain_text("Model: default")
-    choice.get_by_label("Learn it with").select_option("paper")
+    choice.get_by_label("Change it to").select_option("paper")
     choice.get_by_role("button", name="Change").click()
     expect(page.locator("#lens-state")).to_contain_text(
         "Being measured anew for the model paper: 1 photo to go"
@@ -712,11 +712,32 @@ def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tm
     expect(part).to_contain_text("Model: default")
     assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "paper"
 
-    choice.get_by_label("Learn it with").select_option("default")
+    choice.get_by_label("Change it to").select_option("default")
     choice.get_by_role("button", name="Change").click()
     expect(page.locator("#lens-state")).not_to_contain_text("measured anew")
     assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "default"
     assert service.get(f"/v1/lenses/{lens}")["version"] == 1  # nothing was lost, nothing done twice
+
+
+def test_a_page_does_not_go_while_somebody_is_asked(page: Page, learned: dict[str, Any]) -> None:
+    def still_counting(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.text().replace("data-settled", "data-later"))
+
+    address = f"/lenses/{learned['lens_id']}"
+    page.route(f"**{address}", still_counting)
+    page.goto(address)
+    page.evaluate("window.first = true")
+    page.get_by_text("Rename, merge").click()
+    with page.expect_response(lambda answer: "/ui/parts" in answer.url):
+        page.get_by_role("button", name="Delete lens").click()
+        expect(page.get_by_role("dialog")).to_be_visible()
+    page.unroute(f"**{address}")
+    expect(page.locator("#lens-state [data-settled]")).to_be_attached()  # its work has ended
+    assert page.evaluate("window.first")
+    with page.expect_navigation():
+        page.get_by_role("button", name="Cancel").click()
+    assert not page.evaluate("window.first")
 
 
 def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> None:

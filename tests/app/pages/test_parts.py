@@ -389,7 +389,7 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     assert ("Model: default, from" in page, '<option value="paper" selected>' in page) == (True, True)
     for photo in photos:
         store.photos.fail(photo.public_id, 2, "no_usable_patches", "nothing there")
-    assert "None of its photos could be measured for the model paper, so it answers" in shown()
+    assert "None of its photos could be measured for the model paper, so the model default" in shown()
     assert store.photos.retry(photos[0].public_id, ANY_OWNER)
     again = steps.fresh(photos[0])
     steps.inspect(again)
@@ -398,7 +398,7 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     store.photos.finish(again.public_id, again.epoch)
     assert "Model: paper, from" in shown()
     assert "Model:" not in client.get(f"/lenses/{lens}").text
-    assert "learned anew from all photos, model paper" in shown()
+    assert "all photos measured anew, model paper" in shown()
     photo_page = client.get(f"/photos/{photos[0].public_id}").text
     assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
 

@@ -93,7 +93,7 @@ def test_formats_limits_and_version_are_told(client: TestClient, settings: Setti
         ("GET", "/nothing", 404, "not_found"),
         ("GET", "/v1/nothing", 404, "not_found"),
         ("PUT", "/v1/photos", 405, "method_not_allowed"),
-        ("POST", "/v1/lenses", 405, "method_not_allowed"),
+        ("PUT", "/v1/lenses", 405, "method_not_allowed"),
         ("GET", "/v1/lenses/x/psf.exe?r=0", 422, "invalid_parameter"),
     ],
 )

@@ -34,6 +34,7 @@ def _arguments() -> argparse.Namespace:
     lenses.add_argument("--family", choices=library.FAMILIES, default="wavefront")
     lenses.add_argument("--first", type=int, default=0, help="first shard of 25 lenses")
     lenses.add_argument("--shards", type=int, default=400)
+    lenses.add_argument("--of-errors", action="store_true", help="for `train-errors`")
     lenses.add_argument("--held-out", action="store_true", help="lenses, designs and scenes to judge by")
     lenses.add_argument(
         "--plain", action="store_true", help="held out, with five RAW photos that nothing spoils"
@@ -46,6 +47,10 @@ def _arguments() -> argparse.Namespace:
     train.add_argument("--threads", type=int, default=2)
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--code", default="", help="what made the library, for the provenance")
+    told = commands.add_parser("train-errors", help="after that: what tells errors, on lenses of its own")
+    told.add_argument("--minutes", type=float, default=8.0)
+    told.add_argument("--threads", type=int, default=2)
+    told.add_argument("--seed", type=int, default=0)
     judged = commands.add_parser("judge", help="errors on plain lenses by number of photos")
     judged.add_argument("--family", choices=library.FAMILIES, default="traced")
     judged.add_argument("--weights", type=Path, help="others than those of the package")
@@ -76,7 +81,10 @@ def _judge(asked: argparse.Namespace) -> None:
 
 def _describe(asked: argparse.Namespace) -> None:
     for family in library.FAMILIES:
-        lenses = sets.load_library(asked.folder / "lenses", set(), families=(family,), limit=asked.limit)
+        names = [path.name for path in sorted((asked.folder / "lenses").glob(f"{family}-*.npz"))]
+        every = max(library.SHARD * len(names) // asked.limit, 1)
+        others = set(names) - set(names[::every])
+        lenses = sets.load_library(asked.folder / "lenses", others, families=(family,), limit=asked.limit)
         if lenses:
             print(f"{family}, {len(lenses)} lenses: 10, 50 and 90 in a hundred are below")
             for name, values in describe(lenses).items():
@@ -135,11 +143,17 @@ def main() -> None:
             threads=asked.threads, seed=asked.seed, code=asked.code,
         )  # fmt: skip
         return
+    if asked.command == "train-errors":
+        from lab.population.training import train_errors  # noqa: PLC0415 - needs PyTorch
+
+        train_errors(asked.folder, asked.minutes, threads=asked.threads, seed=asked.seed)
+        return
     if asked.command in _OTHERS:
         _OTHERS[asked.command](asked)
         return
     began, count = time.monotonic(), 0
     name = "plain" if asked.plain else "held-out" if asked.held_out else "lenses"
+    name = "lenses-of-errors" if asked.of_errors else name
     shards = range(asked.first, asked.first + asked.shards)
     for made in library.generate(
         asked.folder / name, asked.folder / "scenes", asked.family, shards,

@@ -12,6 +12,7 @@ from lab.population.sets import Lens
 from lensmodel.neural.network import SIDE, assembled
 
 _PERCENTILES: Final = (10, 50, 90)
+_POINT: Final = 0.1  # pixels: narrower kernels are points
 _RING: Final = (0.5, 0.85)  # radii between which the sides of a lens are compared
 
 
@@ -35,7 +36,7 @@ def describe(lenses: Sequence[Lens]) -> dict[str, tuple[float, ...]]:
     """
     rows: dict[str, list[float]] = {}
     for lens in lenses:
-        width, r = widths(lens), np.hypot(*lens.xy.T)
+        width, r = np.maximum(widths(lens), _POINT), np.hypot(*lens.xy.T)
         for zone, inside in (("center", r < 0.3), ("mid", (r >= 0.3) & (r <= 0.75)), ("corner", r > 0.75)):
             rows.setdefault(zone, []).append(float(np.median(width[inside, 1])))
         for colour, name in ((0, "red"), (2, "blue")):

@@ -22,7 +22,7 @@ from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import FieldPosition
 from lensmodel.report import LensReport, Side, Unit, compare
-from lensmodel.report.documents import zone_table
+from lensmodel.report.documents import place_table
 
 SHOWN_VERSIONS: Final = 200
 """Versions of the history on the page (chosen): the newest of them."""
@@ -151,7 +151,7 @@ def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, A
 
     return {
         "charts": charts(test, aperture, unit),
-        "table": zone_table(test),
+        "table": place_table(test),
         "error_note": test.error_words,
     }
 

@@ -13,15 +13,18 @@ from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import AnyLens, Aperture, Force, Json, Photos, Profile, Quiet, Verbose, choice
 from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.files import write_atomically
 from lensmodel.core.types import LensSettings
+from lensmodel.measured.edges import chart_edges
 from lensmodel.model import save_profile
-from lensmodel.photo import PhotoInfo, develop
+from lensmodel.photo import LinearPhoto, PhotoInfo, develop
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import measuring, sampling
 from lensmodel.workflow.calibrating import Identity, difference, grown, joined
 from lensmodel.workflow.lens import Lens
 
 KINDS: Final = ("target", "pair", "points", "edges")
+EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
 PAPERS: Final = ("a2", "a3", "a4")
 USUAL_DETAIL: Final = 4000
 """Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo."""
@@ -36,6 +39,7 @@ class MeasurementOptions:
     size: int
     replace: bool
     any_lens: bool
+    output: Path | None
 
 
 def measure(
@@ -53,7 +57,17 @@ def measure(
             "--replace", help="Drop what was learned blindly at the same aperture and focal length."
         ),
     ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for pictures and figures of the edges of a chart: edges.pdf, edges.png, edges.csv.",
+        ),
+    ] = None,
     any_lens: AnyLens = False,
+    force: Force = False,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -68,11 +82,14 @@ def measure(
 
     - points: stars, or pinholes in front of a lamp; not saturated.
 
-    - edges: an ISO 12233 chart or a checkerboard tilted by 5 degrees.
+    - edges: a chart of dark squares or a checkerboard, turned by 5 degrees. With --output each edge can be
+    looked at: its place on the chart, its profile and its SFR curve.
 
     Examples:
 
         lensmodel measure target page.dng --profile my-24mm.lensprofile
+
+        lensmodel measure edges chart.dng --profile my-24mm.lensprofile -o edges
 
         lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
 
@@ -83,7 +100,11 @@ def measure(
         raise UsageError(f"measure one of {', '.join(KINDS)}, not {kind!r}")
     if size % 2 == 0:
         raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
-    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens)
+    if output is not None:
+        if kind != "edges" or len(photos) != 1:
+            raise UsageError("--output shows the edges of one photo: lensmodel measure edges PHOTO -o DIR")
+        files.refuse_existing(*(output / name for name in EDGE_FILES), force=force)
+    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens, output)
     _run(photos, profile, options, shown, as_json=json_output)
 
 
@@ -128,7 +149,7 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
     """Measure on the photos of one measurement and save the profile; say what became of it."""
     path, key = group[0], sampling.photo_id(group[0])
     known = Lens.load(target) if target.exists() else None
-    if known is not None and key in known.profile.photos:
+    if options.output is None and known is not None and key in known.profile.photos:
         return {"state": "known"}
 
     def admit(info: PhotoInfo) -> None:
@@ -139,6 +160,10 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
 
     photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
+    if options.output is not None:
+        _show_edges(photos[0], options.output)
+        if known is not None and key in known.profile.photos:
+            return {"state": "known"}
     identity = Identity.of(photos[0].info.metadata)
     samples = measuring.samples_of_developed(
         options.kind,
@@ -164,6 +189,19 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
         "estimator": samples[0].estimator,
         "error": green[len(green) // 2],
     }
+
+
+def _show_edges(photo: LinearPhoto, folder: Path) -> None:
+    """Write what was seen of a chart: the chart with its edges, each edge's profile and SFR, a table."""
+    from lensmodel.report.chart_edges import edge_pages, edges_csv  # noqa: PLC0415 - matplotlib, an extra
+    from lensmodel.report.plots import save, to_pdf  # noqa: PLC0415 - as above
+
+    edges = chart_edges(photo)
+    folder.mkdir(parents=True, exist_ok=True)
+    pages = edge_pages(photo, edges)
+    save(pages[0], folder / EDGE_FILES[1])
+    write_atomically(folder / EDGE_FILES[0], to_pdf(pages))
+    write_atomically(folder / EDGE_FILES[2], edges_csv(photo, edges).encode())
 
 
 def target(

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Any, Final
 
-from lensmodel.core.types import ZONES
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
+from lensmodel.report.lens_report import NYQUIST, UNIT_NAMES, ApertureReport, LensReport
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
@@ -32,18 +31,20 @@ table { border-collapse: collapse; } th, td { text-align: left; padding: .3rem 1
 """
 
 
-def zone_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of MTF50 by aperture, zone and worst corner, in each unit that is known."""
+def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
+    """Return head and rows of tangential and sagittal MTF50 by aperture and place, in each known unit."""
     units = report.sensor.units
-    head = ["Aperture", "Zone", *(f"MTF50, {UNIT_NAMES[unit]}" for unit in units)]
+    head = ["Aperture", "Place", *(f"{side}, {UNIT_NAMES[unit]}" for unit in units for side in "TS")]
     rows = []
     for aperture in report.apertures:
         found = report.at(aperture)
-        worst = found.worst
-        own: list[tuple[str, float]] = [(zone, found.zones[zone]) for zone in ZONES]
-        own += [(f"worst corner, {worst.side}", worst.mean)]
-        for zone, value in own:
-            rows.append([found.at or "unknown", zone, *(report.sensor.words(value, unit) for unit in units)])
+        for spot in (found.spots[0], *found.sides, *found.spots[1:]):
+            figures = [
+                report.sensor.words(value, unit)
+                for unit in units
+                for value in (spot.tangential, spot.sagittal)
+            ]
+            rows.append([found.at or "unknown", spot.place.removeprefix("the "), *figures])
     return head, rows
 
 
@@ -56,7 +57,7 @@ def to_html(report: LensReport) -> str:
         f'<p class="verdict">{escape(report.verdict)}</p>',
         f'<p class="facts">{escape(report.facts)}.</p>',
         *(f'<p class="facts">{escape(name)}: {escape(words)}</p>' for name, words in report.details.items()),
-        _table(*zone_table(report)),
+        _table(*place_table(report)),
     ]
     for aperture in report.apertures:
         found = report.at(aperture)
@@ -119,6 +120,7 @@ def to_csv(report: LensReport) -> str:
 def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
     for zone, value in found.zones.items():
         yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": "c/px"}
+    yield from _spots(found)
     for direction, values, errors in (
         ("tangential", found.tangential, found.tangential_error),
         ("sagittal", found.sagittal, found.sagittal_error),
@@ -134,7 +136,7 @@ def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
                 "col": str(col),
                 "value": _number(value),
                 "unit": "c/px",
-                "standard_error": _number(errors[i]) if errors else "",
+                "standard_error": _number(errors[i]) if errors and value < NYQUIST else "",
                 "predicted_error": _number(found.predicted_error[i]),
                 "extrapolated": str(int(found.extrapolated[i])),
             }
@@ -157,6 +159,13 @@ def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
         for r, width in zip(found.radii, widths, strict=True):
             row_ = {"quantity": "width of a point", "r": _number(r), "direction": direction}
             yield row_ | {"value": _number(width), "unit": "px"}
+
+
+def _spots(found: ApertureReport) -> Iterator[dict[str, str]]:
+    for spot in (*found.spots, *found.sides):
+        own = {"quantity": f"MTF50 at {spot.place}", "r": _number(spot.position.r), "unit": "c/px"}
+        for direction, value in (("tangential", spot.tangential), ("sagittal", spot.sagittal)):
+            yield own | {"phi": _number(spot.position.phi), "direction": direction, "value": _number(value)}
 
 
 def _number(value: float | None) -> str:

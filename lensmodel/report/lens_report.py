@@ -39,7 +39,17 @@ from lensmodel.model import LensModel
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.centring import Centring, centring
-from lensmodel.report.places import DEFAULT_ASPECT, Advice, advice, corner_places, grid, place_in_words, ring
+from lensmodel.report.places import (
+    DEFAULT_ASPECT,
+    Advice,
+    advice,
+    corner_places,
+    direction_in_words,
+    grid,
+    place_in_words,
+    ring,
+    side_places,
+)
 
 Unit = Literal["c/px", "lp/ph", "lp/mm"]
 UNIT_NAMES: Final[dict[Unit, str]] = {"c/px": "c/px", "lp/ph": "LP/PH", "lp/mm": "lp/mm"}
@@ -149,6 +159,11 @@ class Spot:
         """The place without the word corner: "the upper left"."""
         return self.place.removesuffix(" corner")
 
+    @property
+    def words(self) -> str:
+        """Both figures, never one of the two."""
+        return f"T {_figure(self.tangential)}, S {_figure(self.sagittal)}"
+
 
 @dataclass(frozen=True, slots=True)
 class ApertureReport:
@@ -173,6 +188,7 @@ class ApertureReport:
     along_u: tuple[float, ...]
     along_v: tuple[float, ...]
     spots: tuple[Spot, ...]  # the centre and the four corners
+    sides: tuple[Spot, ...]  # left, right, top and bottom, at four fifths of the way to the edge
     centring: Centring
 
     @property
@@ -374,10 +390,11 @@ def _tested(
     tangential, sagittal = _mtf50([answer.kernel for answer in answers], places)
     kernels = list(model.kernels(around, settings, size))
     curves = _contrast(kernels, rings, [f for f, _ in frequencies])
-    maps, contrasts = [], []
+    maps: list[np.ndarray] = []
+    contrasts = []
     for replica in redrawn:
         both = list(replica.kernels([*places, *around], settings, size))
-        maps.append(_mtf50(both[: len(places)], places))
+        maps.append(np.minimum(_mtf50(both[: len(places)], places), NYQUIST))
         contrasts.append(_contrast(both[len(places) :], rings, [f for f, _ in frequencies]))
     errors: _Pairs = ((), ())
     spread = np.empty((0,))
@@ -388,6 +405,7 @@ def _tested(
     along_u, along_v = _widths(kernels, rings)
     corners = [("the centre", FieldPosition(0.0, 0.0))]
     corners += [(place_in_words(place), place) for place in corner_places(aspect)]
+    sides = [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
     return ApertureReport(
         settings=settings,
         aspect=aspect,
@@ -408,6 +426,7 @@ def _tested(
         along_u=along_u,
         along_v=along_v,
         spots=tuple(_spot(model, words, place, settings, size) for words, place in corners),
+        sides=tuple(_spot(model, words, place, settings, size) for words, place in sides),
         centring=centring(model, settings),
     )
 
@@ -500,7 +519,7 @@ def sharpness(found: ApertureReport) -> str:
         how = (
             "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
         )
-        fall = f"its worst corner, {worst.side}, is {how} ({_figure(worst.mean)})"
+        fall = f"its worst corner, {worst.side}, is {how} ({worst.words})"
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
     return f"{begin}, and {fall}."
 

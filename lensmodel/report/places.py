@@ -102,6 +102,17 @@ def corner_places(aspect: float) -> tuple[FieldPosition, ...]:
     return tuple(FieldPosition(0.9, phi) for phi in (math.pi - corner, corner, corner - math.pi, -corner))
 
 
+def side_places(aspect: float) -> tuple[FieldPosition, ...]:
+    """Left, right, top and bottom, four fifths of the way to the edge."""
+    width, height = half_sides(aspect)
+    return (
+        FieldPosition(0.8 * width, math.pi),
+        FieldPosition(0.8 * width, 0.0),
+        FieldPosition(0.8 * height, math.pi / 2),
+        FieldPosition(0.8 * height, -math.pi / 2),
+    )
+
+
 def landmarks() -> list[FieldPosition]:
     """The centre, the four corners, the four quarters between, and the middles of the four edges."""
     width, height = half_sides(DEFAULT_ASPECT)

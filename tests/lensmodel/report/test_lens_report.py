@@ -23,7 +23,7 @@ from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import LensReport, SensorGeometry, Side, compare, lens_report
-from lensmodel.report.documents import comparison_html, to_csv, to_html, zone_table
+from lensmodel.report.documents import comparison_html, place_table, to_csv, to_html
 from lensmodel.report.places import grid, half_sides, ring
 from lensmodel.report.plots import charts, comparison_page, pages, save, to_pdf
 
@@ -126,6 +126,22 @@ def test_tangential_and_sagittal_are_told_apart() -> None:
     assert found.curves[-1].tangential[0] == found.curves[-1].sagittal[0]
 
 
+def test_sides_are_given_apart_and_their_two_directions_too() -> None:
+    found = report_of(bad_side=0.8, astigmatic=1.8)
+
+    head, rows = place_table(found)
+    assert head[:4] == ["Aperture", "Place", "T, c/px", "S, c/px"]
+    table = {row[1]: [float(cell.removeprefix("at least ")) for cell in row[2:4]] for row in rows}
+    assert list(table)[:5] == ["centre", "left", "right", "top", "bottom"]
+    assert table["left"][1] > 1.1 * table["right"][1]
+    assert table["left"][0] < 0.8 * table["left"][1]
+    written = list(csv.DictReader(io.StringIO(to_csv(found))))
+    assert {row["direction"] for row in written if row["quantity"] == "MTF50 at the left"} == {
+        "tangential",
+        "sagittal",
+    }
+
+
 def test_the_verdict_names_the_worst_corner_and_does_not_contradict_the_map() -> None:
     found = report_of(bad_side=0.8)
 
@@ -155,7 +171,7 @@ def test_a_point_within_a_pixel_is_reported_as_at_least_nyquist(tmp_path: Path) 
     found = lens_report(LensModel.fit(given, QUICK), "Perfect", draws=4, rows=2, size=SIZE, channels=("g",))
 
     assert "as sharp as the sensor can show" in found.verdict
-    assert "at least .500" in zone_table(found)[1][0][2]
+    assert "at least .500" in place_table(found)[1][0][2]
     save(pages(found)[1], tmp_path / "maps.png")  # errors of figures beyond what a sensor shows are none
 
 

@@ -61,11 +61,11 @@ def _take_turns_at_compiling(folder: Path) -> None:
 @pytest.fixture
 def estimated_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Estimate in this process: a worker process first takes a second to import the library."""
-    from lensmodel.core import parallel, processes  # noqa: PLC0415 - most tests need neither
+    from lensmodel.core import processes  # noqa: PLC0415 - most tests need neither
 
     @contextmanager
     def here(executor: Executor | None, *_: object) -> Iterator[Executor]:
-        yield executor or parallel.Here()
+        yield executor or processes.Here()
 
     monkeypatch.setattr(processes, "pool", here)
 

@@ -1,4 +1,6 @@
-"""Worker processes that a script, a notebook or a command can start alike.
+"""Where loops over patches, cells and photos run: any executor will do, here or on other machines.
+
+Worker processes can be started by a script, a notebook or a command alike.
 
 Python's spawned processes import the main module again: of a script without `if __name__ == "__main__"`
 each worker would begin the script anew. The workers here only run functions of this library and what was
@@ -12,14 +14,19 @@ import pickle
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
 from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, ParamSpec, TypeVar
+
+A = TypeVar("A")
+T = TypeVar("T")
+P = ParamSpec("P")
 
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """The work is parallel over processes; threads of linear algebra in each only get in one another's way."""
@@ -90,3 +97,40 @@ class _Context(SpawnContext):
     """`multiprocessing.get_context("spawn")` with such processes."""
 
     Process = _Process
+
+
+class Here(Executor):
+    """Runs each call at once in the thread that submits it: where no further processes are wanted."""
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Call, and return a future that is done."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # noqa: BLE001 - a future hands on whatever it was
+            future.set_exception(error)
+        return future
+
+
+def in_order(
+    executor: Executor,
+    call: Callable[..., T],
+    items: Iterable[A],
+    arguments: Callable[[A], tuple[Any, ...] | None],
+    *,
+    ahead: int,
+) -> Iterator[tuple[A, Future[T] | None]]:
+    """Give items in their order with the futures of their calls, of which few are submitted ahead."""
+    waiting: deque[tuple[A, Future[T] | None]] = deque()
+    try:
+        for item in items:
+            given = arguments(item)
+            waiting.append((item, None if given is None else executor.submit(call, *given)))
+            if len(waiting) >= ahead:
+                yield waiting.popleft()
+        while waiting:
+            yield waiting.popleft()
+    finally:
+        for _, future in waiting:
+            if future is not None:
+                future.cancel()

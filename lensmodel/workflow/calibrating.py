@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from lensmodel import photo
-from lensmodel.core import parallel
+from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
 from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import PsfSample
@@ -238,8 +238,12 @@ class Calibration:
             except (LensModelError, OSError):
                 return None
 
-        jobs = parallel.in_order(
-            executor or parallel.Here(), samples_of_bytes, paths, sent, ahead=1 if executor is None else ahead
+        jobs = processes.in_order(
+            executor or processes.Here(),
+            samples_of_bytes,
+            paths,
+            sent,
+            ahead=1 if executor is None else ahead,
         )
         for path, job in jobs:
             try:

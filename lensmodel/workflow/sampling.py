@@ -25,7 +25,7 @@ import numpy as np
 
 from lensmodel import blind, patches, photo
 from lensmodel.blind.estimator import require_size
-from lensmodel.core import codec, parallel, processes
+from lensmodel.core import codec, processes
 from lensmodel.core.errors import (
     InvalidInputError,
     MetadataMissingError,
@@ -430,7 +430,7 @@ def samples_of_photo(
         if not alone:
             save_developed(developed, Path(folder))
         source = developed if alone else Path(folder)
-        with processes.pool(parallel.Here() if alone else executor, workers, method) as pool:
+        with processes.pool(processes.Here() if alone else executor, workers, method) as pool:
             jobs = {pool.submit(_cell_of, source, group, *order): index for index, group in enumerate(groups)}
             try:
                 for job in as_completed(jobs):
@@ -472,4 +472,4 @@ def samples_of_bytes(name: str, data: bytes, config: Config, key: str = "") -> l
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(data)
-        return samples_of_photo(path, config, key=key, executor=parallel.Here())
+        return samples_of_photo(path, config, key=key, executor=processes.Here())

@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 import lensmodel
 from lensmodel.cli.main import app
-from lensmodel.core import parallel
+from lensmodel.core import processes
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import load_profile
 from lensmodel.workflow import sampling
 
 
 def test_the_calling_thread_is_an_executor_that_hands_on_errors() -> None:
-    executor = parallel.Here()
+    executor = processes.Here()
 
     assert executor.submit(threading.get_ident).result() == threading.get_ident()
     with pytest.raises(ZeroDivisionError):
@@ -45,7 +45,8 @@ def test_items_come_in_order_and_few_are_submitted_ahead() -> None:
     with Counting() as executor:
         seen = []
         for taken, (item, future) in enumerate(
-            parallel.in_order(executor, pow, range(20), lambda k: (k, 2) if k % 3 else None, ahead=4), start=1
+            processes.in_order(executor, pow, range(20), lambda k: (k, 2) if k % 3 else None, ahead=4),
+            start=1,
         ):
             assert executor.submitted <= taken + 4
             seen.append((item, None if future is None else future.result()))
@@ -56,7 +57,7 @@ def test_items_come_in_order_and_few_are_submitted_ahead() -> None:
 def test_what_is_not_taken_any_more_is_cancelled() -> None:
     gate = threading.Event()
     with ThreadPoolExecutor(1) as executor:
-        jobs = parallel.in_order(executor, gate.wait, range(9), lambda _: (5.0,), ahead=8)
+        jobs = processes.in_order(executor, gate.wait, range(9), lambda _: (5.0,), ahead=8)
         first = next(jobs)[1]
         jobs.close()  # type: ignore[attr-defined]  # a generator
         gate.set()
@@ -78,7 +79,7 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
     config = sampling.Config(estimator="default", count=4)
-    here = sampling.samples_of_photo(photo, config, executor=parallel.Here())
+    here = sampling.samples_of_photo(photo, config, executor=processes.Here())
     with ThreadPoolExecutor(2) as threads:
         beside = sampling.samples_of_photo(photo, config, executor=threads)
     sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), config)

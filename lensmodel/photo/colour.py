@@ -97,17 +97,10 @@ def encode(linear: NDArray[np.float32], table: NDArray[np.float32]) -> NDArray[n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatrixProfile:
-    """What a profile of RGB or grey says by three curves and a matrix.
-
-    Parameters
-    ----------
-    curves : tuple of three Curve
-    to_xyz : ndarray, shape (3, 3)
-        Linear RGB to XYZ under D50.
-    """
+    """What a profile of RGB or grey says by three curves and a matrix."""
 
     curves: tuple[Curve, Curve, Curve]
-    to_xyz: Matrix
+    to_xyz: Matrix  # (3, 3), linear RGB to XYZ under D50
 
 
 def icc_space(icc: bytes) -> str:

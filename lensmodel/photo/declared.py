@@ -73,20 +73,7 @@ _CURVES: Final[Mapping[int, Curve]] = {
 
 
 def by_chunks(icc: bytes | None, chunks: Mapping[bytes, bytes]) -> bytes | None:
-    """Profile of a PNG by its chunks, in their order of precedence; None is sRGB.
-
-    Parameters
-    ----------
-    icc : bytes or None
-        Of the chunk iCCP.
-    chunks : mapping of bytes to bytes
-        Content of cICP, sRGB, gAMA and cHRM, as far as they are there.
-
-    Raises
-    ------
-    UnsupportedFormatError
-        For colours of cICP that are not read, as those of HDR.
-    """
+    """Profile of a PNG by its chunks, in their order of precedence; None is sRGB."""
     if len(coded := chunks.get(b"cICP", b"")) == 4:
         primaries, curve, matrix, full = coded
         if primaries not in _PRIMARIES or curve not in _CURVES or matrix != 0 or full != 1:
@@ -115,21 +102,7 @@ def by_tags(
     gamma: float | None,
     transfer: Sequence[float],
 ) -> bytes | None:
-    """Profile of a TIFF or JPEG by its tags; None is sRGB, or nothing that can be used.
-
-    Parameters
-    ----------
-    colour_space : int or None
-        ColorSpace of Exif: 1 sRGB, 65535 not calibrated; 2 is written for AdobeRGB by some.
-    interoperability : str or None
-        InteroperabilityIndex: "R03" is AdobeRGB.
-    white, primaries : sequence of float
-        WhitePoint and PrimaryChromaticities; empty where they are not there.
-    gamma : float or None
-        Gamma of Exif.
-    transfer : sequence of float
-        TransferFunction of TIFF: linear light 0..65535 of each number, once or for each channel.
-    """
+    """Profile of a TIFF or JPEG by its tags; None is sRGB, or nothing that can be used."""
     if colour_space == 1:
         return None
     if interoperability == "R03" or colour_space == 2:

@@ -38,19 +38,7 @@ Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def find_defects(values: NDArray[np.uint16], sigma: NDArray[np.floating]) -> Places:
-    """Find pixels of a Bayer mosaic that stand alone, brighter or darker than all around them.
-
-    Parameters
-    ----------
-    values : ndarray of uint16, shape (height, width)
-    sigma : ndarray, shape (2, 2, n)
-        Standard deviation of the noise of each site of the pattern, at n evenly spaced levels 0..65535.
-
-    Returns
-    -------
-    rows, cols : ndarray of int
-        Empty where there are so many that they must be the picture.
-    """
+    """Find pixels of a Bayer mosaic that stand alone, brighter or darker than all around them."""
     rows, cols = [], []
     for row in (0, 1):
         for col in (0, 1):

@@ -46,60 +46,27 @@ _D65: Final = 21  # CalibrationIlluminant1 of DNG 1.6, chapter 4, in the numbers
 
 @dataclass(frozen=True, slots=True)
 class ShotInfo:
-    """What a photo says about how it was taken; None or an empty text is left out of the file.
+    """What a photo says about how it was taken; None or an empty text is left out of the file."""
 
-    Parameters
-    ----------
-    camera_maker, camera_model, body_serial : str
-        The camera.
-    lens_maker, lens_model, lens_serial : str
-        The lens (EXIF 0xA433 to 0xA435).
-    aperture : float or None
-        The f-number.
-    focal_mm : float or None
-        Focal length in millimetres.
-    focal_range_mm : tuple of float or None
-        Shortest and longest focal length of the lens.
-    widest_aperture : tuple of float or None
-        Smallest f-number at the shortest and longest focal length.
-    focus_m : float or None
-        Subject distance in metres; infinity is allowed.
-    iso : int or None
-        Photographic sensitivity.
-    exposure_s : float or None
-        Exposure time in seconds.
-    taken_at : datetime or None
-        When the photo was taken.
-    pixel_pitch_um : float or None
-        Written as the focal plane resolution.
-    orientation : int
-        EXIF orientation, 1 to 8.
-    description : str
-        Free text.
-    baseline_exposure : float or None
-        Stops by which a raw converter is asked to brighten the picture.
-    artist, copyright : str or None
-    rating : int or None
-    """
-
-    camera_maker: str = ""
+    camera_maker: str = ""  # the camera
     camera_model: str = ""
     body_serial: str = ""
-    lens_maker: str = ""
+    lens_maker: str = ""  # the lens (EXIF 0xA433 to 0xA435)
     lens_model: str = ""
     lens_serial: str = ""
-    aperture: float | None = None
-    focal_mm: float | None = None
-    focal_range_mm: tuple[float, float] | None = None
+    aperture: float | None = None  # the f-number
+    focal_mm: float | None = None  # focal length in millimetres
+    focal_range_mm: tuple[float, float] | None = None  # shortest and longest focal length of the lens
+    # smallest f-number at the shortest and longest focal length
     widest_aperture: tuple[float, float] | None = None
-    focus_m: float | None = None
-    iso: int | None = None
-    exposure_s: float | None = None
-    taken_at: datetime | None = None
-    pixel_pitch_um: float | None = None
-    orientation: int = 1
-    description: str = ""
-    baseline_exposure: float | None = None
+    focus_m: float | None = None  # subject distance in metres; infinity is allowed
+    iso: int | None = None  # photographic sensitivity
+    exposure_s: float | None = None  # exposure time in seconds
+    taken_at: datetime | None = None  # when the photo was taken
+    pixel_pitch_um: float | None = None  # written as the focal plane resolution
+    orientation: int = 1  # EXIF orientation, 1 to 8
+    description: str = ""  # free text
+    baseline_exposure: float | None = None  # stops by which a raw converter is asked to brighten the picture
     artist: str | None = None
     copyright: str | None = None
     rating: int | None = None

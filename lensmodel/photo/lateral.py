@@ -37,21 +37,13 @@ class LateralColour:
     A point whose green image lies at radius r has its red (blue) image at::
 
         r_src = r (v + c r + b r² + a r³)
-
-    Parameters
-    ----------
-    red, blue : tuple of float
-        (a, b, c, v), with r in half diagonals; (0, 0, 0, 1) is no displacement.
-    half_diagonal : float
-        Half diagonal of the frame in pixels.
-    red_points, blue_points : int
-        How many points of the photo the estimate rests on. With fewer than 30 nothing is claimed:
-        the polynomial is the identity.
     """
 
-    red: Polynomial
+    red: Polynomial  # (a, b, c, v), with r in half diagonals; (0, 0, 0, 1) is no displacement
     blue: Polynomial
-    half_diagonal: float
+    half_diagonal: float  # half diagonal of the frame in pixels
+    # How many points of the photo the estimate rests on. With fewer than 30 nothing is claimed: the
+    # polynomial is the identity.
     red_points: int = 0
     blue_points: int = 0
 
@@ -81,13 +73,7 @@ class LateralColour:
 
     @classmethod
     def from_json(cls, values: Mapping[str, object]) -> LateralColour:
-        """Read what `to_json` wrote.
-
-        Raises
-        ------
-        InvalidInputError
-            If a value is missing or not a number.
-        """
+        """Read what `to_json` wrote."""
         try:
             return cls(
                 _polynomial(values["red"]),
@@ -110,20 +96,6 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
     band-passed windows peaks, found to sub-pixels by Newton steps on the cross spectrum. The radial
     part of the shifts is fitted by Huber-weighted least squares; the number of terms, none
     included, is chosen by the Bayesian information criterion.
-
-    Parameters
-    ----------
-    planes : Planes, shape (3, height, width)
-        Linear light, not yet corrected for lateral colour.
-    frame : Frame
-        Size of the photo.
-    clip : float or sequence of float
-        Windows that reach this level, of all channels or of each, are left out.
-
-    Raises
-    ------
-    InvalidInputError
-        If the planes do not have the size of the frame.
     """
     if planes.shape != (3, frame.height, frame.width):
         raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")

@@ -34,18 +34,7 @@ _LOWEST_PILE: Final = 0.8
 
 
 def require_known_mosaic(rows: Sequence[str]) -> None:
-    """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6.
-
-    Parameters
-    ----------
-    rows : sequence of str
-        Letters of the colours of the part that repeats.
-
-    Raises
-    ------
-    UnsupportedFormatError
-        Naming the pattern.
-    """
+    """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6."""
     height, width = len(rows), len(rows[0]) if rows else 0
     if (height, width) == (6, 6):
         return
@@ -61,37 +50,17 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mosaic:
-    """A colour filter array without its margins.
+    """A colour filter array without its margins."""
 
-    Parameters
-    ----------
-    values : ndarray of uint16, shape (height, width)
-        Raw numbers.
-    colours : ndarray of uint8, same shape
-        0 red, 1 green, 2 blue, 3 second green.
-    black : tuple of float
-        Black level of each of the four.
-    white : int
-        Level that the file states for saturation.
-    is_bayer : bool
-        The pattern repeats every 2 x 2 pixels; false for X-Trans.
-    """
-
-    values: NDArray[np.uint16]
-    colours: NDArray[np.uint8]
-    black: tuple[float, ...]
-    white: int
-    is_bayer: bool
+    values: NDArray[np.uint16]  # (height, width), raw numbers
+    colours: NDArray[np.uint8]  # 0 red, 1 green, 2 blue, 3 second green
+    black: tuple[float, ...]  # black level of each of the four
+    white: int  # level that the file states for saturation
+    is_bayer: bool  # the pattern repeats every 2 x 2 pixels; false for X-Trans
 
     @classmethod
     def of(cls, raw: rawpy.RawPy) -> Mosaic | None:
-        """Take the mosaic of an opened file; `None` where each pixel has all colours already.
-
-        Raises
-        ------
-        UnsupportedFormatError
-            If it is neither Bayer's nor X-Trans.
-        """
+        """Take the mosaic of an opened file; `None` where each pixel has all colours already."""
         if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
             return None
         letters = raw.color_desc.decode("ascii", "replace")
@@ -106,15 +75,7 @@ class Mosaic:
         )
 
     def check(self) -> None:
-        """Refuse numbers that no sensor gives, although the decoder was content.
-
-        Raises
-        ------
-        RawDecodeError
-            If all are equal, or a quarter of the rows are as random as a wrong decoding makes them.
-        TruncatedImageError
-            If rows are empty: the data were cut off and the decoder filled up.
-        """
+        """Refuse numbers that no sensor gives, although the decoder was content."""
         low, high = self.values.min(axis=1), self.values.max(axis=1)
         if low.min() == high.max():
             raise RawDecodeError(f"every pixel of the RAW data is {int(low[0])}; the file holds no picture")
@@ -147,20 +108,7 @@ class Mosaic:
         return random / len(starts)
 
     def repair(self, noise: tuple[NoiseModel, NoiseModel, NoiseModel], white: int) -> int:
-        """Replace defective pixels in LibRaw's own memory, before it demosaics.
-
-        Parameters
-        ----------
-        noise : tuple of three NoiseModel
-            Of the sensor, for r, g and b where `white` is 1.
-        white : int
-            Raw number of saturation.
-
-        Returns
-        -------
-        int
-            How many there were.
-        """
+        """Replace defective pixels in LibRaw's own memory, before it demosaics."""
         levels = np.linspace(0.0, 65535.0, _NOISE_LEVELS)
         sigma = np.empty((2, 2, _NOISE_LEVELS))
         for row, col in np.ndindex(2, 2):
@@ -177,13 +125,6 @@ class Mosaic:
 
         The level that a file states is often too high, and the colours of some sensors clip at
         different ones. Where a photo has clipped pixels they pile up, and the pile is the truth.
-
-        Returns
-        -------
-        white : int
-            Raw number that becomes 1.0; the stated one where nothing is clipped.
-        clip : tuple of float
-            For r, g, b the level of saturation on that scale, at most 1.
         """
         piles = {k: self._pile(k) for k in range(4) if self.is_bayer or k < 3}
         ends = [pile[1] for pile in piles.values() if pile is not None]

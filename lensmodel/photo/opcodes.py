@@ -66,16 +66,6 @@ def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opco
     """Rewrite the steps of OpcodeList2, which are for a mosaic, for an image of three colours.
 
     A gain map of every second pixel of a mosaic is that of a colour; of the two greens the mean is taken.
-
-    Parameters
-    ----------
-    steps : list of Opcode
-    cfa : BayerPattern or None
-        Colours of the mosaic; None where it is no Bayer mosaic.
-
-    Returns
-    -------
-    kept, lost : list of Opcode
     """
     kept: list[Opcode] = []
     lost: list[Opcode] = []

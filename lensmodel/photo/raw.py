@@ -80,17 +80,7 @@ class DevelopedRaw:
 
 @contextmanager
 def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
-    """Open a RAW file with LibRaw's header parser; foreign errors become ours.
-
-    Raises
-    ------
-    UnsupportedFormatError
-        If LibRaw does not know the format.
-    TruncatedImageError
-        If the file ends early.
-    RawDecodeError
-        If it fails in any other way.
-    """
+    """Open a RAW file with LibRaw's header parser; foreign errors become ours."""
     try:
         with rawpy.RawPy() as raw:
             raw.open_file(str(path))
@@ -130,13 +120,6 @@ def develop_raw(
     No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
     1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
     states, of all channels or of each.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown demosaicing method.
-    UnsupportedFormatError, TruncatedImageError, RawDecodeError
-        If the file cannot be decoded, or what comes out is no photograph.
     """
     method = "ahd" if demosaic == "default" else demosaic
     if method not in _ALGORITHMS:

@@ -52,20 +52,6 @@ def balance_of_rendition(
     the sensor over the same block, the multipliers of red and blue relative to green are::
 
         m_k = median over near-neutral blocks of (C^-1 J)_k s_g / ((C^-1 J)_g s_k)
-
-    Parameters
-    ----------
-    raw : RawPy
-        The opened file.
-    mosaic : Mosaic or None
-        Its sensor data; without a Bayer mosaic there is no answer.
-    to_srgb : ndarray, shape (3, 3), or None
-        C.
-
-    Returns
-    -------
-    tuple of float or None
-        Red and blue; `None` where there is no JPEG, it shows something else, or too little in it is grey.
     """
     if mosaic is None or not mosaic.is_bayer or (picture := _jpeg_of(raw)) is None:
         return None

@@ -37,18 +37,10 @@ _COARSEST_POWER: Final = 64.0
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How large a photo may be; checked on the header, before anything is decoded.
+    """How large a photo may be; checked on the header, before anything is decoded."""
 
-    Parameters
-    ----------
-    max_megapixels : float
-        Width times height, in millions.
-    max_bytes : int
-        Size of the file.
-    """
-
-    max_megapixels: float = 160.0
-    max_bytes: int = 2 << 30
+    max_megapixels: float = 160.0  # width times height, in millions
+    max_bytes: int = 2 << 30  # size of the file
 
     def __post_init__(self) -> None:
         if not (self.max_megapixels > 0 and self.max_bytes > 0):
@@ -61,20 +53,12 @@ class LensIdentity:
 
     A serial is never blank and never a placeholder such as "0000000000": then it is `None`
     and `serial_source` is "none".
-
-    Parameters
-    ----------
-    maker, model : str or None
-        As the file names them.
-    serial : str or None
-    serial_source : str
-        Which tag the serial is from, or "none".
     """
 
-    maker: str | None = None
+    maker: str | None = None  # as the file names them
     model: str | None = None
     serial: str | None = None
-    serial_source: SerialSource = "none"
+    serial_source: SerialSource = "none"  # which tag the serial is from, or "none"
 
     def __post_init__(self) -> None:
         if (self.serial is None) != (self.serial_source == "none"):
@@ -128,12 +112,7 @@ class PhotoMetadata:
     keywords: tuple[str, ...] = ()
 
     def without_serials(self) -> PhotoMetadata:
-        """Return the same without the serials of body and lens, which are personal data.
-
-        Returns
-        -------
-        PhotoMetadata
-        """
+        """Return the same without the serials of body and lens, which are personal data."""
         return replace(self, body_serial=None, lens=replace(self.lens, serial=None, serial_source="none"))
 
 

@@ -63,45 +63,25 @@ class CiffShot:
     """What the heap says of camera, lens and exposure; `None` is unknown.
 
     Nothing is judged here: whether a number can be true is for the caller to say.
-
-    Parameters
-    ----------
-    lens_model : str or None
-        The range of the lens in mm, such as "16-35 mm": these files hold no name of it.
-    focus_m : float or None
-        Geometric mean of the near and far bound.
-    pitch_um : float or None
-        Width of the sensor over that of the picture.
     """
 
     maker: str | None = None
     model: str | None = None
     body_serial: str | None = None
+    # the range of the lens in mm, such as "16-35 mm": these files hold no name of it
     lens_model: str | None = None
     aperture: float | None = None
     focal_mm: float | None = None
-    focus_m: float | None = None
+    focus_m: float | None = None  # geometric mean of the near and far bound
     iso: float | None = None
     exposure_s: float | None = None
     taken_at: datetime | None = None
     orientation: int = 1
-    pitch_um: float | None = None
+    pitch_um: float | None = None  # width of the sensor over that of the picture
 
 
 def read_ciff(buffer: Buffer) -> CiffShot | None:
-    """Read the records of a CRW file.
-
-    Parameters
-    ----------
-    buffer : bytes or mmap
-        The whole file.
-
-    Returns
-    -------
-    CiffShot or None
-        `None` where the file does not begin as a CIFF does; whatever else is wrong with it makes
-        fields unknown and raises nothing.
-    """
+    """Read the records of a CRW file."""
     head = bytes(buffer[: MAGIC_AT + len(MAGIC)])
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
     if order is None or head[MAGIC_AT:] != MAGIC:

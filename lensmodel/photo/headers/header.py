@@ -25,67 +25,32 @@ MAX_SEGMENTS: Final = 4096
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the container says: kind, size and the blocks in which metadata lie.
+    """What the container says: kind, size and the blocks in which metadata lie."""
 
-    Parameters
-    ----------
-    kind : FileKind
-        Kind of file.
-    width, height : int
-        Size as stored; 0 where only LibRaw can tell.
-    channels : int
-        Samples of a pixel; 0 unknown.
-    bits : int
-        Bits of a sample; 0 unknown.
-    compression : int
-        TIFF tag 259; 1 is none.
-    directory : int
-        Offset of the directory of a TIFF's picture; 0 where it is not said which.
-    tiff : tuple of TiffReader
-        TIFF structures with EXIF in them.
-    ciff : CiffShot or None
-        What the heap of a CRW file says, which has no TIFF structure.
-    xmp, icc : bytes or None
-        XMP packet, and ICC profile: of a PNG also one made of what its chunks declare.
-    coarseness : float
-        Median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG,
-        in 8-bit numbers; 0 unknown, or not compressed so.
-    white : tuple of int
-        WhiteLevel of a DNG, of all channels or of each; empty where it does not say.
-    opcodes_2, opcodes_3 : bytes
-        OpcodeList2 and 3 of a DNG.
-    chroma_step : tuple of int
-        Rows and columns of pixels that share one value of a JPEG's chroma.
-    """
-
-    kind: FileKind
-    width: int = 0
+    kind: FileKind  # kind of file
+    width: int = 0  # size as stored; 0 where only LibRaw can tell
     height: int = 0
-    channels: int = 0
-    bits: int = 0
-    compression: int = 1
-    directory: int = 0
-    tiff: tuple[TiffReader, ...] = ()
-    ciff: CiffShot | None = None
-    xmp: bytes | None = None
+    channels: int = 0  # samples of a pixel; 0 unknown
+    bits: int = 0  # bits of a sample; 0 unknown
+    compression: int = 1  # TIFF tag 259; 1 is none
+    directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
+    tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
+    ciff: CiffShot | None = None  # what the heap of a CRW file says, which has no TIFF structure
+    xmp: bytes | None = None  # XMP packet, and ICC profile: of a PNG also one made of what its chunks declare
     icc: bytes | None = None
+    # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
+    # 8-bit numbers; 0 unknown, or not compressed so
     coarseness: float = 0.0
+    # WhiteLevel of a DNG, of all channels or of each; empty where it does not say
     white: tuple[int, ...] = ()
-    opcodes_2: bytes = b""
+    opcodes_2: bytes = b""  # OpcodeList2 and 3 of a DNG
     opcodes_3: bytes = b""
+    # rows and columns of pixels that share one value of a JPEG's chroma
     chroma_step: tuple[int, int] = (1, 1)
 
 
 def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None:
-    """Refuse what would be too large to decode.
-
-    Raises
-    ------
-    ImageTooLargeError
-        If it has more pixels than the limits allow.
-    DecompressionBombError
-        If the claimed picture is out of all proportion to the file.
-    """
+    """Refuse what would be too large to decode."""
     megapixels = width * height / 1e6
     proportion = width * height / max(file_bytes, 1)
     if megapixels > BOMB_MEGAPIXELS and proportion > BOMB_PIXELS_PER_BYTE:

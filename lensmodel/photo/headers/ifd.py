@@ -99,27 +99,13 @@ Directory: TypeAlias = Mapping[int, IfdEntry]
 
 @dataclass(frozen=True, slots=True)
 class TiffReader:
-    """Directories of a TIFF structure inside a buffer.
+    """Directories of a TIFF structure inside a buffer."""
 
-    Parameters
-    ----------
-    buffer : bytes or mmap
-        The bytes; offsets count from `base`.
-    base : int
-        Where the structure starts in the buffer.
-    order : {"<", ">"}
-        Byte order.
-    first : int
-        Offset of the first directory from `base`.
-    big : bool
-        BigTIFF: 64-bit offsets.
-    """
-
-    buffer: Buffer = field(repr=False)
-    base: int
-    order: str
-    first: int
-    big: bool = False
+    buffer: Buffer = field(repr=False)  # the bytes; offsets count from `base`
+    base: int  # where the structure starts in the buffer
+    order: str  # byte order
+    first: int  # offset of the first directory from `base`
+    big: bool = False  # BigTIFF: 64-bit offsets
 
     @classmethod
     def open(cls, buffer: Buffer, base: int = 0) -> TiffReader | None:

@@ -26,15 +26,7 @@ _NO_FRAMES: Final = {0xC4, 0xC8, 0xCC}
 
 
 def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
-    """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation.
-
-    Raises
-    ------
-    TruncatedImageError, NotAnImageError
-        If the header ends early or makes no sense.
-    ImageTooLargeError
-        See `check_size`.
-    """
+    """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation."""
     header, icc_parts = Header("jpeg"), dict[int, bytes]()
     for code, body in _segments(buffer):
         if 0xC0 <= code <= 0xCF and code not in _NO_FRAMES:

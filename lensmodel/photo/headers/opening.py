@@ -27,15 +27,7 @@ _PARSERS: Final[Mapping[FileKind, Callable[[Buffer, Limits], Header]]] = {
 
 @contextlib.contextmanager
 def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
-    """Map a file and parse its header; the header is valid inside the `with` only.
-
-    Raises
-    ------
-    NotAnImageError, UnsupportedFormatError, TruncatedImageError
-        If it is no photo, none that we read, or ends early.
-    ImageTooLargeError
-        If the file has more bytes than the limits allow.
-    """
+    """Map a file and parse its header; the header is valid inside the `with` only."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
         kind = sniff(head)

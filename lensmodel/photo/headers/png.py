@@ -15,15 +15,7 @@ from lensmodel.photo.values import Limits
 
 
 def read_png(buffer: Buffer, limits: Limits) -> Header:
-    """Read the chunks; image data are skipped, not read.
-
-    Raises
-    ------
-    TruncatedImageError, NotAnImageError, UnsupportedFormatError
-        If the file ends early, its header makes no sense, or its colours are not read.
-    ImageTooLargeError
-        See `check_size`.
-    """
+    """Read the chunks; image data are skipped, not read."""
     first = bytes(buffer[8:33])
     if len(first) < 25:
         raise TruncatedImageError("the PNG ends inside its header; the upload was cut off")

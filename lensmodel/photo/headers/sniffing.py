@@ -34,23 +34,6 @@ def sniff(head: bytes) -> FileKind:
 
     RAW files that look like TIFF up to their directories (NEF, ARW, PEF, DNG) are "tiff" here;
     `inspect` looks into the directories and tells them apart.
-
-    Parameters
-    ----------
-    head : bytes
-        The first `HEAD_BYTES` bytes of the file, or fewer where it is shorter.
-
-    Returns
-    -------
-    str
-        One of `FileKind`.
-
-    Raises
-    ------
-    NotAnImageError
-        If the bytes belong to no image format.
-    UnsupportedFormatError
-        If they belong to one that is not read here.
     """
     for at, magic in _RAW_MAGIC:
         if head[at : at + len(magic)] == magic:

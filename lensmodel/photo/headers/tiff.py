@@ -40,15 +40,7 @@ _RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}
 
 
 def read_tiff(buffer: Buffer, limits: Limits) -> Header:
-    """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF.
-
-    Raises
-    ------
-    TruncatedImageError, NotAnImageError, UnsupportedFormatError
-        If the file ends early, holds no picture, or too many.
-    ImageTooLargeError
-        See `check_size`.
-    """
+    """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF."""
     reader = TiffReader.open(buffer)
     if reader is None:
         raise TruncatedImageError("the TIFF ends inside its header; the upload was cut off")
@@ -153,13 +145,7 @@ def _coarseness(buffer: Buffer, directory: Directory, limits: Limits) -> float:
 
 
 def _check_strips(directory: Directory, file_bytes: int) -> None:
-    """Refuse a picture whose strips or tiles do not lie in the file.
-
-    Raises
-    ------
-    NotAnImageError, TruncatedImageError, UnsupportedFormatError
-        If there is no picture, it ends early, or its tables are absurd.
-    """
+    """Refuse a picture whose strips or tiles do not lie in the file."""
     width, height = _value(directory, 256, 0), _value(directory, 257, 0)
     if width <= 0 or height <= 0:
         raise NotAnImageError(f"the TIFF gives no size ({width} x {height}); it holds no picture")
@@ -182,13 +168,7 @@ def _check_strips(directory: Directory, file_bytes: int) -> None:
 
 
 def _check_colours(directory: Directory) -> None:
-    """Refuse numbers that stand for other things than light of three colours, before they are stored.
-
-    Raises
-    ------
-    UnsupportedFormatError
-        Naming what they are.
-    """
+    """Refuse numbers that stand for other things than light of three colours, before they are stored."""
     kind, samples = _value(directory, 262, 1), _value(directory, 277, 1)
     named = _OTHER_COLOURS.get(kind, f"kind {kind}")
     if kind not in _READ_COLOURS:

@@ -86,15 +86,7 @@ class Directory:
 
 
 def laid_out(main: Directory, below: Mapping[int, Directory]) -> bytes:
-    """Lay out a TIFF structure: its header, the main directory, and those that its tags point to.
-
-    Parameters
-    ----------
-    main : Directory
-        The pointers are added to it.
-    below : mapping of int to Directory
-        By the tag that points to each; empty ones are left out.
-    """
+    """Lay out a TIFF structure: its header, the main directory, and those that its tags point to."""
     below = {tag: directory for tag, directory in below.items() if directory.entries}
     for tag in below:
         main.longs(tag, 0)
@@ -146,19 +138,7 @@ def exif_directory(metadata: PhotoMetadata) -> Directory:
 def exif_block(
     metadata: PhotoMetadata, orientation: int, description: str = "", gps: Directory | None = None
 ) -> bytes:
-    """Make a complete EXIF structure, from its TIFF header on.
-
-    Parameters
-    ----------
-    metadata : PhotoMetadata
-        What to write; serials in it are left out.
-    orientation : int
-        EXIF orientation of the pixels as written.
-    description : str
-        Goes into ImageDescription; signs outside ASCII become "?".
-    gps : Directory, optional
-        Where it was taken, as `location.gps_directory` reads it.
-    """
+    """Make a complete EXIF structure, from its TIFF header on."""
     main = main_directory(metadata, orientation, description)
     return laid_out(main, {EXIF_POINTER: exif_directory(metadata), GPS_POINTER: gps or Directory()})
 

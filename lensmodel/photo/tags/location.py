@@ -68,32 +68,14 @@ class Overwrite:
 
 @dataclass(frozen=True, slots=True)
 class LocationTraces:
-    """Where a file says where it was taken.
+    """Where a file says where it was taken."""
 
-    Parameters
-    ----------
-    overwrites : tuple of Overwrite
-        What removes it; empty where the file says nothing.
-    complete : bool
-        False where the file holds more than was looked at, as hostile ones may.
-    """
-
-    overwrites: tuple[Overwrite, ...]
-    complete: bool
+    overwrites: tuple[Overwrite, ...]  # what removes it; empty where the file says nothing
+    complete: bool  # false where the file holds more than was looked at, as hostile ones may
 
 
 def find_location(buffer: Buffer) -> LocationTraces:
     """Find what a photo file says of the place where it was taken.
-
-    Parameters
-    ----------
-    buffer : bytes or mmap
-        The whole file.
-
-    Returns
-    -------
-    LocationTraces
-        What to write over it; applied, the same search finds nothing.
 
     Notes
     -----

@@ -30,17 +30,7 @@ class MakerNote:
 
 
 def read_maker_note(maker: str, note: IfdEntry | None, reader: TiffReader) -> MakerNote:
-    """Read the maker note of EXIF tag 0x927C.
-
-    Parameters
-    ----------
-    maker : str
-        EXIF Make; decides the layout where the note carries no name of its own.
-    note : IfdEntry or None
-        The tag.
-    reader : TiffReader
-        The structure that the tag lies in; Canon's and Panasonic's offsets count from its base.
-    """
+    """Read the maker note of EXIF tag 0x927C."""
     if note is None:
         return MakerNote()
     head = bytes(reader.buffer[note.offset : note.offset + 16])

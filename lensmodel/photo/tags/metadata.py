@@ -62,16 +62,6 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
     """Read what a photo file says, without decoding it.
 
     Unreadable metadata are unknown metadata; only a file that is no photo raises.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file; its content decides what it is.
-
-    Raises
-    ------
-    NotAnImageError, UnsupportedFormatError, TruncatedImageError
-        If the file's header cannot be read.
     """
     with opened_header(Path(path), Limits()) as header:
         return metadata_of(header)

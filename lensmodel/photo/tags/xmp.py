@@ -88,16 +88,6 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
 
     A packet that is damaged gives what came before the damage, a refused one nothing:
     metadata that cannot be read are unknown, and no reason to refuse the photo.
-
-    Parameters
-    ----------
-    packet : bytes or None
-        The XML text, up to `MAX_XMP_BYTES`.
-
-    Returns
-    -------
-    mapping of str to str
-        For example "aux:LensSerialNumber" to "0000129324".
     """
     if not packet or len(packet) > MAX_XMP_BYTES:
         return {}

@@ -47,13 +47,7 @@ _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 
 
 
 def sidecar_for(photo: Path) -> Path:
-    """Name the sidecar of a photo: `c.tif.xmp` of `c.tif`, since `c.xmp` may be that of a `c.dng`.
-
-    Raises
-    ------
-    InvalidInputError
-        If another program has written a file of that name, or changed ours: what it holds is somebody's work.
-    """
+    """Name the sidecar of a photo: `c.tif.xmp` of `c.tif`, since `c.xmp` may be that of a `c.dng`."""
     path = photo.with_name(f"{photo.name}.xmp")
     try:
         with path.open("rb") as file:
@@ -70,15 +64,7 @@ def sidecar_for(photo: Path) -> Path:
 def write_sidecar(
     path: Path, metadata: PhotoMetadata, *, source: str, description: str, done: Mapping[str, str]
 ) -> None:
-    """Write a packet as a file, complete or not at all; an existing one is replaced (`sidecar_for`).
-
-    Parameters
-    ----------
-    path : Path
-        Where to.
-    metadata, source, description, done
-        As of `xmp_packet`.
-    """
+    """Write a packet as a file, complete or not at all; an existing one is replaced (`sidecar_for`)."""
     with atomic(path) as file:
         file.write(xmp_packet(metadata, description, source=source, done=done, writable=True))
 
@@ -92,23 +78,7 @@ def xmp_packet(
     done: Mapping[str, str] = MappingProxyType({}),
     writable: bool = False,
 ) -> bytes:
-    """Return a packet, UTF-8; serial numbers, places (GPS) and maker notes stay out.
-
-    Parameters
-    ----------
-    metadata : PhotoMetadata
-        Of the photo that was changed.
-    description : str
-        What was done to it; it becomes the description and one event of the history.
-    lens : str
-        What its owner calls the lens; by default what the photo says.
-    source : str
-        Name of the photo's file, without a folder; "" leaves it out.
-    done : mapping of str to str
-        Further properties in the namespace `OWN`, such as the method and the expected gain.
-    writable : bool
-        Whether other programs may change the packet in place, as they may a sidecar.
-    """
+    """Return a packet, UTF-8; serial numbers, places (GPS) and maker notes stay out."""
     root = ET.Element(_name("x:xmpmeta"), {_name("x:xmptk"): SOFTWARE})
     whole = ET.SubElement(ET.SubElement(root, _name("rdf:RDF")), _name("rdf:Description"))
     whole.set(_name("rdf:about"), "")

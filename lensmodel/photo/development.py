@@ -21,15 +21,7 @@ from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw, opened_raw, stored_levels
 from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
-from lensmodel.photo.values import (
-    Encoding,
-    Limits,
-    LinearPhoto,
-    PhotoInfo,
-    PlaneNoise,
-    Transfer,
-    remarks_log,
-)
+from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer, remarks_log
 
 
 def develop(

@@ -159,11 +159,7 @@ class Mosaic:
         at = np.arange(first, len(counts))
         middle = int(at[np.argmax(sums[np.minimum(at + width, len(counts))] - sums[at])]) + width // 2
         low, high = middle - 2 * width, middle + 2 * width
-        pile, below, above = (
-            within(low, high),
-            within(2 * low - high, low),
-            within(high, len(counts)),
-        )
+        pile, below, above = (within(low, high), within(2 * low - high, low), within(high, len(counts)))
         total = within(0, len(counts))
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
         if not max(50, 2e-5 * total) < pile < 0.5 * total or pile < 5 * below or above > _STRAYS * pile:

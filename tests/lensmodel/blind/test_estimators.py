@@ -12,13 +12,7 @@ from lensmodel import blind
 from lensmodel.blind.patch_recurrence import blend, normal_equations, recur
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
-from lensmodel.core.psf import (
-    centroid,
-    delta,
-    distance,
-    gaussian,
-    rms_width,
-)
+from lensmodel.core.psf import centroid, delta, distance, gaussian, rms_width
 from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.simulate import demo_scene, edge_area
 

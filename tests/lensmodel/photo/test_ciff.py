@@ -31,10 +31,7 @@ Value = bytes | dict[int, "Value"]
 
 SHOT = 0x102A
 D30: dict[int, Value] = {
-    0x2807: {
-        0x080A: b"Canon\0Canon EOS D30\0\0\xfb\x7f",
-        0x3004: {0x180B: struct.pack("<I", 0x123509AA)},
-    },
+    0x2807: {0x080A: b"Canon\0Canon EOS D30\0\0\xfb\x7f", 0x3004: {0x180B: struct.pack("<I", 0x123509AA)}},
     0x300A: {
         0x180E: struct.pack("<III", 1514811812, 0, 0),
         0x1810: struct.pack("<IIfi", 2160, 1440, 1.0, 90),

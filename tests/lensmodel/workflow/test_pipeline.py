@@ -83,9 +83,7 @@ def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
     assert [path.name for path in tmp_path.iterdir()] == ["photo.json"]
 
 
-def test_lateral_colour_does_not_hang_on_the_level_of_white(
-    city: LinearPhoto,
-) -> None:
+def test_lateral_colour_does_not_hang_on_the_level_of_white(city: LinearPhoto) -> None:
     brighter = replace(city, planes=4.0 * city.planes, clip=(4.0, 4.0, 4.0))
 
     assert correcting.lateral_of(city).red_points > 0

@@ -29,7 +29,7 @@ COPY app /srv/lensmodel/app
 COPY migrations /srv/lensmodel/migrations
 COPY --chmod=755 tools/container_entry.sh /usr/local/bin/lensmodel-entry
 # Listening on every address of a container reaches nobody: publishing its port does, and that is
-# the host's decision (compose.yaml publishes it on loopback). LENS_PUBLIC has it ask for keys; the first
+# the host's decision (compose.yaml publishes it on loopback). LENS_ALLOWED_HOSTS has it ask for keys; the first
 # is made by the command "keys create" in a container with the same volume. Whoever publishes it under a
 # name gives that name in LENS_ALLOWED_HOSTS; addresses and local names are answered to anyway.
 ENV PATH=/opt/lensmodel/bin:$PATH \
@@ -38,7 +38,6 @@ ENV PATH=/opt/lensmodel/bin:$PATH \
     LENS_DATA_DIR=/data \
     LENS_HOST=0.0.0.0 \
     LENS_PORT=8000 \
-    LENS_PUBLIC=true \
     LENS_ALLOWED_HOSTS=localhost \
     LENS_LOG_FORMAT=json \
     NUMBA_CACHE_DIR=/data/cache \

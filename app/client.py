@@ -15,32 +15,50 @@ from __future__ import annotations
 import io
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from types import TracebackType
+from typing import Any, Final, Literal, Self, TypeAlias, TypeVar
 
 import httpx2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
 
 from app import schemas as s
-from app.client_connection import DEFAULT_URL, Query, ServiceProblemError, read, require_success, said
-from app.client_lenses import LensCalls
-from app.schemas.account import AccountOut
+from app.runtime.settings import CLIENT_KEY
 from lensmodel.core.errors import LensModelError
+from lensmodel.core.files import atomic
+from lensmodel.core.types import Channel
 
-__all__ = [
-    "DEFAULT_URL",
-    "Client",
-    "JobEndedError",
-    "JobPatienceError",
-    "ServiceProblemError",
-    "ended",
-]
+M = TypeVar("M", bound=BaseModel)
+Query: TypeAlias = Mapping[str, str | int | float | bool | None]
+
+DEFAULT_URL: Final = "http://127.0.0.1:8000"
+ANSWER_SECONDS: Final = 60.0
+"""Longest wait for a response (chosen): longer than a long poll."""
+
+CONNECTS: Final = 5
+"""Attempts to connect (chosen): with the pauses of httpx, seven seconds bridge the restart of a service."""
 
 LONG_POLL_SECONDS: Final = 20
-"""Longest wait of one request for a job: the default of LENS_LONG_POLL_SECONDS."""
+"""Longest wait of one request for a job: as the service allows."""
 
 PAUSE_SECONDS: Final = 0.1
 """Pause between two requests for a job (chosen): a service may be set to answer at once."""
+
+AWAY_SECONDS: Final = 2.0
+"""Pause of `wait` while the service is away or busy (chosen): it restarts in a few seconds."""
+
+_AWAY: Final = frozenset({429, 502, 503, 504})
+
+
+class ServiceProblemError(LensModelError):
+    """The service said no; `problem` says why."""
+
+    def __init__(self, problem: s.Problem) -> None:
+        super().__init__(f"{problem.detail or problem.title} ({problem.code}, status {problem.status})")
+        self.problem = problem
 
 
 class JobEndedError(LensModelError):
@@ -56,37 +74,62 @@ class JobPatienceError(LensModelError):
     """A job took longer than its caller would wait."""
 
 
-class Client(LensCalls):
-    """Speaks with one service; see `app.client_connection.Connection` for where and how."""
+class Client:
+    """Speaks with one service.
+
+    Parameters
+    ----------
+    url : str
+        Where the service listens.
+    http : httpx2.Client, optional
+        A connection to use instead of an own one, for instance with other time limits.
+    key : str, optional
+        What `lensmodel keys create` printed, where the service asks for it; by default LENS_API_KEY of the
+        environment. It is not sent over a connection that is given as `http`.
+    """
+
+    def __init__(
+        self, url: str = DEFAULT_URL, *, http: httpx2.Client | None = None, key: str | None = None
+    ) -> None:
+        if http is None:
+            shown = os.environ.get(CLIENT_KEY, "") if key is None else key
+            headers = {"Authorization": f"Bearer {shown}"} if shown else {}
+            transport = httpx2.HTTPTransport(retries=CONNECTS)
+            http = httpx2.Client(base_url=url, timeout=ANSWER_SECONDS, headers=headers, transport=transport)
+        self._http = http
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the connections."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    # --- photos -----------------------------------------------------------------------------------
 
     def upload(
         self,
         path: str | Path,
         *,
         calibrate: bool = True,
-        lens_id: str | None = None,
-        lens_serial: str | None = None,
-        lens_model: str | None = None,
-        lens_maker: str | None = None,
-        aperture: float | None = None,
-        focal_length_mm: float | None = None,
-        focus_distance_m: float | None = None,
-        pixel_pitch_um: float | None = None,
-        model: s.PsfModel | None = None,
-        selector: str | None = None,
-        kind: s.MeasurementKind | None = None,
-        reference_id: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
+        **fields: str | float | None,
     ) -> s.PhotoOut:
         """Send a photo, streamed from its file; the same bytes give the photo that is there already.
 
-        `on_progress(sent, total)` is called in bytes after each mebibyte. With `model` the photo founds a
-        lens that is learned so; of a lens that is there and has another it is refused, see `choose_model`.
-        `selector` chooses its patches instead of the service's own. Settings are those of a file that does
-        not say its own; `change_photo` corrects one that says them wrongly.
-
-        With `kind` it was made to measure the lens; of a pair it is the open photo, and `reference_id` is the
-        closed one, sent before with `calibrate=False`.
+        `fields` are those of `UploadFields`, such as `lens_id` or `aperture`; `on_progress(sent, total)` is
+        called in bytes after each mebibyte. Settings are those of a file that does not say its own:
+        `change_photo` corrects one that says them wrongly. With `model` the photo founds a lens that is
+        learned so; of a lens that is there and has another it is refused. With `kind` it was made to measure
+        the lens; of a pair it is the open photo, and `reference_id` is the closed one, sent before with
+        `calibrate=False`.
 
         Raises
         ------
@@ -95,30 +138,16 @@ class Client(LensCalls):
         OSError
             If the file cannot be read.
         """
-        fields: Query = {
-            "filename": Path(path).name,
-            "calibrate": str(calibrate).lower(),
-            "lens_id": lens_id,
-            "lens_serial": lens_serial,
-            "lens_model": lens_model,
-            "lens_maker": lens_maker,
-            "aperture": aperture,
-            "focal_length_mm": focal_length_mm,
-            "focus_distance_m": focus_distance_m,
-            "pixel_pitch_um": pixel_pitch_um,
-            "model": model,
-            "selector": selector,
-            "kind": kind,
-            "reference_id": reference_id,
-        }
+        given = s.UploadFields.model_validate({"calibrate": calibrate, **fields})
+        query = given.model_dump(exclude_none=True) | {"calibrate": str(calibrate).lower()}
         with Path(path).open("rb") as file:
             answer = self._http.post(
                 "/v1/photos",
-                params=said(fields),
+                params={"filename": Path(path).name, **query},
                 content=_pieces(file, on_progress),
                 headers={"Content-Type": "application/octet-stream"},
             )
-        return read(s.PhotoOut, answer)
+        return _read(s.PhotoOut, answer)
 
     def photo(self, photo_id: str) -> s.PhotoOut:
         """Return one photo."""
@@ -131,13 +160,12 @@ class Client(LensCalls):
     def change_photo(self, /, photo_id: str, **changes: object) -> s.PhotoOut:
         """Name the lens of a photo, correct its settings, or exclude it: fields of `PhotoChange`."""
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
-        return read(s.PhotoOut, self._http.patch(f"/v1/photos/{photo_id}", json=body))
+        return self._send(s.PhotoOut, "PATCH", f"/v1/photos/{photo_id}", body)
 
     def change_photos(self, /, photo_ids: Iterable[str], **changes: object) -> list[s.PhotoOut]:
         """Name the lens of several photos at once, or correct their settings: fields of `PhotosChange`."""
         body = s.PhotosChange.model_validate({"photo_ids": list(photo_ids), **changes})
-        sent = body.model_dump(exclude_unset=True)
-        return read(s.PhotoPage, self._http.patch("/v1/photos", json=sent)).items
+        return self._send(s.PhotoPage, "PATCH", "/v1/photos", body.model_dump(exclude_unset=True)).items
 
     def patches(self, photo_id: str) -> list[s.PatchOut]:
         """Return where a photo was learned from, and where not and why."""
@@ -145,7 +173,9 @@ class Client(LensCalls):
 
     def delete_photo(self, photo_id: str) -> None:
         """Delete a photo with all that was made of it."""
-        require_success(self._http.delete(f"/v1/photos/{photo_id}"))
+        _require_success(self._http.delete(f"/v1/photos/{photo_id}"))
+
+    # --- jobs -------------------------------------------------------------------------------------
 
     def job(self, job_id: str) -> s.JobOut:
         """Return one job."""
@@ -157,21 +187,18 @@ class Client(LensCalls):
 
     def cancel(self, job_id: str) -> s.JobOut:
         """Cancel a job."""
-        return read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/cancel"))
+        return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/cancel")
 
     def retry(self, job_id: str) -> s.JobOut:
         """Start a failed or cancelled job anew."""
-        return read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/retry"))
+        return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/retry")
 
     def retry_all(self, code: str = "outage") -> int:
         """Start anew all jobs that failed with a code; return how many."""
         again = 0
-        while True:
-            answer = self._http.post("/v1/jobs/retry", params={"code": code})
-            retried = read(s.RetriedOut, answer).retried
+        while retried := self._send(s.RetriedOut, "POST", f"/v1/jobs/retry?code={code}").retried:
             again += retried
-            if retried == 0:
-                return again
+        return again
 
     def wait(
         self,
@@ -180,7 +207,7 @@ class Client(LensCalls):
         timeout: float | None = None,
         on_change: Callable[[s.JobOut], None] | None = None,
     ) -> s.JobOut:
-        """Wait until the work on a photo or a correction has succeeded.
+        """Wait until the work on a photo or a correction has succeeded, also while the service restarts.
 
         Parameters
         ----------
@@ -203,27 +230,37 @@ class Client(LensCalls):
         tag: str | None = None
         while True:
             left = LONG_POLL_SECONDS if until is None else max(until - time.monotonic(), 0.0)
-            job, tag = self.poll(job_id, tag, 0.0 if tag is None else min(left, LONG_POLL_SECONDS))
-            if job is not None and ended(job, on_change):
+            pause, job = PAUSE_SECONDS, None
+            try:
+                job, tag = self._poll(job_id, tag, 0.0 if tag is None else min(left, LONG_POLL_SECONDS))
+            except (httpx2.TransportError, ServiceProblemError) as error:
+                if tag is None or (
+                    isinstance(error, ServiceProblemError) and error.problem.status not in _AWAY
+                ):
+                    raise
+                pause = AWAY_SECONDS
+            if job is not None and _ended(job, on_change):
                 return job
             if until is not None and time.monotonic() >= until:
                 raise JobPatienceError(
                     f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
                 )
-            time.sleep(PAUSE_SECONDS)  # a service may be set to answer at once
+            time.sleep(pause)
 
-    def poll(self, job_id: str, tag: str | None, seconds: float) -> tuple[s.JobOut | None, str | None]:
+    def _poll(self, job_id: str, tag: str | None, seconds: float) -> tuple[s.JobOut | None, str | None]:
         """Ask once for a job, waiting so many seconds for a change since `tag`; None where there was none."""
         headers = {} if tag is None else {"If-None-Match": tag}
         answer = self._http.get(f"/v1/jobs/{job_id}", params={"wait": seconds}, headers=headers)
         if answer.status_code == httpx2.codes.NOT_MODIFIED:
             return None, tag
-        return read(s.JobOut, answer), answer.headers.get("ETag")
+        return _read(s.JobOut, answer), answer.headers.get("ETag")
+
+    # --- corrections ------------------------------------------------------------------------------
 
     def correct(self, /, photo_id: str, **options: object) -> s.CorrectionOut:
         """Ask for a correction: fields of `CorrectionIn`."""
         body = s.CorrectionIn.model_validate({"photo_id": photo_id, **options}).model_dump(mode="json")
-        return read(s.CorrectionOut, self._http.post("/v1/corrections", json=body))
+        return self._send(s.CorrectionOut, "POST", "/v1/corrections", body)
 
     def correction(self, correction_id: str) -> s.CorrectionOut:
         """Return one correction."""
@@ -235,11 +272,133 @@ class Client(LensCalls):
 
     def delete_correction(self, correction_id: str) -> None:
         """Delete a correction with its file; one that runs stops."""
-        require_success(self._http.delete(f"/v1/corrections/{correction_id}"))
+        _require_success(self._http.delete(f"/v1/corrections/{correction_id}"))
 
-    def account(self) -> AccountOut:
+    def download(self, correction_id: str, path: str | Path) -> Path:
+        """Save the corrected photo; the file appears under its name only when it is complete."""
+        return self._save(f"/v1/corrections/{correction_id}/result", Path(path))
+
+    # --- lenses -----------------------------------------------------------------------------------
+
+    def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
+        """Return all lenses, newest first, optionally of one model or serial."""
+        return list(self._pages(s.LensPage, "/v1/lenses", {"model": model, "serial": serial}))
+
+    def lens(self, lens_id: str) -> s.LensOut:
+        """Return one lens."""
+        return self._get(s.LensOut, f"/v1/lenses/{lens_id}")
+
+    def calibrations(self, lens_id: str) -> list[s.CalibrationOut]:
+        """Return the history of a lens, oldest first."""
+        return list(self._pages(s.CalibrationPage, f"/v1/lenses/{lens_id}/calibrations"))
+
+    def lateral_colour(self, lens_id: str) -> s.LateralOut:
+        """Return the lateral colour shift of a lens."""
+        return self._get(s.LateralOut, f"/v1/lenses/{lens_id}/lateral-colour")
+
+    def psf(
+        self,
+        /,
+        lens_id: str,
+        *,
+        r: float,
+        phi: float = 0.0,
+        aperture: float | None = None,
+        channel: Channel = "g",
+        size: int = 55,
+        **more: float | bool | None,
+    ) -> s.PsfOut:
+        """Return the PSF of a lens at one place and setting, with what it rests on."""
+        query: Query = {"r": r, "phi": phi, "aperture": aperture, "channel": channel, "size": size, **more}
+        return self._get(s.PsfOut, f"/v1/lenses/{lens_id}/psf.json", query)
+
+    def kernel(
+        self, /, lens_id: str, *, r: float, phi: float = 0.0, **query: str | float | None
+    ) -> NDArray[np.float32]:
+        """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
+        params = _present({"r": r, "phi": phi, **query})
+        answer = _require_success(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=params))
+        kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
+        return kernel
+
+    def field_png(self, /, lens_id: str, **query: str | float | None) -> bytes:
+        """Return the map of PSFs over the field as a PNG; the parameters are those of the endpoint."""
+        address = f"/v1/lenses/{lens_id}/field.png"
+        return _require_success(self._http.get(address, params=_present(query))).content
+
+    def delete_lens(self, lens_id: str) -> None:
+        """Delete a lens with all that was learned of it."""
+        _require_success(self._http.delete(f"/v1/lenses/{lens_id}"))
+
+    def rename_lens(self, lens_id: str, label: str | None) -> s.LensOut:
+        """Call a lens by a name of its owner's; None takes the name away."""
+        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"label": label})
+
+    def merge_lens(self, lens_id: str, into: str) -> s.LensOut:
+        """Let a lens become a part of another, which is returned; it is forgotten itself."""
+        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"merge_into": into})
+
+    def go_back(self, lens_id: str, version: int) -> s.LensOut:
+        """Leave out the photos that joined a lens after a version of `calibrations`."""
+        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"back_to": version})
+
+    def save_profile(self, lens_id: str, path: str | Path) -> Path:
+        """Save what was learned of a lens as a `.lensprofile`."""
+        return self._save(f"/v1/lenses/{lens_id}/profile", Path(path))
+
+    def create_lens(self, label: str) -> s.LensOut:
+        """Create a lens, to add a profile to."""
+        return self._send(s.LensOut, "POST", "/v1/lenses", {"label": label})
+
+    def add_profile(self, lens_id: str, path: str | Path, *, any_lens: bool = False) -> s.LensOut:
+        """Let what a `.lensprofile` knows join a lens; the same file a second time changes nothing.
+
+        One that seems to be of another lens is refused without `any_lens`.
+        """
+        headers = {"Content-Type": "application/zip"}
+        address = f"/v1/lenses/{lens_id}/profile{'?any_lens=true' if any_lens else ''}"
+        answer = self._http.put(address, content=Path(path).read_bytes(), headers=headers)
+        lens = _read(s.LensOut, answer)
+        if answer.status_code != httpx2.codes.ACCEPTED:
+            return lens
+        self.wait(answer.headers["Location"].rpartition("/")[2])  # a worker is still reading it
+        return self.lens(lens_id)
+
+    def save_report(
+        self,
+        lens_id: str,
+        path: str | Path,
+        *,
+        form: Literal["json", "csv", "html", "pdf"] | None = None,
+        against: str | None = None,
+        aperture: float | None = None,
+        against_aperture: float | None = None,
+        channel: Channel = "g",
+    ) -> Path:
+        """Save the test report of a lens, in the form that the ending of `path` names unless `form` does.
+
+        With `against`, another lens, or `against_aperture` it is a comparison.
+
+        Raises
+        ------
+        ServiceProblemError
+            With the code `not_ready` while a worker has yet to make it.
+        """
+        target = Path(path)
+        query: Query = {
+            "against": against,
+            "aperture": aperture,
+            "against_aperture": against_aperture,
+            "channel": channel,
+        }
+        kind = form or target.suffix.lower().removeprefix(".")
+        return self._save(f"/v1/lenses/{lens_id}/report.{kind}", target, query)
+
+    # --- the account ------------------------------------------------------------------------------
+
+    def account(self) -> s.AccountOut:
         """Return who asks, what he has and what he may have."""
-        return self._get(AccountOut, "/v1/account")
+        return self._get(s.AccountOut, "/v1/account")
 
     def export_account(self, path: str | Path) -> Path:
         """Save all that the service keeps of this owner as a ZIP file."""
@@ -247,21 +406,37 @@ class Client(LensCalls):
 
     def erase_account(self) -> None:
         """Erase all that the service keeps of this owner, its keys too. There is no way back."""
-        require_success(self._http.delete("/v1/account"))
+        _require_success(self._http.delete("/v1/account"))
 
-    def download(self, correction_id: str, path: str | Path) -> Path:
-        """Save the corrected photo; the file appears under its name only when it is complete."""
-        return self._save(f"/v1/corrections/{correction_id}/result", Path(path))
+    # --- requests ---------------------------------------------------------------------------------
+
+    def _save(self, address: str, target: Path, query: Query | None = None) -> Path:
+        with self._http.stream("GET", address, params=_present(query) if query else None) as answer:
+            if answer.is_error:
+                answer.read()
+            _require_success(answer)
+            with atomic(target) as file:
+                for piece in answer.iter_bytes():
+                    file.write(piece)
+        return target
+
+    def _send(self, answer: type[M], method: str, path: str, body: Mapping[str, object] | None = None) -> M:
+        return _read(answer, self._http.request(method, path, json=body))
+
+    def _get(self, answer: type[M], path: str, query: Query | None = None) -> M:
+        # None and not {}: empty parameters would cut off the query that an address carries already
+        return _read(answer, self._http.get(path, params=_present(query) if query else None))
+
+    def _pages(self, answer: type[M], path: str, query: Query | None = None) -> Iterator[Any]:
+        page: Any = self._get(answer, path, query)
+        yield from page.items
+        while page.next is not None:
+            page = self._get(answer, page.next)
+            yield from page.items
 
 
-def ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
-    """Tell a caller of a change; say whether the job has succeeded.
-
-    Raises
-    ------
-    JobEndedError
-        If it ended in another way, or cannot go on before its owner names the lens.
-    """
+def _ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
+    """Tell a caller of a change; say whether the job has succeeded."""
     if on_change is not None:
         on_change(job)
     if job.state in {"failed", "cancelled", "waiting"}:
@@ -275,3 +450,25 @@ def _pieces(file: io.BufferedReader, on_progress: Callable[[int, int], None] | N
         yield piece
         if on_progress is not None:
             on_progress(file.tell(), total)
+
+
+def _present(query: Query) -> dict[str, str | int | float | bool]:
+    """Return a query without what is left open."""
+    return {name: value for name, value in query.items() if value is not None}
+
+
+def _require_success(answer: httpx2.Response) -> httpx2.Response:
+    if not answer.is_error:
+        return answer
+    try:
+        problem = s.Problem.model_validate_json(answer.content)
+    except ValidationError:  # a proxy between us and the service
+        text = answer.text[:200]
+        problem = s.Problem(
+            title=answer.reason_phrase, status=answer.status_code, detail=text, code="no_problem"
+        )
+    raise ServiceProblemError(problem)
+
+
+def _read(model: type[M], answer: httpx2.Response) -> M:
+    return model.model_validate_json(_require_success(answer).content)

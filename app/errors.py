@@ -1,9 +1,9 @@
-"""Errors of the service with their HTTP status; `app.http.errors` turns them into responses."""
+"""Errors of the service; `app.http.errors` turns them into responses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from lensmodel.core.errors import LensModelError
 
@@ -24,8 +24,6 @@ class ServiceError(LensModelError):
         For the answer.
     """
 
-    status: ClassVar[int] = 400
-
     def __init__(
         self, detail: str, *, errors: Sequence[FieldError] = (), headers: Mapping[str, str] | None = None
     ) -> None:
@@ -43,61 +41,61 @@ class MalformedUploadError(ServiceError):
 class InvalidParameterError(ServiceError):
     """A value outside its range."""
 
-    status, code = 422, "invalid_parameter"
+    code = "invalid_parameter"
 
 
 class UnknownPhotoError(ServiceError):
     """No photo of that id, or somebody else's."""
 
-    status, code = 404, "unknown_photo"
+    code = "unknown_photo"
 
 
 class UnknownPictureError(ServiceError):
     """No such part of a picture."""
 
-    status, code = 404, "unknown_photo"
+    code = "unknown_photo"
 
 
 class UnknownLensError(ServiceError):
     """No lens of that id, or somebody else's."""
 
-    status, code = 404, "unknown_lens"
+    code = "unknown_lens"
 
 
 class UnknownCorrectionError(ServiceError):
     """No correction of that id, or somebody else's."""
 
-    status, code = 404, "unknown_correction"
+    code = "unknown_correction"
 
 
 class UnknownJobError(ServiceError):
     """No job of that id, or somebody else's."""
 
-    status, code = 404, "unknown_job"
+    code = "unknown_job"
 
 
 class NotSignedInError(ServiceError):
     """No valid key or session."""
 
-    status, code = 401, "not_signed_in"
+    code = "not_signed_in"
 
 
 class ForbiddenError(ServiceError):
     """The key does not allow this."""
 
-    status, code = 403, "forbidden"
+    code = "forbidden"
 
 
 class NotReadyError(ServiceError):
     """The result is not finished yet."""
 
-    status, code = 409, "not_ready"
+    code = "not_ready"
 
 
 class ConflictError(ServiceError):
     """The state does not allow it."""
 
-    status, code = 409, "conflict"
+    code = "conflict"
 
 
 class OtherLensError(ConflictError):
@@ -109,40 +107,40 @@ class OtherLensError(ConflictError):
 class NotAcceptableError(ServiceError):
     """None of the accepted formats is available."""
 
-    status, code = 406, "not_acceptable"
+    code = "not_acceptable"
 
 
 class TooLargeError(ServiceError):
     """More bytes than an upload may have."""
 
-    status, code = 413, "image_too_large"
+    code = "image_too_large"
 
 
 class SlowBodyError(ServiceError):
     """A body that arrives too slowly or not at all."""
 
-    status, code = 408, "too_slow"
+    code = "too_slow"
 
 
 class BusyError(ServiceError):
     """Too much is in progress already."""
 
-    status, code = 503, "busy"
+    code = "busy"
 
 
 class QuotaError(ServiceError):
     """The owner has too much unfinished or stored already."""
 
-    status, code = 429, "quota_exceeded"
+    code = "quota_exceeded"
 
 
 class StorageFullError(ServiceError):
     """No room for another photo."""
 
-    status, code = 507, "quota_exceeded"
+    code = "quota_exceeded"
 
 
 class RangeError(ServiceError):
     """A byte range beyond the end of the file."""
 
-    status, code = 416, "invalid_parameter"
+    code = "invalid_parameter"

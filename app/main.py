@@ -15,24 +15,19 @@ from app.access.authentication import Gate
 from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.http import errors
-from app.http.bodies import JsonBodies
 from app.http.dependencies import Fresh, Places, Services, call_of
-from app.http.middleware import Heads, OwnNames, RequestLog, SameSite
+from app.http.middleware import JsonBodies, OwnNames, RequestLog, SameSite
 from app.http.model_cache import ModelCache
-from app.http.picture_cache import Drawn
 from app.routes import (
     account,
     corrections,
     health,
     jobs,
-    lens_changes,
     lens_profiles,
     lens_reports,
     lenses,
-    photo_sets,
     photos,
     psf,
-    session,
 )
 from app.routes.common import problems
 from app.runtime.outage import missable
@@ -60,8 +55,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             store,
             storage,
             cache,
-            Places(chosen.max_uploads),
-            Drawn(),
+            Places(photos.MAX_UPLOADS),
             Gate(chosen, store.keys),
             Fresh(health.FRESH_S),
         )
@@ -76,7 +70,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,  # it would load scripts from another site: the pages have their own
         redoc_url=None,
     )
-    app.add_middleware(Heads)
     app.add_middleware(JsonBodies)
     app.add_middleware(SameSite, allowed=chosen.hosts)
     app.add_middleware(OwnNames, allowed=chosen.hosts)
@@ -96,14 +89,12 @@ def _routes() -> tuple[BaseRoute, ...]:
     """
     router = APIRouter()
     router.include_router(health.probes)
-    router.include_router(session.router, prefix="/v1")
+    router.include_router(account.sign_ins, prefix="/v1")
     resources = (
         psf,  # first: routes are tried in their order, and this one is asked for most often
         photos,
-        photo_sets,
         jobs,
         lenses,
-        lens_changes,
         lens_profiles,
         lens_reports,
         corrections,

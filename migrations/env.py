@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from alembic import context
 
-from app.store.access import access_tables as _access_tables  # noqa: F401 - its tables are part of the schema
 from app.store.tables import Base
 
 context.configure(

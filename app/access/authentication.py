@@ -16,10 +16,9 @@ from starlette.requests import Request
 
 from app.access import keys
 from app.access.keys import SCOPES, Scope
-from app.access.rate_limits import Rates
 from app.errors import ForbiddenError, NotSignedInError, QuotaError
-from app.store.access.keys import Holder, KeyStore
-from app.store.access.owners import LOCAL
+from app.store.keys import Holder, KeyStore
+from app.store.owners import LOCAL
 
 if TYPE_CHECKING:
     from app.runtime.settings import Settings
@@ -27,6 +26,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COOKIE: Final = "lens_session"
+SESSION: Final = timedelta(hours=12)
+"""How long a browser that has signed in stays so (chosen): a day of work."""
+
 FRESH_S: Final = 1.0
 """Seconds for which a process trusts what it has read of a key (chosen): a revoked key works no longer."""
 
@@ -38,6 +40,11 @@ HOW: Final = (
     "`lensmodel keys create` on the machine of the service makes one"
 )
 CHALLENGE: Final = {"WWW-Authenticate": "Bearer"}
+
+
+MAX_BUCKETS: Final = 10_000
+"""Buckets that are kept (chosen: a few MiB, more owners than ask at once); the one used least recently is
+dropped first, and is full again by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +147,7 @@ class Gate:
         if who is None or who.key_id is None:
             raise NotSignedInError("this key is not valid, or no longer: look for a blank or a missing end")
         token = secrets.token_urlsafe(32)
-        self._store.sign_in(who.key_id, keys.digest_of(token), timedelta(hours=self._settings.session_hours))
+        self._store.sign_in(who.key_id, keys.digest_of(token), SESSION)
         return who, token
 
     def sign_out(self, request: Request) -> None:
@@ -189,3 +196,34 @@ def shown_by(request: Request) -> str | None:
 
 def _who(holder: Holder, digest: str) -> Who:
     return Who(holder.owner, holder.scopes, holder.key_id, digest)
+
+
+class Rates:
+    """The buckets of one process, one for each name.
+
+    Parameters
+    ----------
+    per_minute : int
+        Requests that refill each bucket in a minute; it holds those of ten seconds, a sixth of them. 0 = no
+        limit.
+    """
+
+    def __init__(self, per_minute: int) -> None:
+        self._rate = per_minute / 60.0
+        self._size = max(per_minute / 6.0, 1.0)
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._guard = threading.Lock()
+
+    def wait_of(self, name: str) -> float:
+        """Take one request from a bucket; return 0, or the seconds until there is one if it is empty."""
+        if self._rate <= 0:
+            return 0.0
+        now = time.monotonic()
+        with self._guard:
+            left, since = self._left.pop(name, (self._size, now))
+            left = min(left + (now - since) * self._rate, self._size)
+            allowed = left >= 1.0
+            self._left[name] = (left - 1.0 if allowed else left, now)
+            if len(self._left) > MAX_BUCKETS:
+                self._left.popitem(last=False)
+        return 0.0 if allowed else (1.0 - left) / self._rate

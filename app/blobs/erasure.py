@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from app.blobs.storage import Storage
-from app.store.access.accounts import AccountStore
+from app.store.accounts import AccountStore
 
 
 def erase(accounts: AccountStore, storage: Storage, owner_key: int) -> None:

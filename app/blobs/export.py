@@ -11,8 +11,7 @@ from typing import Any, Final
 
 from app.blobs.storage import Storage
 from app.store import Store
-from app.store.access.access_tables import KeyRow
-from app.store.tables import Base, CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import Base, CorrectionRow, EventRow, KeyRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 TABLES: Final[Mapping[str, type[Base]]] = {
     "lenses": LensRow,

@@ -21,7 +21,7 @@ from urllib.parse import unquote, urlsplit
 import obstore
 from obstore.store import LocalStore, ObjectStore, from_url
 
-from app.store.ids import new_id
+from app.store.database import new_id
 
 if TYPE_CHECKING:
     from obstore import GetResult

@@ -17,7 +17,7 @@ from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from app.store.access.keys import KeyStore, Listed
+    from app.store.keys import KeyStore, Listed
 
 keys = typer.Typer(
     help="""Make, list, renew and end the keys of a service that others can reach.
@@ -54,9 +54,9 @@ def _span_or_none(text: str | None) -> timedelta | None:
 @contextmanager
 def _opened(data: Data) -> Iterator[KeyStore]:
     """Open the keys of an installation, its schema brought up to date."""
-    from app.store.access.keys import KeyStore  # noqa: PLC0415 - same
+    from app.store import migrate  # noqa: PLC0415 - only these commands need the service
     from app.store.database import Database  # noqa: PLC0415 - same
-    from app.store.upkeep import migrate  # noqa: PLC0415 - only these commands need the service
+    from app.store.keys import KeyStore  # noqa: PLC0415 - same
 
     settings = settings_from(data)
     settings.data_dir.mkdir(parents=True, exist_ok=True)

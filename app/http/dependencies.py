@@ -8,21 +8,23 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Request, Response, Security
+from fastapi.exceptions import RequestValidationError
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from app.access.authentication import Gate, Who
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
-from app.http.picture_cache import Drawn
 from app.runtime.settings import Settings
-from app.schemas import Readiness
+from app.schemas import Question, Readiness
 from app.store import Store
 
 T = TypeVar("T")
+Q = TypeVar("Q", bound=Question)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,6 @@ class Services:
     storage: Storage
     models: ModelCache
     uploads: Places
-    pictures: Drawn
     gate: Gate
     readiness: Fresh[Readiness]
 
@@ -138,3 +139,36 @@ async def probe_of(request: Request, response: Response) -> Call:
 
 ProbeDep = Annotated[Call, Depends(probe_of)]
 CallDep = Annotated[Call, Depends(call_of)]
+
+
+@dataclass(frozen=True, slots=True)
+class QueryModel(Generic[Q]):
+    """A dependency that reads query parameters by their schema; the last value of a repeated name counts.
+
+    FastAPI validates them field by field, which takes as long as a quick answer. `/openapi.json` describes
+    them in the same way; see `described`.
+    """
+
+    kind: type[Q]
+
+    async def __call__(self, request: Request) -> Q:
+        """Read the parameters; raise `RequestValidationError` as FastAPI does."""
+        try:
+            return self.kind.model_validate(dict(request.query_params))
+        except ValidationError as error:
+            errors = error.errors(include_url=False)
+            raise RequestValidationError(
+                [{**entry, "loc": ("query", *entry["loc"])} for entry in errors]
+            ) from None
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Parameters for `openapi_extra`, described as FastAPI describes its own."""
+        schema = self.kind.model_json_schema()
+        required = schema.get("required", ())
+        parameters = []
+        for name, field in schema["properties"].items():
+            described = {"description": field["description"]} if "description" in field else {}
+            entry = {"name": name, "in": "query", "required": name in required, "schema": field}
+            parameters.append(entry | described)
+        return {"parameters": parameters}

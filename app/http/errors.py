@@ -21,7 +21,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from app.errors import ServiceError
+from app.errors import RangeError, ServiceError, StorageFullError
 from app.runtime.outage import is_no_room, is_outage
 from app.schemas import FieldError, Problem
 from lensmodel.core import errors as library
@@ -39,44 +39,25 @@ HEADERS: Final[Mapping[str, str]] = {
 """Headers of every response unless it sets its own: no scripts, no sniffing, no embedding elsewhere."""
 
 
-STATUS: Final[Mapping[type[Exception], int]] = {
-    library.InvalidInputError: 422,
-    library.UnreadablePhotoError: 415,
-    library.ImageTooLargeError: 413,
-    library.MetadataMissingError: 422,
-    library.OutsideSupportError: 422,
-    library.NotEnoughEvidenceError: 409,
-    library.CancelledError: 409,
-}
-"""Exceptions of the library by HTTP status; subclasses count as their nearest ancestor here."""
-
 STATUS_OF_CODE: Final[Mapping[str, int]] = {
-    "malformed_upload": 400,
-    "not_an_image": 415,
-    "truncated_image": 415,
-    "unsupported_format": 415,
-    "raw_decode_failed": 415,
-    "image_too_large": 413,
-    "decompression_bomb": 413,
-    "metadata_missing": 422,
-    "invalid_parameter": 422,
-    "no_usable_patches": 422,
-    "outside_support": 422,
-    "no_samples": 409,
-    "unknown_photo": 404,
-    "unknown_lens": 404,
-    "not_ready": 409,
-    "conflict": 409,
-    "other_lens": 409,
-    "cancelled": 409,
+    **dict.fromkeys(("malformed_upload", "invalid_request"), 400),
+    "not_signed_in": 401,
+    "forbidden": 403,
+    **dict.fromkeys(("unknown_photo", "unknown_lens", "unknown_correction", "unknown_job"), 404),
+    "not_acceptable": 406,
+    "too_slow": 408,
+    **dict.fromkeys(("no_samples", "not_ready", "conflict", "other_lens", "cancelled"), 409),
+    **dict.fromkeys(("image_too_large", "decompression_bomb", "body_too_large"), 413),
+    **dict.fromkeys(("not_an_image", "truncated_image", "unsupported_format", "raw_decode_failed"), 415),
+    **dict.fromkeys(("metadata_missing", "invalid_parameter", "no_usable_patches", "outside_support"), 422),
+    **dict.fromkeys(("memory_limit", "time_limit"), 422),
     "quota_exceeded": 429,
-    "busy": 503,
-    "memory_limit": 422,
-    "time_limit": 422,
-    "crashed_repeatedly": 500,
-    "outage": 503,
+    **dict.fromkeys(("busy", "outage"), 503),
 }
-"""Codes that a job can end with, with the status of the same error as a response."""
+"""Status of the codes that errors have and jobs end with; all others are faults of ours."""
+
+STATUS: Final[Mapping[type[Exception], int]] = {StorageFullError: 507, RangeError: 416}
+"""Errors whose status is not that of their code."""
 
 CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
@@ -88,14 +69,12 @@ CODE_OF_STATUS: Final[Mapping[int, str]] = {
 }
 
 
-def status_of(error: Exception) -> int:
-    """Return the HTTP status of an exception: its own, or that of its nearest known ancestor."""
-    if isinstance(error, ServiceError):
-        return error.status
-    for kind in type(error).__mro__:
-        if kind in STATUS:
-            return STATUS[kind]
-    return 500
+def status_of(error: library.LensModelError) -> int:
+    """Return the HTTP status of an error: its own, that of its code, or that of its nearest ancestor's."""
+    if type(error) in STATUS:
+        return STATUS[type(error)]
+    codes = (getattr(kind, "code", "") for kind in type(error).__mro__)
+    return next((STATUS_OF_CODE[code] for code in codes if code in STATUS_OF_CODE), 500)
 
 
 def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ()) -> Problem:

@@ -1,30 +1,51 @@
-"""Middleware of every request: its id and log line, allowed host names, same-site checks, HEAD."""
+"""Middleware of every request: its id and log line, allowed host names, same-site checks, size of bodies.
+
+Clients that are slow on purpose are left to a proxy in front: docs/topics/operating.md has one.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Final
 from urllib.parse import quote, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars, clear_contextvars
 
-from app.http.bodies import CLOSE, SAFE
-from app.http.errors import HEADERS, REQUEST_ID, respond
+from app.errors import SlowBodyError
+from app.http.errors import HEADERS, REQUEST_ID, respond, status_of
 from app.runtime import logs, metrics
-from app.store.ids import new_id
+from app.store.database import new_id
 
 log = logging.getLogger("app.access")
 
 MAX_LOGGED: Final = 500
 """Characters of a path in the log at most (chosen): no path of the interface has as many."""
 
-ONLY_HEAD: Final = "lensmodel.only_head"
-"""Key in the scope of a request whose response needs no body."""
+MAX_JSON_BYTES: Final = 64 * 1024
+"""Longest JSON body (chosen): far longer than any request; parsed, it takes some ten times as much memory."""
+
+JSON_SECONDS: Final = 60.0
+"""Longest time that a JSON body may take (chosen): 64 KiB come within it by the slowest mobile connection."""
+
+UPLOADS: Final = {
+    "POST": re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements"),
+    "PUT": re.compile(r"/v1/lenses/[^/]+/profile"),
+}
+"""Paths whose routes read the body themselves and bound it, by method."""
+
+SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
+CLOSE: Final = {"Connection": "close"}
+"""Header of a refusal before the body is read: the rest of it is not waited for."""
+
+_TOO_LONG: Final = f"the body has more than {MAX_JSON_BYTES} bytes: no question needs as many"
 
 _ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 
@@ -145,24 +166,6 @@ class SameSite:
         return bool(name) and (place == headers.get("host", "").lower() or name in self._allowed)
 
 
-class Heads:
-    """Answers HEAD as GET without the body (RFC 9110, 9.3.2); events have no end and no HEAD."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on; return only the head of the response."""
-        if scope["type"] != "http" or scope["method"] != "HEAD" or scope["path"].endswith("/events"):
-            await self._app(scope, receive, send)
-            return
-
-        async def answer(message: Message) -> None:
-            await send({**message, "body": b""} if message["type"] == "http.response.body" else message)
-
-        await self._app({**scope, "method": "GET", ONLY_HEAD: True}, receive, answer)
-
-
 def _known(method: str) -> str:
     """Return a method as a label; unknown ones share a label, lest strangers create any number of them."""
     return method if method in {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"} else "other"
@@ -191,3 +194,84 @@ def is_local(host: str) -> bool:
     except ValueError:
         return False
     return "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()
+
+
+@asynccontextmanager
+async def within(seconds: float) -> AsyncIterator[None]:
+    """Bound the time in which a body comes."""
+    try:
+        async with asyncio.timeout(seconds) as limit:
+            yield
+    except TimeoutError as error:
+        if not limit.expired():
+            raise
+        text = f"the body did not come within {seconds:g} s: send it again over a faster connection"
+        raise SlowBodyError(text, headers=CLOSE) from error
+
+
+class JsonBodies:
+    """Middleware that refuses bodies that are too long or not JSON."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on with its body complete, or refuse it."""
+        if scope["type"] != "http" or scope["method"] in SAFE or _is_upload(scope):
+            await self._app(scope, receive, send)
+            return
+        refusal, body = _refusal(Headers(scope=scope)), b""
+        try:
+            if refusal is None:
+                async with within(JSON_SECONDS):
+                    body = await _read(receive)
+        except SlowBodyError as error:
+            refusal = (status_of(error), error.code, str(error))
+        except ClientDisconnect:
+            return
+        if refusal is None and len(body) > MAX_JSON_BYTES:
+            refusal = (413, "body_too_large", _TOO_LONG)
+        if refusal is not None:
+            await respond(Request(scope), *refusal, headers=CLOSE)(scope, receive, send)
+            return
+        await self._app(scope, _replayed(body, receive), send)
+
+
+async def _read(receive: Receive) -> bytes:
+    """Return the body, or of a longer one its beginning."""
+    body = bytearray()
+    while len(body) <= MAX_JSON_BYTES:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        body += message.get("body", b"")
+        if not message.get("more_body", False):
+            break
+    return bytes(body)
+
+
+def _is_upload(scope: Scope) -> bool:
+    pattern = UPLOADS.get(scope["method"])
+    return pattern is not None and pattern.fullmatch(scope["path"]) is not None
+
+
+def _refusal(headers: Headers) -> tuple[int, str, str] | None:
+    """Return why a body is refused by its headers alone: status, code, detail; None if it is not."""
+    declared = headers.get("content-length", "0")
+    if not declared.isdecimal() or len(declared) > 18:
+        return 400, "invalid_request", f"Content-Length {declared[:40]!r} is no number"
+    if int(declared) > MAX_JSON_BYTES:
+        return 413, "body_too_large", f"Content-Length {declared}: {_TOO_LONG}"
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    if (int(declared) == 0 and "transfer-encoding" not in headers) or kind == "application/json":
+        return None
+    return 415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json"
+
+
+def _replayed(body: bytes, receive: Receive) -> Receive:
+    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return replay

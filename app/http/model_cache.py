@@ -17,7 +17,7 @@ from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
 from app.schemas import PsfModel
 from app.store import Store, StoredSample
-from app.store.access.owners import ANY_OWNER
+from app.store.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.model import LensModel, ModelSettings

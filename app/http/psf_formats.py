@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.http.model_cache import Fitted
-from app.http.picture_cache import DrawnPicture
 from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, Kernel
@@ -106,7 +105,7 @@ def field_map(
     gamma: float,
     aspect: float = 1.5,
     view: View = (0.0, 0.0, 1.0, 1.0),
-) -> DrawnPicture:
+) -> tuple[bytes, Mapping[str, str]]:
     """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak.
 
     `ask` answers with a kernel of side `size`. Where too little is known the cell is hatched, as in reports.
@@ -127,7 +126,7 @@ def field_map(
             known = answer.predicted_error < UNKNOWN and not answer.extrapolated
             cell = _bright(answer.kernel, gamma) if known else hatched
             sheet[top : top + size, left : left + size] = cell
-    return DrawnPicture(_png(Image.fromarray(sheet)), _made(made))
+    return _png(Image.fromarray(sheet)), _made(made)
 
 
 def _bright(kernel: Kernel, gamma: float) -> NDArray[np.uint8]:

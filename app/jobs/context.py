@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from app.blobs.storage import Storage
-from app.jobs.task_files import PREVIEW, R_MAP, SHOWN
+from app.jobs.task_files import R_MAP, SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
@@ -23,8 +23,7 @@ from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
-from app.store.jobs import JobStore
-from app.store.photo_steps import photo_folder
+from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.core.types import ignore_step
 
@@ -62,11 +61,9 @@ class JobContext:
     store: Store
     storage: Storage
     sandbox: Sandbox
-    jobs: JobStore = field(init=False)
     _locks: defaultdict[str, threading.Lock] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.jobs = JobStore(self.store.database)
         self._locks = defaultdict(threading.Lock)
 
     def attempt(
@@ -174,7 +171,7 @@ class JobContext:
             with self.original(photo) as path, self.sandbox.folder() as folder:
                 arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
-                for name in (PREVIEW, R_MAP, SHOWN):
+                for name in (R_MAP, SHOWN):
                     if (folder / name).is_file():
                         self.storage.put_file(f"{photo_folder(photo)}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)

@@ -23,12 +23,12 @@ from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
-from app.store.access.owners import ANY_OWNER
 from app.store.corrections import CorrectionPlan, Result, Run, run_folder
-from app.store.photo_steps import stored_settings
+from app.store.lenses import report_key
+from app.store.owners import ANY_OWNER
+from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import LensRow
-from app.store.versions import report_key
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
 from lensmodel.correction import Bounds
@@ -80,11 +80,11 @@ class CorrectionWork:
         developed = self._context.developed(photo, wanted)
         self._corrections.progress(run, 0, 0, "correcting")
         settings = self._context.settings
-        limits = self._context.limits(photo, settings.correct_seconds, 120)
+        limits = self._context.limits(photo, settings.task_seconds, 120)
         limits = replace(
             limits,
             memory_mb=limits.memory_mb + THREAD_MB * settings.worker_slots,
-            cpu_s=math.ceil(settings.correct_seconds) * settings.worker_slots,
+            cpu_s=math.ceil(settings.task_seconds) * settings.worker_slots,
         )
         arguments: dict[str, Any] = {
             "developed": str(developed),
@@ -164,11 +164,8 @@ class CorrectionWork:
         if not self._corrections.finish(run, result, report):
             self._context.storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
-    def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
-        """Note the errors that one version of a lens expects, and write its report.
-
-        When repeated for a missing report it keeps the figures that were measured first.
-        """
+    def measure(self, lens_id: str, version: int) -> None:
+        """Note the errors that one version of a lens expects, and write its report."""
         lenses = self._context.store.lenses
 
         def wanted() -> bool:
@@ -200,7 +197,7 @@ class CorrectionWork:
     def _report(self, lens_id: str, key: str, mode: str, folder: Path, wanted: Callable[[], bool]) -> None:
         """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
         settings = self._context.settings
-        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
+        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.task_seconds)
         lens = self._lens(lens_id)
         arguments = {"mode": mode, "about": self._about(lens)}
         try:

@@ -10,8 +10,8 @@ from typing import Any, Final
 from app.jobs.context import JobContext, JobFailedError
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.store import NewPatch, NewSample
-from app.store.access.owners import ANY_OWNER
-from app.store.photo_steps import stored_settings
+from app.store.owners import ANY_OWNER
+from app.store.photos import stored_settings
 from app.store.tables import PhotoRow
 from app.ways import configured_way
 from lensmodel.core.errors import InvalidInputError
@@ -48,7 +48,7 @@ class MeasurementWork:
             "settings": stored_settings(photo),
             "size": configured_way(settings, photo.way).kernel_size,
         }
-        limits = self._context.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
+        limits = self._context.limits(photo, settings.task_seconds, _BYTES_A_PIXEL)
         with self._context.sandbox.folder() as folder:
             listed = self._context.attempt(
                 "measure-lens", arguments, folder=folder, limits=limits, wanted=wanted, reads=folders

@@ -1,38 +1,35 @@
 """The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
 
-Each step reads the tables first
-and does only what is not done yet. So the job may be started again at any time, by any worker, and still
-every effect happens once.
+Each step reads the tables first and does only what is not done yet. So the job may be started again at any
+time, by any worker, and still every effect happens once.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from app.jobs.answers import Inspected, Selected, checked
-from app.jobs.body_keys import body_key
-from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
-from app.jobs.location_work import remove_location
+from app.jobs import inspection
+from app.jobs.answers import Selected, checked
+from app.jobs.context import JobContext, JobFailedError, NotWantedError
 from app.jobs.measurement_work import MeasurementWork
-from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.profile_work import read_in
 from app.jobs.queue import Job, JobEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
-from app.jobs.thumbnail_work import keep_thumbnail
-from app.sandbox.outcome import TaskLimits
-from app.store import LensName, NewSample, Store
-from app.store.access.owners import ANY_OWNER
-from app.store.photo_steps import stored_settings
+from app.store import NewPatch, NewSample, Store
+from app.store.owners import ANY_OWNER
+from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, PhotoRow
 from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
+from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
 from lensmodel.workflow.sampling import Preset
 
@@ -70,7 +67,7 @@ class PhotoWork:
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
-        rows = self._context.jobs.begin_cell(photo_id, epoch, cell)
+        rows = self._context.store.patches.begin_cell(photo_id, epoch, cell)
         if not rows:
             return
         numbers = [row.idx for row in rows]
@@ -99,7 +96,7 @@ class PhotoWork:
         arguments = {
             "developed": str(developed),
             "photo": photo.public_id,
-            "patches": [described(row) for row in rows],
+            "patches": [_described(row) for row in rows],
             "numbers": [row.idx for row in rows],
             "settings": stored_settings(photo),
             "estimator": way.estimator,
@@ -151,44 +148,12 @@ class _Steps:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
         if self._photo.state != "inspecting":
             return True
-        self._photo = remove_location(self._context, self._photo, self._wanted)
-        limits = TaskLimits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
-        with self._context.original(self._photo) as path, self._context.sandbox.folder() as folder:
-            arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
-            info = self._context.attempt(
-                "inspect", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=[path]
-            )
-            info = checked(Inspected, info)
-            keep_thumbnail(self._context, self._photo, info, path, self._wanted)
-        self._record(info)
+        self._photo = inspection.remove_location(self._context, self._photo, self._wanted)
+        inspection.inspect(self._context, self._photo, self._wanted)
         self._photo = _row(self._store, self._photo.public_id)
         goes_on = self._identify()
         self._photo = _row(self._store, self._photo.public_id)  # the way of its lens decides what follows
         return goes_on
-
-    def _record(self, info: dict[str, Any]) -> None:
-        metadata, lens = info["metadata"], info["metadata"]["lens"]
-        taken = metadata["taken_at"]
-        self._store.photos.record_inspection(
-            self._photo.public_id,
-            width=info["width"],
-            height=info["height"],
-            identity=LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
-            aperture=metadata["aperture"],
-            focal_mm=metadata["focal_mm"],
-            focus_m=metadata["focus_m"],
-            pixel_pitch_um=metadata["pixel_pitch_um"],
-            orientation=metadata["orientation"],
-            camera_maker=metadata["camera_maker"],
-            camera_model=metadata["camera_model"],
-            body_key=body_key(
-                metadata["camera_maker"], metadata["camera_model"], metadata.get("body_serial")
-            ),
-            iso=metadata["iso"],
-            exposure_s=metadata["exposure_s"],
-            # Cameras write local time without a zone; as UTC it at least sorts.
-            taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
-        )
 
     def _identify(self) -> bool:
         photo = self._photo
@@ -250,7 +215,7 @@ class _Steps:
         selection = checked(Selected, selection)
         if selection["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, photo.epoch, selection["lateral"])
-        self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
+        self._store.patches.add(photo.public_id, photo.epoch, _plan_of(selection))
 
     def estimate(self) -> None:
         """Hand out the cells and wait until each is done, rejected or given up."""
@@ -289,17 +254,17 @@ class _Steps:
 
     def count(self) -> None:
         """Count the photo, if enough of its patches gave a PSF, and not all in one place."""
-        photo, settings = self._photo, self._context.settings
+        photo = self._photo
         rows = self._store.patches.all_of(photo.public_id, photo.epoch)
         tried = [row for row in rows if row.cell is not None]
         done = [row for row in tried if row.state == "done"]
         if done:
             try:
-                sampling.require_spread([patch_of(row) for row in done], count=self._way.patches)
+                sampling.require_spread([_patch_of(row) for row in done], count=self._way.patches)
             except NoUsablePatchesError as error:
                 raise JobFailedError(error.code, str(error)) from error
-        if len(done) < settings.min_good_patches:
-            raise JobFailedError(*why_not(tried, len(done)))
+        if not done:
+            raise JobFailedError(*_why_not(tried, len(done)))
         self._finish()
 
     def _finish(self) -> None:
@@ -369,9 +334,8 @@ def _require_model(photo: PhotoRow, lens: LensRow | None) -> None:
     requested = photo.given.get("model")
     if lens is not None and requested not in {None, lens.way}:
         text = (
-            f"the photo was sent with model={requested}, and its lens has the model {lens.way}: PATCH "
-            f'/v1/lenses/{lens.public_id} with {{"model": "{requested}"}} and retry, or send it again with '
-            f"model={lens.way}"
+            f"the photo was sent with model={requested}, and its lens has the model {lens.way}: send it "
+            f"again with model={lens.way}, or name a new lens for it"
         )
         raise JobFailedError("conflict", text)
 
@@ -387,3 +351,65 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     if photo.aperture is None:
         return "the photo does not say its aperture: give the f-number"
     return ""
+
+
+def _plan_of(selection: dict[str, Any]) -> list[NewPatch]:
+    """Return the patches and windows of the task `select` as rows to insert."""
+    chosen = [
+        NewPatch(
+            idx=number,
+            row=patch["row"],
+            col=patch["col"],
+            size=patch["size"],
+            r=patch["position"]["r"],
+            phi=patch["position"]["phi"],
+            cell=patch["cell"],
+            score=patch["score"],
+        )
+        for number, patch in enumerate(selection["patches"])
+    ]
+    rejected = [
+        NewPatch(
+            idx=len(chosen) + number,
+            row=window["row"],
+            col=window["col"],
+            size=window["size"],
+            r=window["r"],
+            phi=window["phi"],
+            rejected=window["reason"],
+        )
+        for number, window in enumerate(selection["rejected"])
+    ]
+    return chosen + rejected
+
+
+def _described(row: PatchRow) -> dict[str, Any]:
+    """Return a patch as JSON for a task."""
+    place = {"r": row.r, "phi": row.phi}
+    score = row.score or 0.0
+    return {
+        "row": row.row,
+        "col": row.col,
+        "size": row.size,
+        "position": place,
+        "score": score,
+        "cell": row.cell,
+    }
+
+
+def _patch_of(row: PatchRow) -> Patch:
+    """Return a patch as a value of the library."""
+    return Patch(row.row, row.col, row.size, FieldPosition(row.r, row.phi), row.score or 0.0, row.cell or 0)
+
+
+def _why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:
+    """Return why a photo with `good` useful patches does not count: a code and a sentence."""
+    failures = Counter(row.reason for row in tried if row.state == "failed")
+    if failures and good == 0:
+        reason, count = failures.most_common(1)[0]
+        text = f"{count} of {len(tried)} patches ended with {reason}; retry, or report the file"
+        return reason or "internal_error", text
+    return (
+        "no_usable_patches",
+        f"{good} of {len(tried)} patches gave a PSF: use a photo with more fine detail in focus",
+    )

@@ -9,8 +9,7 @@ from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedErro
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.other_lens import REMEDY, Described, difference
 from app.sandbox.outcome import TaskLimits
-from app.store.access.owners import ANY_OWNER
-from app.store.profile_intake import take_in
+from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from app.ways import configured_way
 
@@ -60,5 +59,5 @@ def read_in(context: JobContext, file: PhotoRow) -> None:
         if why is not None:
             raise JobFailedError("other_lens", f"the profile seems to be of another lens: {why}; {REMEDY}")
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
-    if take_in(store.database, file, samples, names) is None:
+    if store.patches.take_in(file, samples, names) is None:
         raise NotWantedError

@@ -20,9 +20,8 @@ CLEANED: Final = "cleaned"
 REPORT: Final = "report.json"
 """The report of a lens test."""
 
-PREVIEW: Final = "preview.jpg"
 R_MAP: Final = "r-map.png"
-"""Pictures of a developed photo, by `app.blobs.previews`."""
+"""Where the edges of a developed photo tell about the blur, by `app.blobs.previews`."""
 
 THUMBNAIL: Final = "glance.jpg"
 """Small picture of a photo before it is developed, by `app.blobs.thumbnails`; stored ones have this name."""

@@ -21,13 +21,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from app import distances
 from app.blobs import previews, thumbnails
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
     CLEANED,
     LAYER_FILES,
-    PREVIEW,
     R_MAP,
     REPORT,
     SHOWN,
@@ -36,7 +36,6 @@ from app.jobs.task_files import (
     THUMBNAIL,
 )
 from app.sandbox.child import ProgressHook, Task
-from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel import measured as lens_measure
 from lensmodel.blind import estimators
@@ -122,7 +121,6 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
     sampling.save_developed(developed, folder)
-    (folder / PREVIEW).write_bytes(previews.preview(developed))
     (folder / R_MAP).write_bytes(previews.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}

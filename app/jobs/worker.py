@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import os
@@ -23,24 +22,22 @@ from app.blobs.storage import Storage
 from app.jobs.context import JobContext, JobFailedError
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.developed_cache import drop_developed
+from app.jobs.inspection import remove_location
 from app.jobs.job_log import JobRecord, accounted
-from app.jobs.location_work import remove_location
-from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
-from app.jobs.task_files import PREVIEW, R_MAP, SHOWN, THUMBNAIL
+from app.jobs.task_files import R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.outage import Patience, is_outage
-from app.runtime.processes import end_with_parent, is_running, started_at
+from app.runtime.processes import end_with_parent, is_running, on_signals, started_at
 from app.runtime.settings import Settings
-from app.runtime.signals import on_signals
 from app.sandbox import account, confine
 from app.sandbox.budget import Budget
 from app.sandbox.runner import Sandbox
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
-from app.store.ids import new_id
+from app.store.database import new_id
+from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 
 log = logging.getLogger(__name__)
@@ -49,9 +46,9 @@ EXIT_FENCED: Final = 70
 """Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)."""
 
 # seconds between two rounds of a duty, all chosen
+SWEEP_S: Final = 0.5  # of the tables for new work: a read of two indexes
 RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
-REPORTS_S: Final = 6 * 3600.0  # of the search for missing reports: it lists all fitted models
 KEEP_JOBS: Final = timedelta(days=2)
 """How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into."""
 
@@ -148,14 +145,12 @@ class Worker:
         )
         self._take_over_gone(host)
         self._start_thread(TIDY_S, self._tidy)  # deleting may take long
-        self._start_thread(REPORTS_S, self._ask_for_reports)  # so may listing the blobs
         duties = (
-            (self._settings.sweep_seconds, self._sweep),
+            (SWEEP_S, self._sweep),
             (beat_s, self._take_over_silent),
             (RECONCILE_S, self._reconcile),
-            (beat_s, self._leave_metrics),
         )
-        due = [0.0, 0.0, time.monotonic() + RECONCILE_S, 0.0]
+        due = [0.0, 0.0, time.monotonic() + RECONCILE_S]
         while not self._stop.is_set():
             for number, (period, duty) in enumerate(duties):
                 if time.monotonic() >= due[number]:
@@ -266,7 +261,7 @@ class Worker:
     def _correction_broke(self, ending: Ending, correction_id: str, epoch: int) -> None:
         self._store.corrections.fail(correction_id, ending.code, ending.detail, epoch=epoch)
 
-    def _measure_broke(self, ending: Ending, lens_id: str, version: int, _again: int = 0) -> None:
+    def _measure_broke(self, ending: Ending, lens_id: str, version: int) -> None:
         unknown = {"error": None, "coverage": None, "problem": ending.code}
         self._store.lenses.record_metrics(lens_id, version, unknown)
 
@@ -280,13 +275,6 @@ class Worker:
             self._engine.enqueue(Job("correction", (correction_id, epoch), owner))
         for lens_id, version in self._store.lenses.unmeasured():
             self._engine.enqueue(Job("measure", (lens_id, version)))
-
-    def _ask_for_reports(self) -> None:
-        ask_for_reports(self._store, self._context.storage, self._engine)
-
-    def _leave_metrics(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk: metrics are no reason to stop
-            metrics.leave(self._settings.data_dir.resolve(), self.id)
 
     def _keep_lease(self) -> None:
         """Renew the lease; stop at once if this worker was declared dead."""
@@ -355,7 +343,7 @@ class Worker:
         for owner_key in self._store.accounts.to_erase():
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
-            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, PREVIEW, R_MAP, SHOWN)))
+            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, R_MAP, SHOWN)))
         for photo_id in self._store.photos.read_profiles():
             self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))
         for photo in self._store.photos.unsearched():
@@ -368,7 +356,7 @@ class Worker:
             self._do(partial(self._delete, prefix))  # one failure does not prevent the others
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
         developed = self._context.developed_folder("x").parent
-        drop_developed(developed, self._context.jobs.existing_photos, self._settings.correct_seconds)
+        drop_developed(developed, self._context.store.photos.existing, self._settings.task_seconds)
 
     def _search(self, photo: PhotoRow) -> None:
         try:
@@ -391,7 +379,6 @@ class Worker:
     def _die(self, why: str) -> None:
         log.error("%s: this worker stops", why)
         metrics.FENCED.inc()
-        self._leave_metrics()
         logging.shutdown()
         os._exit(EXIT_FENCED)
 
@@ -410,8 +397,8 @@ def main() -> None:
     settings = Settings()
     logs.begin("worker", settings.log_level, settings.log_format)
     confine.keep_private()
-    if settings.metrics_port:
-        metrics.publish(settings.metrics_port, settings.metrics_host, settings.data_dir.resolve())
+    if settings.metrics_address:
+        metrics.publish(settings.metrics_address)
     worker = Worker(settings)
     on_signals(lambda _: worker.stop())
     worker.run()

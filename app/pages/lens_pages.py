@@ -15,9 +15,9 @@ from app.http.dependencies import Call, CallDep
 from app.pages import shown, words
 from app.pages.rendering import page
 from app.routes import lenses as lens_routes
+from app.routes.common import find_lens
 from app.routes.lens_reports import stored_report
-from app.schemas import PhotoOut
-from app.schemas.fields import Aperture
+from app.schemas import Aperture, PhotoOut
 from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import FieldPosition
@@ -40,7 +40,7 @@ def lens_page(
     lens_id: str, call: CallDep, aperture: Annotated[str, Query(max_length=20)] = ""
 ) -> HTMLResponse:
     """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
-    lens, row = lens_routes.read_lens(lens_id, call), lens_routes.find_lens(call, lens_id)
+    lens, row = lens_routes.read_lens(lens_id, call), find_lens(call, lens_id)
     photos, more = shown.photos(call, lens_id)
     aspect, test = _aspect(call, row), _test(call, row)
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
@@ -56,7 +56,6 @@ def lens_page(
         "lens.html",
         lens=lens,
         counting=shown.counting(call, lens_id),
-        anew=shown.anew(call, lens_id),
         photos=photos,
         more=more,
         others=[other for other in shown.lenses_with_photos(call) if other.id != lens_id],
@@ -72,7 +71,7 @@ def lens_page(
 @router.get("/lenses/{lens_id}/tests")
 def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     """Show what testers and researchers ask of a lens: charts, its blur at any point, its versions."""
-    lens, row = lens_routes.read_lens(lens_id, call), lens_routes.find_lens(call, lens_id)
+    lens, row = lens_routes.read_lens(lens_id, call), find_lens(call, lens_id)
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, _ = shown.photos(call, lens_id)
@@ -83,7 +82,6 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
         "lens_tests.html",
         lens=lens,
         counting=shown.counting(call, lens_id),
-        anew=shown.anew(call, lens_id),
         history=history,
         curve=sum(bool(event.error) for event in history) > 1,  # one point is no curve
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
@@ -108,7 +106,7 @@ def lens_charts(
     """Show the charts of one aperture, or two lenses or apertures in one."""
     from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
 
-    test = stored_report(call, lens_routes.find_lens(call, lens_id))
+    test = stored_report(call, find_lens(call, lens_id))
     chosen = _aperture(aperture)
     with_itself = against.startswith("at ") and _aperture(against.removeprefix("at ")) == chosen
     if not against or with_itself:
@@ -118,7 +116,7 @@ def lens_charts(
         second_aperture = _aperture(against.removeprefix("at "))
         query = {"aperture": aperture, "against_aperture": against.removeprefix("at ")}
     else:
-        second_test = stored_report(call, lens_routes.find_lens(call, against))
+        second_test = stored_report(call, find_lens(call, against))
         second_aperture = chosen if chosen in second_test.apertures else None
         query = {"aperture": aperture, "against": against}
     first_tested, second_tested = test.at(chosen), second_test.at(second_aperture)

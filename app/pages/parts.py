@@ -70,8 +70,8 @@ def _batch(call: Call, ids: str) -> Fragments:
 
 def _lens(call: Call, lens_id: str) -> Fragments:
     lens = lens_routes.read_lens(lens_id, call)
-    known = {"counting": shown.counting(call, lens_id), "anew": shown.anew(call, lens_id)}
-    return {"lens-state": fragment("_lens_state.html", lens=lens, **known)}
+    state = fragment("_lens_state.html", lens=lens, counting=shown.counting(call, lens_id))
+    return {"lens-state": state}
 
 
 _DRAWERS: Final[Mapping[Page, Callable[[Call, str], Fragments]]] = {

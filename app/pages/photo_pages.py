@@ -14,15 +14,13 @@ from app.http import views
 from app.http.dependencies import CallDep
 from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown, words
-from app.pages.audit_words import held_places, held_squares
-from app.pages.groups import grouped
 from app.pages.rendering import page
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import CorrectionIn, Id, PhotoOut, Region
 from app.store.corrections import run_folder
-from app.store.photo_steps import photo_folder
+from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 
 NAMES: Final = (
@@ -72,7 +70,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
-        proposed=grouped([row])[0].name,
+        proposed=shown.grouped([row])[0].name,
         lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
         corrections=corrections,
         done=done,
@@ -135,7 +133,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         zones=zones,
         most_gain=most_gain,
         nothing=words.nothing_words(row.kind),
-        audit=held_places(report.get("audit") or {}, *size),
-        held=held_squares(report.get("audit") or {}, *size) if can_look else None,
+        audit=words.held_places(report.get("audit") or {}, *size),
+        held=words.held_squares(report.get("audit") or {}, *size) if can_look else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

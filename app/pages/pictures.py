@@ -1,13 +1,135 @@
-"""Places of the upright picture and of the sensor, which an EXIF orientation relates."""
+"""Pictures for the pages, as children have made them: the API hands out their bytes and decodes none.
+
+A place of the upright picture and of the sensor are related by an EXIF orientation.
+"""
 
 from __future__ import annotations
 
-from typing import Final, TypeVar
+from contextlib import suppress
+from typing import Annotated, Final, Literal, TypeVar
 
+from fastapi import APIRouter, Path, Response
+
+from app.blobs import tiles
 from app.blobs.storage import Storage
+from app.errors import InvalidParameterError, NotReadyError
+from app.http.dependencies import Call, CallDep
+from app.jobs.task_files import LAYER_FILES, R_MAP, SHOWN, SIDES, THUMBNAIL
+from app.routes import corrections as correction_routes
+from app.routes import photos as photo_routes
 from app.schemas import PatchOut, Region
+from app.store.corrections import CorrectionPlan, run_folder
+from app.store.photos import photo_folder
+
+Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
+Number = Annotated[int, Path(ge=0, le=10_000)]
+Which = Literal["before", "after"]
+
+NOTHING: Final = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 3 2">'
+    '<rect width="3" height="2" fill="#8882"/></svg>'
+)
+"""Placeholder until there is a picture."""
 
 N = TypeVar("N", int, float)
+
+router = APIRouter(include_in_schema=False)
+
+
+def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
+    return Response(data, media_type=media_type, headers={"Cache-Control": "private, max-age=3600"})
+
+
+def _stored(call: Call, key: str) -> bytes:
+    try:
+        return call.storage.get(key)
+    except FileNotFoundError as error:
+        raise NotReadyError("there is no such picture yet: wait for the job that makes it") from error
+
+
+@router.get("/ui/photos/{photo_id}/thumbnail.jpg")
+def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
+    """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
+    folder = photo_folder(photo_routes.find_photo(call, photo_id))
+    with suppress(FileNotFoundError):
+        return _picture(call.storage.get(f"{folder}{THUMBNAIL}"))
+    with suppress(NotReadyError):
+        return _picture(tiles.whole(call.storage, f"{folder}{SHOWN}"))
+    return Response(NOTHING, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
+
+
+@router.get("/ui/photos/{photo_id}/r-map.png")
+def photo_r_map(photo_id: str, call: CallDep) -> Response:
+    """Show where the edges of a photo tell about the blur."""
+    key = f"{photo_folder(photo_routes.find_photo(call, photo_id))}{R_MAP}"
+    return _picture(_stored(call, key), "image/png")
+
+
+def _shown(call: Call, photo_id: str) -> str:
+    return f"{photo_folder(photo_routes.find_photo(call, photo_id))}{SHOWN}"
+
+
+@router.get("/ui/photos/{photo_id}/preview.jpg")
+@router.get("/ui/photos/{photo_id}/tiles/whole.jpg")
+def photo_whole(photo_id: str, call: CallDep) -> Response:
+    """Show a developed photo as large as most screens are."""
+    return _picture(tiles.whole(call.storage, _shown(call, photo_id)))
+
+
+@router.get("/ui/photos/{photo_id}/tiles/places/{place}.jpg")
+def photo_place(photo_id: str, place: Number, call: CallDep) -> Response:
+    """Show a part of a developed photo, 1:1."""
+    return _picture(tiles.part(call.storage, _shown(call, photo_id), place))
+
+
+@router.get("/ui/photos/{photo_id}/tiles/{half}/{col}_{row}.jpg")
+def photo_tile(photo_id: str, half: Half, col: Number, row: Number, call: CallDep) -> Response:
+    """Show a tile of a developed photo, halved `half` times."""
+    return _picture(tiles.tile(call.storage, _shown(call, photo_id), half, col, row))
+
+
+def _compared(call: Call, correction_id: str) -> CorrectionPlan:
+    plan = correction_routes.find_plan(call, correction_id)
+    if plan.correction.state != "succeeded":
+        raise NotReadyError(f"correction {correction_id} is {plan.correction.state}: wait for its job")
+    return plan
+
+
+def _side(call: Call, correction_id: str, which: Which) -> str:
+    return f"{run_folder(_compared(call, correction_id).correction)}{SIDES[which]}"
+
+
+@router.get("/ui/corrections/{correction_id}/tiles/{which}/whole.jpg")
+def correction_whole(correction_id: str, which: Which, call: CallDep) -> Response:
+    """Show a photo before or after a correction as large as most screens are."""
+    return _picture(tiles.whole(call.storage, _side(call, correction_id, which)))
+
+
+@router.get("/ui/corrections/{correction_id}/tiles/{which}/places/{place}.jpg")
+def correction_place(correction_id: str, which: Which, place: Number, call: CallDep) -> Response:
+    """Show a part of a photo before or after a correction, 1:1."""
+    return _picture(tiles.part(call.storage, _side(call, correction_id, which), place))
+
+
+@router.get("/ui/corrections/{correction_id}/tiles/{which}/{half}/{col}_{row}.jpg")
+def correction_tile(
+    correction_id: str, which: Which, half: Half, col: Number, row: Number, call: CallDep
+) -> Response:
+    """Show a tile of a photo before or after a correction, halved `half` times."""
+    return _picture(tiles.tile(call.storage, _side(call, correction_id, which), half, col, row))
+
+
+@router.get("/ui/corrections/{correction_id}/layer/{name}")
+def correction_layer(
+    correction_id: str, name: Literal["before", "after", "smooth", "clean"], call: CallDep
+) -> Response:
+    """Show a part of a photo as the sliders of a preview mix it."""
+    plan = _compared(call, correction_id)
+    if plan.correction.params.get("roi") is None:
+        raise InvalidParameterError(f"correction {correction_id} is of a whole photo: it has tiles")
+    if name in {"smooth", "clean"} and not plan.correction.params.get("layers"):
+        raise InvalidParameterError(f"correction {correction_id} has no layers")
+    return _picture(_stored(call, f"{run_folder(plan.correction)}{LAYER_FILES[name]}"), "image/png")
 
 
 def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote
@@ -14,26 +16,27 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.http.dependencies import CallDep, call_of
-from app.pages import batch, lens_pages, parts, photo_pages, picture_routes, shown, signing, words
-from app.pages.interface import operations
+from app.pages import batch, lens_pages, parts, photo_pages, pictures, shown, words
 from app.pages.rendering import page
 from lensmodel.core.errors import LensModelError
 
 HERE: Final = Path(__file__).parent
 
 router = APIRouter(include_in_schema=False)
+strangers = APIRouter(include_in_schema=False)
+"""What whoever is not signed in yet may see."""
 
 
 def include(site: APIRouter) -> None:
     """Add the pages and their files to the routes of the service."""
-    site.include_router(signing.router)
+    site.include_router(strangers)
     for part in (
         router,
         parts.router,
         photo_pages.router,
         batch.router,
         lens_pages.router,
-        picture_routes.router,
+        pictures.router,
     ):
         site.include_router(part, dependencies=[Depends(call_of)])
     site.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
@@ -89,4 +92,55 @@ def home(call: CallDep) -> HTMLResponse:
 def interface(request: Request) -> HTMLResponse:
     """Show what programs can ask, from the same description that programs read; nothing is loaded for it."""
     description = request.app.openapi()
-    return page("docs.html", title=description["info"]["title"], groups=operations(description))
+    return page("docs.html", title=description["info"]["title"], groups=_operations(description))
+
+
+@strangers.get("/sign-in")
+async def sign_in() -> HTMLResponse:
+    """Ask for a key."""
+    return page("sign_in.html")
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One operation of the interface."""
+
+    method: str
+    path: str
+    summary: str
+    description: str
+    parameters: list[tuple[str, str, str]]
+    """Name, location and meaning of each."""
+
+    body: list[str]
+    answers: list[str]
+
+
+def _operations(described: Mapping[str, Any]) -> list[tuple[str, list[Operation]]]:
+    """Return the operations of an OpenAPI document by their first tag, in its order."""
+    groups: defaultdict[str, list[Operation]] = defaultdict(list)
+    for path, methods in described["paths"].items():
+        for method, entry in methods.items():
+            groups[(entry.get("tags") or ["other"])[0]].append(_operation(method, path, entry))
+    return list(groups.items())
+
+
+def _operation(method: str, path: str, entry: Mapping[str, Any]) -> Operation:
+    listed = entry.get("parameters", [])
+    return Operation(
+        method=method.upper(),
+        path=path,
+        summary=entry["summary"],
+        description=entry.get("description", ""),
+        parameters=[(p["name"], p["in"], _meaning(p)) for p in listed],
+        body=list(entry.get("requestBody", {}).get("content", {})),
+        answers=[f"{status} {answer['description']}" for status, answer in entry["responses"].items()],
+    )
+
+
+def _meaning(parameter: Mapping[str, Any]) -> str:
+    schema = parameter.get("schema", {})
+    description = parameter.get("description") or schema.get("description", "")
+    choice = f"one of {', '.join(map(str, schema['enum']))}" if "enum" in schema else ""
+    default = f"default {schema['default']}" if schema.get("default") is not None else ""
+    return "; ".join(part for part in (description, choice, default) if part)

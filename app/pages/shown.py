@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from app.http.dependencies import Call
-from app.pages.groups import WaitingGroup, grouped
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
+from app.routes.common import find_lens
 from app.schemas import LensOut, PhotoOut
+from app.store.tables import PhotoRow
+from lensmodel.core.names import camera_name, full_name
 
 PHOTOS: Final = 60
 """Photos and lenses of a list (chosen): the newest of them."""
@@ -40,17 +46,79 @@ def lenses_with_photos(call: Call) -> list[LensOut]:
 
 def counting(call: Call, lens_id: str) -> bool:
     """Whether a worker has yet to measure the newest version of a lens."""
-    lens = lens_routes.find_lens(call, lens_id)
+    lens = find_lens(call, lens_id)
     newest = call.store.lenses.history(lens, after=lens.version - 1)
     return lens.sample_count > 0 and any(event.metrics is None for event in newest)
-
-
-def anew(call: Call, lens_id: str) -> int:
-    """How many photos of a lens that changes its model are still to be measured."""
-    return call.store.lenses.learned_anew(lens_routes.find_lens(call, lens_id))
 
 
 def waiting(call: Call) -> list[WaitingGroup]:
     """Group the photos that wait for their owner to say which lens it was."""
     rows = call.store.photos.page(call.owner, before=None, limit=MAX_WAITING, state="needs_lens")
     return grouped([row for row in rows if row.lens_id is None])
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingGroup:
+    """Photos that wait for their lens and were probably taken with the same one.
+
+    Parameters
+    ----------
+    camera : str or None
+    body : int or None
+        Which of several bodies of that camera, counted from 1; None where there is but one.
+    focal_mm : float or None
+    lens_model : str or None
+        What the files call the lens, where they do.
+    needs_aperture : bool
+        Whether any of the files does not say its aperture.
+    photos : list of PhotoRow
+        Newest first.
+    """
+
+    camera: str | None
+    body: int | None
+    focal_mm: float | None
+    lens_model: str | None
+    needs_aperture: bool
+    photos: list[PhotoRow]
+
+    @property
+    def name(self) -> str:
+        """What to call the lens: its own name, else camera and focal length; empty where nothing is known."""
+        parts = [self.camera] if self.camera else []
+        if self.lens_model:
+            maker = self.camera.split()[0] if self.camera else None
+            return full_name(maker, self.lens_model) if self.lens_model[0].isdigit() else self.lens_model
+        parts += [f"body {self.body}"] if self.body else []
+        return ", ".join([*parts, *([f"{self.focal_mm:g} mm"] if self.focal_mm else [])])
+
+    @property
+    def key(self) -> str:
+        """A key that stays the same while photos join and leave."""
+        first = self.photos[0]
+        identity = f"{self.camera}|{first.body_key}|{self.focal_mm}|{self.lens_model}"
+        return hashlib.sha256(identity.encode()).hexdigest()[:12]
+
+
+def grouped(rows: Sequence[PhotoRow]) -> list[WaitingGroup]:
+    """Group photos by body and lens name, those that name no lens by focal length."""
+    groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
+    for row in rows:
+        camera = camera_name(row.camera_maker, row.camera_model)
+        focal = 0.0 if row.lens_model else row.focal_mm or 0.0
+        groups[camera, row.body_key or "", focal, row.lens_model or ""].append(row)
+    bodies: defaultdict[str, list[str]] = defaultdict(list)
+    for camera, body, *_ in sorted(groups):
+        if body not in bodies[camera]:
+            bodies[camera].append(body)
+    return [
+        WaitingGroup(
+            camera=camera or None,
+            body=bodies[camera].index(body) + 1 if len(bodies[camera]) > 1 else None,
+            focal_mm=focal or None,
+            lens_model=model or None,
+            needs_aperture=any(row.aperture is None for row in photos),
+            photos=photos,
+        )
+        for (camera, body, focal, model), photos in sorted(groups.items())
+    ]

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from app.pages.groups import WaitingGroup
+from app.pages.pictures import upright_point
+from app.pages.shown import WaitingGroup
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
 from lensmodel.core.names import full_name
@@ -44,6 +45,28 @@ FILES: Final[Mapping[str, str]] = {
 }
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
+CHECKS: Final[Mapping[str, str]] = {
+    "too dark": "darker than anything nearby",
+    "too bright": "brighter than anything nearby",
+    "isolated pixels": "single pixels that stand out",
+    "hue, spots": "spots of a colour that the photo does not have there",
+    "hue, area": "a tint that the photo does not have there",
+    "re-blur": "detail that does not match the photo",
+    "spectrum": "sharper than this lens allows",
+    "comb": "lines beside lines",
+    "ringing": "rings beside edges",
+    "grain": "grain beyond that of the photo",
+}
+LEAST: Final = 0.005
+"""Share below which a check is not mentioned (chosen): less than can be seen."""
+
+MAX_PLACES: Final = 6
+"""Places that are listed (chosen): the worst ones."""
+
+SQUARE: Final = 96
+"""Side of a square in photo pixels for audits without `tile_side` (chosen): large enough to
+find in the picture."""
+
 REASONS: Final[Mapping[str, str]] = {
     "clipped": "too bright: the sensor was saturated",
     "flat": "no detail",
@@ -196,34 +219,20 @@ EVENTS: Final[Mapping[str, str]] = {
     "photo_excluded": "photo left out",
     "photo_removed": "photo deleted",
     "photo_changed": "details of a photo changed",
-    "model_changed": "all photos measured anew",
 }
 
 
 def event_words(event: CalibrationOut) -> str:
     """Say what made a version."""
-    words = EVENTS.get(event.kind, event.kind)
-    return f"{words}, model {event.model}" if event.kind == "model_changed" else words
+    return EVENTS.get(event.kind, event.kind)
 
 
 def model_words(lens: LensOut) -> str:
-    """Say what the models of a lens are, and what it costs to change that of this one."""
-    words = (
-        'The model "paper" is the method of the paper that this program grew from, to compare with: its '
-        "kernels and its correction alone, without what guards photos from errors."
-    )
-    if lens.samples:
-        words += " After a change all photos of the lens are measured again; until then nothing else changes."
-    return words
-
-
-def changing_words(lens: LensOut, left: int) -> str:
-    """Say what is going on while a lens changes its model; `left` photos are still to be measured."""
-    answers = f"the model {lens.answering_model} is used"
-    if left:
-        photos = counted(left, "photo")
-        return f"Being measured anew for the model {lens.psf_model}: {photos} to go. Until then {answers}."
-    return f"None of its photos could be measured for the model {lens.psf_model}, so {answers}."
+    """Say what the model of a lens is where it is not the usual one."""
+    return {
+        "paper": 'Its model is "paper", the method of the paper that this program grew from, to compare '
+        "with: its kernels and its correction alone, without what guards photos from errors."
+    }.get(lens.psf_model, "")
 
 
 def centring_verdict(centring: Centring) -> str:
@@ -299,6 +308,71 @@ def held_words(zone: Mapping[str, Any]) -> str:
     return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
 
 
+@dataclass(frozen=True, slots=True)
+class MarkedPlace:
+    """A place of the upright photo in its pixels, with a caption."""
+
+    x: int
+    y: int
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class HeldBack:
+    """What was held back: a sentence, the reasons, and the worst places."""
+
+    words: str
+    reasons: list[str]
+    places: list[MarkedPlace]
+
+
+def check_words(name: str) -> str:
+    """Return what a check objects to, in words."""
+    return CHECKS.get(name, name)
+
+
+def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> HeldBack | None:
+    """Return what was held back of a correction; None where nothing was checked."""
+    zones = audit.get("zones") or {}
+    tiles = sum(zone["tiles"] for zone in zones.values())
+    if not tiles:
+        return None
+    share = sum(zone["tiles"] * zone["held_back"] for zone in zones.values()) / tiles
+    checks: dict[str, float] = {}
+    for zone in zones.values():
+        for name, part in zone["checks"].items():
+            checks[name] = checks.get(name, 0.0) + part * zone["tiles"] / tiles
+    listed = sorted(checks.items(), key=lambda item: -item[1])
+    reasons = [f"{check_words(name)}: {part:.1%}" for name, part in listed if part >= LEAST]
+    words = (
+        "Applied almost in full."
+        if share < LEAST
+        else f"{share:.0%} of the correction was held back over the whole photo."
+    )
+    places = []
+    worst = audit.get("worst", []) if share >= LEAST else []  # less cannot be seen
+    for place in worst[:MAX_PLACES]:
+        y, x = upright_point(place["row"], place["col"], height, width, orientation)
+        places.append(MarkedPlace(x, y, f"{place['held_back']:.0%}: {check_words(place['check'])}"))
+    return HeldBack(words, reasons, places)
+
+
+def held_squares(
+    audit: Mapping[str, Any], height: int, width: int, orientation: int
+) -> dict[str, Any] | None:
+    """Return the tiles with something held back as squares of the upright photo."""
+    tiles = audit.get("tiles") or []
+    if not tiles:
+        return None
+    side = int(audit.get("tile_side") or SQUARE)
+    squares = []
+    for tile in tiles:
+        middle = (tile["row"] + side / 2, tile["col"] + side / 2)
+        y, x = upright_point(*middle, height, width, orientation)
+        squares.append({"x": round(x - side / 2), "y": round(y - side / 2), "held": tile["held_back"]})
+    return {"tiles": squares, "side": side, "most": max(tile["held_back"] for tile in tiles)}
+
+
 def active(photo: PhotoOut) -> bool:
     """Whether work on it goes on."""
     return photo.state in ACTIVE
@@ -324,7 +398,6 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         event_words,
         sharpness,
         model_words,
-        changing_words,
         unit_name,
         photo_state,
         state_class,

@@ -1,20 +1,29 @@
-"""The account: what an owner has, all of it to take away, all of it gone."""
+"""The account: signing in and out, what an owner has, all of it to take away, all of it gone."""
 
 from __future__ import annotations
 
+from typing import Final
+from urllib.parse import urlsplit
+
 from fastapi import APIRouter, Response, status
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
-from app.access.authentication import COOKIE
+from app.access.authentication import COOKIE, SESSION
 from app.blobs.erasure import erase
 from app.blobs.export import exported
-from app.http.dependencies import CallDep
-from app.http.middleware import ONLY_HEAD
+from app.http.dependencies import CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import most
-from app.schemas.account import AccountOut
+from app.runtime.settings import LOOPBACK
+from app.schemas import AccountOut, SessionOut, SignIn
 
 router = APIRouter(tags=["account"])
+sign_ins = APIRouter(tags=["account"])
+"""Open to strangers, of whom one may be about to sign in."""
+
+HTTPS: Final = "https"
 
 
 @router.get("/account", operation_id="getAccount", responses=problems(401))
@@ -58,8 +67,6 @@ def export_account(call: CallDep) -> Response:
         "Content-Disposition": 'attachment; filename="lensmodel-account.zip"',
         "Cache-Control": "private, no-store",
     }
-    if call.request.scope.get(ONLY_HEAD):
-        return Response(headers=headers, media_type="application/zip")
     body = exported(call.store, call.storage, call.owner)
     return StreamingResponse(body, headers=headers, media_type="application/zip")
 
@@ -81,3 +88,48 @@ def erase_account(call: CallDep) -> None:
     if key is not None:
         erase(accounts, call.storage, key)
     call.response.delete_cookie(COOKIE)
+
+
+@sign_ins.post(
+    "/session", operation_id="signIn", status_code=status.HTTP_201_CREATED, responses=problems(401, 422, 429)
+)
+async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
+    """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
+    gate = call.services.gate
+    who, token = await run_in_threadpool(gate.sign_in, credentials.key.strip())
+    call.response.set_cookie(
+        COOKIE,
+        token,
+        max_age=int(SESSION.total_seconds()),
+        httponly=True,
+        samesite="strict",
+        secure=must_be_secure(call.request),
+    )
+    return SessionOut.model_validate({"owner": who.owner, "scopes": who.scopes, "needed": True})
+
+
+@sign_ins.get("/session", operation_id="getSession", responses=problems(401))
+async def read_session(call: CallDep) -> SessionOut:
+    """Return who is signed in."""
+    needed = call.who.key_id is not None
+    return SessionOut.model_validate({"owner": call.owner, "scopes": call.who.scopes, "needed": needed})
+
+
+@sign_ins.delete(
+    "/session", operation_id="signOut", status_code=status.HTTP_204_NO_CONTENT, responses=problems(422)
+)
+async def sign_out(call: ProbeDep) -> None:
+    """Sign the browser out."""
+    await run_in_threadpool(call.services.gate.sign_out, call.request)
+    call.response.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=must_be_secure(call.request))
+
+
+def must_be_secure(request: Request) -> bool:
+    """Say whether the cookie may travel by HTTPS only: everywhere but between programs of one machine."""
+    if HTTPS in {request.url.scheme, request.headers.get("x-forwarded-proto", "").lower()}:
+        return True
+    try:
+        name = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
+    except ValueError:
+        return True
+    return name not in LOOPBACK

@@ -50,11 +50,11 @@ def matches_tag(call: Call, tag: str) -> bool:
     return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
 
 
-def named_lens(call: Call, lens_id: str) -> LensRow:
-    """Return the lens that a field of a request names."""
+def find_lens(call: Call, lens_id: str) -> LensRow:
+    """Return a lens of the owner."""
     lens = call.store.lenses.get(lens_id, call.owner)
     if lens is None:
-        raise UnknownLensError(f"lens_id {lens_id}: there is no such lens; GET /v1/lenses lists them")
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
     return lens
 
 

@@ -20,14 +20,13 @@ from app.errors import (
 )
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
-from app.routes.common import Cursor, Limit, OnlyId, matches_tag, named_lens, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, find_lens, matches_tag, next_link, problems
 from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
-from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
+from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
-from app.store.photo_steps import stored_settings
+from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
 from app.ways import configured_way
@@ -70,7 +69,7 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     version = _version_for(call, lens, options.lens_version)
     _admit(call)
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
-    params["method"] = options.method or configured_way(call.settings, lens.answering_way).method
+    params["method"] = options.method or configured_way(call.settings, lens.way).method
     # with other settings of the photo the same request is a new correction
     params["settings"] = stored_settings(photo)
     # only values other than the defaults: requests stored before there were bounds stay the same
@@ -80,7 +79,7 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     row, created = call.store.corrections.create(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
-    call.response.headers["Location"] = f"{views.V1}/corrections/{row.public_id}"
+    call.response.headers["Location"] = f"{V1}/corrections/{row.public_id}"
     return views.correction_out(CorrectionPlan(row, photo, lens))
 
 
@@ -125,7 +124,7 @@ def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
 
 def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     if lens_id is not None:
-        return named_lens(call, lens_id)
+        return find_lens(call, lens_id)
     lens = call.store.photos.lens_of(photo) or call.store.lenses.by_identity(photo)
     if lens is not None:
         return lens
@@ -267,8 +266,6 @@ def read_result(correction_id: str, call: CallDep) -> Response:
     if (start, end) != (0, row.result_bytes):
         code = status.HTTP_206_PARTIAL_CONTENT
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{row.result_bytes}"
-    if call.request.scope.get(ONLY_HEAD):
-        return Response(status_code=code, headers=headers, media_type=row.result_media_type)
     body = call.storage.stream(row.result_key, start, end)
     return StreamingResponse(body, code, headers, row.result_media_type)
 

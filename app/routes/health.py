@@ -13,6 +13,7 @@ from fastapi import APIRouter, Response, status
 
 from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
+from app.routes.jobs import LONG_POLL_S
 from app.routes.photos import GIB
 from app.routes.psf import MEDIA_TYPES
 from app.runtime import metrics
@@ -27,7 +28,7 @@ from app.schemas import (
     Readiness,
     VersionOut,
 )
-from app.store.upkeep import migrate
+from app.store import migrate
 from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
 from lensmodel.patches import selectors
@@ -126,8 +127,7 @@ def _worker(call: Call) -> dict[str, bool]:
 @probes.get("/metrics", include_in_schema=False)
 def read_metrics(call: CallDep) -> Response:
     """Return the numbers of this service for Prometheus."""
-    settings = call.settings
-    text = metrics.of_service(call.store, settings.lease_seconds, settings.data_dir)
+    text = metrics.of_service(call.store, call.settings.lease_seconds)
     return Response(text, media_type=metrics.CONTENT_TYPE)
 
 
@@ -162,6 +162,6 @@ def read_limits(call: CallDep) -> LimitsOut:
         max_queued_photos=settings.max_queued_photos,
         max_stored_bytes=int(settings.max_stored_gb * GIB),
         max_psf_size=MAX_PSF_SIZE,
-        long_poll_seconds=settings.long_poll_seconds,
+        long_poll_seconds=LONG_POLL_S,
         keep_results_days=settings.keep_results_days,
     )

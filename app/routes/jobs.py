@@ -22,6 +22,9 @@ from app.schemas import JobOut, JobPage, RetriedOut
 
 router = APIRouter(tags=["jobs"])
 
+LONG_POLL_S: Final = 20.0
+"""Longest that a question for a job waits for a change of it (chosen): proxies end requests after 30 s."""
+
 LOOK_S: Final = 0.5
 """Seconds between two looks at a job that somebody waits for (chosen): each is one or two reads."""
 
@@ -84,7 +87,7 @@ async def read_job(
     job = await run_in_threadpool(find_job, call, job_id)
     known_tag = call.request.headers.get("if-none-match", "").strip('W/"')
     previous = known_tag or fingerprint(job)
-    deadline = time.monotonic() + min(wait, call.settings.long_poll_seconds)
+    deadline = time.monotonic() + min(wait, LONG_POLL_S)
     while fingerprint(job) == previous and job.state not in FINAL and time.monotonic() < deadline:
         await asyncio.sleep(min(LOOK_S, max(deadline - time.monotonic(), 0.0)))
         job = await run_in_threadpool(find_job, call, job_id)

@@ -23,12 +23,11 @@ from app.errors import (
 )
 from app.http import upload
 from app.http.dependencies import Call, CallDep
-from app.http.views import V1
-from app.routes.common import problems
-from app.routes.jobs import LOOK_S
-from app.routes.lenses import find_lens, read_lens
+from app.routes import jobs
+from app.routes.common import find_lens, problems
+from app.routes.lenses import read_lens
 from app.routes.photos import delete_photo, receiving, recorded
-from app.schemas import LensOut
+from app.schemas import V1, LensOut
 from app.store.tables import PHOTO_FINAL, PROFILE_FILE, PhotoRow
 from lensmodel.core.names import full_name
 from lensmodel.model.profile import LensProfile, write_profile
@@ -103,9 +102,9 @@ async def add_lens_profile(
     async with receiving(call) as (public_id, key):
         digest, size = await upload.receive_profile(call.request, call.storage, key, limit=MAX_BYTES)
     file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
-    end = time.monotonic() + call.settings.long_poll_seconds
+    end = time.monotonic() + jobs.LONG_POLL_S
     while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(jobs.LOOK_S)
         file = await run_in_threadpool(call.store.photos.get, file.public_id, call.owner)
     if file is not None and file.state in {"failed", "cancelled"}:
         await run_in_threadpool(delete_photo, file.public_id, call)

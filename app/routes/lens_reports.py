@@ -12,11 +12,10 @@ from fastapi import APIRouter, Query, Response, status
 
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.routes.common import matches_tag, problems
-from app.routes.lenses import find_lens
-from app.schemas.fields import Aperture, OptionalId
+from app.routes.common import find_lens, matches_tag, problems
+from app.schemas import Aperture, OptionalId
+from app.store.lenses import report_key
 from app.store.tables import LensRow
-from app.store.versions import report_key
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import Channel

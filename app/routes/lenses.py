@@ -1,4 +1,4 @@
-"""Lenses: what is known of each copy, and its history."""
+"""Lenses: what is known of each copy, its history, and what its owner does with it as a whole."""
 
 from __future__ import annotations
 
@@ -6,24 +6,16 @@ from statistics import median
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, status
+from pydantic import Field
 
-from app.errors import UnknownLensError
+from app.errors import ConflictError, InvalidParameterError, UnknownLensError
 from app.http import views
-from app.http.dependencies import Call, CallDep
-from app.routes.common import Cursor, Limit, OnlyName, cut, next_link, problems
-from app.schemas import MAX_VERSION, CalibrationPage, LateralOut, LensOut, LensPage
-from app.store.tables import LensRow
+from app.http.dependencies import CallDep
+from app.routes.common import Cursor, Limit, OnlyName, cut, find_lens, next_link, problems
+from app.schemas import MAX_VERSION, CalibrationPage, Id, LateralOut, LensOut, LensPage, Name, Question
 from lensmodel.core.errors import NoSamplesError
 
 router = APIRouter(tags=["lenses"])
-
-
-def find_lens(call: Call, lens_id: str) -> LensRow:
-    """Return a lens of the owner."""
-    lens = call.store.lenses.get(lens_id, call.owner)
-    if lens is None:
-        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
-    return lens
 
 
 @router.get("/lenses", operation_id="listLenses", responses=problems(422))
@@ -49,6 +41,62 @@ def read_lens(lens_id: str, call: CallDep) -> LensOut:
     return views.lens_out(lens, *call.store.lenses.coverage_of([lens])[lens.id])
 
 
+class LensChange(Question):
+    """What to change about a lens: one of these."""
+
+    label: Name | None = Field(None, description="what its owner calls it; null takes the name away")
+    merge_into: Id | None = Field(None, description="the lens that this one is a part of")
+    back_to: int | None = Field(
+        None, ge=1, le=MAX_VERSION, description="a version: photos that joined later are left out"
+    )
+
+
+class LensIn(Question):
+    """A lens of which nothing is known yet but its name."""
+
+    label: Name = Field(description="what its owner calls it")
+
+
+@router.post(
+    "/lenses", operation_id="createLens", status_code=status.HTTP_201_CREATED, responses=problems(422)
+)
+def create_lens(new: LensIn, call: CallDep) -> LensOut:
+    """Create a lens, to add a profile to; photos create theirs by themselves."""
+    return read_lens(call.store.lenses.create(call.owner, new.label), call)
+
+
+@router.patch("/lenses/{lens_id}", operation_id="changeLens", responses=problems(404, 409, 422))
+def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
+    """Rename a lens, merge it into another, or go back to an earlier version.
+
+    Merged, its photos teach the other lens, which is returned, and it is forgotten. Going back leaves out the
+    photos that joined later; they stay, and can be included again.
+    """
+    lens = find_lens(call, lens_id)
+    if len(change.model_fields_set) != 1:
+        raise InvalidParameterError("send one of label, merge_into and back_to")
+    lenses = call.store.lenses
+    if change.merge_into is not None:
+        target = find_lens(call, change.merge_into)
+        if target.id == lens.id:
+            raise InvalidParameterError("merge_into names the lens itself: name the other one")
+        if lens.way != target.way:
+            raise ConflictError(
+                f"lens {lens_id} has the model {lens.way}, and {change.merge_into} {target.way}: only lenses "
+                "of one model can be merged"
+            )
+        if not lenses.merge(lens_id, change.merge_into, call.owner):
+            raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
+        return read_lens(change.merge_into, call)
+    if change.back_to is not None:
+        if change.back_to >= lens.version:
+            raise InvalidParameterError(f"back_to must be below {lens.version}, the newest version")
+        lenses.go_back(lens_id, call.owner, change.back_to)
+        return read_lens(lens_id, call)
+    lenses.rename(lens_id, call.owner, change.label)
+    return read_lens(lens_id, call)
+
+
 @router.delete(
     "/lenses/{lens_id}",
     operation_id="deleteLens",
@@ -57,7 +105,7 @@ def read_lens(lens_id: str, call: CallDep) -> LensOut:
 )
 def delete_lens(lens_id: str, call: CallDep) -> None:
     """Delete a lens with its serial and all that was learned of it; its photos stay and can be corrected."""
-    if not call.store.removal.lens(lens_id, call.owner):
+    if not call.store.lenses.delete(lens_id, call.owner):
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
 
 

@@ -20,52 +20,45 @@ from app.errors import (
     QuotaError,
     ServiceError,
     StorageFullError,
-    UnknownLensError,
     UnknownPhotoError,
 )
-from app.http import bodies, upload, views
-from app.http.bodies import CLOSE
+from app.http import middleware, upload, views
 from app.http.dependencies import Call, CallDep
-from app.routes.common import Cursor, Limit, OnlyId, cut, named_lens, next_link, problems
-from app.routes.upload_checks import check_model, check_selector
+from app.http.middleware import CLOSE
+from app.routes.common import Cursor, Limit, OnlyId, cut, find_lens, next_link, problems
 from app.runtime.settings import MIB, Settings
-from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState, UploadFields
+from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotosChange, PhotoState, UploadFields
 from app.store import LensName
-from app.store.access.accounts import Quota
-from app.store.ids import new_id
-from app.store.photo_steps import GIVEN_SETTINGS, photo_folder
-from app.store.photos import Received
-from app.store.tables import PhotoRow
+from app.store.accounts import Quota
+from app.store.database import new_id
+from app.store.photos import GIVEN_SETTINGS, NewCopy, Received, photo_folder
+from app.store.tables import LensRow, PhotoRow
+from lensmodel.core.errors import UnknownMethodError
+from lensmodel.patches import selectors
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB  # bytes
+UPLOAD_S: Final = 3600.0
+"""Longest that a photo may be on its way to us in seconds (chosen): 512 MiB come within it at 1.2 Mbit/s."""
+
+MAX_UPLOADS: Final = 8
+"""Files that are received at once (chosen): each takes a connection and a file, and hardly any memory."""
+
+MAX_PHOTOS: Final = 100_000
+"""Photos of one owner, unless his keys say another number (chosen): all that one photographer has."""
+
 SEND_AGAIN = "send the same file again, and ask then (LENS_KEEP_PHOTOS says how long files stay)"
 
-_UPLOAD_BODY = {
+_FIELDS: Final = {
+    name: next(kind for kind in field.get("anyOf", [field]) if kind.get("type") != "null")
+    for name, field in UploadFields.model_json_schema()["properties"].items()
+}
+_FILE: Final = {"type": "string", "contentMediaType": "application/octet-stream"}
+_FORM: Final = {"type": "object", "required": ["file"], "properties": {"file": _FILE, **_FIELDS}}
+_UPLOAD_BODY: Final = {
     "required": True,
     "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["file"],
-                "properties": {
-                    "file": {"type": "string", "contentMediaType": "application/octet-stream"},
-                    "calibrate": {"type": "boolean", "default": True},
-                    "kind": {"enum": ["target", "pair", "points", "edges"]},
-                    "reference_id": {"type": "string"},
-                    "model": {"enum": ["default", "paper"]},
-                    "selector": {"type": "string"},
-                    "lens_id": {"type": "string"},
-                    "lens_serial": {"type": "string"},
-                    "lens_model": {"type": "string"},
-                    "lens_maker": {"type": "string"},
-                    "aperture": {"type": "number", "minimum": 0.5, "maximum": 128},
-                    "focal_length_mm": {"type": "number", "minimum": 0.1, "maximum": 20000},
-                    "focus_distance_m": {"type": "number", "exclusiveMinimum": 0},
-                    "pixel_pitch_um": {"type": "number", "exclusiveMinimum": 0.1},
-                },
-            }
-        },
+        "multipart/form-data": {"schema": _FORM},
         "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
     },
 }
@@ -94,7 +87,7 @@ async def create_photo(call: CallDep) -> PhotoOut:
     With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
     photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
     With `model` it founds a lens that is learned so; of a lens with another model it is refused, or fails
-    with `conflict` where only the file says which lens it was: `PATCH /v1/lenses/{id}` changes the model.
+    with `conflict` where only the file says which lens it was.
     `selector` names who chooses its patches, of those that `GET /v1/formats` lists; bytes that are known keep
     the patches they have.
     """
@@ -111,17 +104,15 @@ async def create_photo(call: CallDep) -> PhotoOut:
 )
 async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
     """Store a photo made to measure a lens that is known, and measure it; `kind` says what it shows."""
-    if await run_in_threadpool(call.store.lenses.get, lens_id, call.owner) is None:
-        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
+    await run_in_threadpool(find_lens, call, lens_id)
     return await _received(call, lens_id)
 
 
 @asynccontextmanager
 async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
     """Admit an upload, whose body comes in the block; give the id of its row and the key of its blob."""
-    limits = call.settings
     many = BusyError(
-        f"{limits.max_uploads} files are being received, more may not be: try again in a few seconds",
+        f"{MAX_UPLOADS} files are being received, more may not be: try again in a few seconds",
         headers={"Retry-After": "5", **CLOSE},
     )
     with call.services.uploads.take(many):
@@ -129,9 +120,9 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
         prefix = f"photos/{public_id}/"
-        span = timedelta(seconds=limits.upload_seconds)
+        span = timedelta(seconds=UPLOAD_S)
         await run_in_threadpool(partial(call.store.photos.expect, prefix, within=span))
-        async with bodies.within(limits.upload_seconds):
+        async with middleware.within(UPLOAD_S):
             yield public_id, f"{prefix}original"
 
 
@@ -150,7 +141,7 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
     """Create a photo from an upload."""
     try:
         _check_kind(call, uploaded.fields, measured=measured)
-        check_selector(uploaded.fields)
+        _check_selector(uploaded.fields)
         photo, fresh = _record(call, public_id, uploaded, key)
     except ServiceError:
         call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
@@ -173,6 +164,29 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         )
     if fields.reference_id is not None:
         find_photo(call, fields.reference_id)
+
+
+def _check_selector(fields: UploadFields) -> None:
+    """Refuse a selector that is not there, or one for a photo whose patches nobody chooses."""
+    if fields.selector is None:
+        return
+    if fields.kind is not None:
+        raise InvalidParameterError(
+            f"selector={fields.selector} and kind exclude each other: leave one of them out"
+        )
+    try:
+        selectors.create(fields.selector)
+    except UnknownMethodError as error:
+        raise InvalidParameterError(str(error)) from error
+
+
+def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
+    """Refuse a photo that was sent for another model than its lens has."""
+    if lens is not None and fields.model not in {None, lens.way}:
+        raise ConflictError(
+            f"model={fields.model}: lens {lens.public_id} has the model {lens.way}, which was chosen by its "
+            "first photo: leave model out, or name a new lens"
+        )
 
 
 def _admit(call: Call) -> None:
@@ -215,7 +229,7 @@ def most(settings: Settings, quota: Quota) -> tuple[int, int]:
     """Return how many bytes and how many photos an owner may have."""
     return (
         int(settings.max_stored_gb * GIB) if quota.stored_bytes is None else quota.stored_bytes,
-        settings.max_photos if quota.photos is None else quota.photos,
+        MAX_PHOTOS if quota.photos is None else quota.photos,
     )
 
 
@@ -223,7 +237,7 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None:
-        check_model(fields, named_lens(call, fields.lens_id))
+        _check_model(fields, find_lens(call, fields.lens_id))
     received = recorded(
         call,
         public_id,
@@ -236,7 +250,7 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
         given=given,
     )
     if received.photo.public_id != public_id and not received.fresh:
-        check_model(fields, call.store.photos.lens_of(received.photo))
+        _check_model(fields, call.store.photos.lens_of(received.photo))
     return described_photo(call, received.photo), received.fresh
 
 
@@ -342,7 +356,6 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         raise InvalidParameterError("calibrate=false: send excluded=true to take a photo out of its lens")
     if change.calibrate and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
-    counts = photo.state in {"counted", "excluded"}
     done = call.store.photos.change(
         photo_id,
         call.owner,
@@ -352,11 +365,8 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         calibrate=bool(change.calibrate),
     )
     photo = find_photo(call, photo_id)
-    if not done and counts and photo.file_gone_at is not None:
-        raise ConflictError(
-            f"photo {photo_id} was learned from for another model than that of the lens, and its file is no "
-            f"longer kept: {SEND_AGAIN}"
-        )
+    if not done and lens is not None:
+        raise ConflictError(f"photo {photo_id} was learned from for another model than that of the lens")
     if not done:
         raise ConflictError(
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
@@ -370,7 +380,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     if sum(way is not None for way in ways) > 1:
         raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
-        return named_lens(call, change.lens_id).public_id
+        return find_lens(call, change.lens_id).public_id
     maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
     if change.new_lens is not None:
         return LensName(maker, model, None, label=change.new_lens.label)
@@ -379,3 +389,25 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     if change.lens_model is not None or change.lens_maker is not None:
         raise InvalidParameterError("lens_model alone does not tell copies apart: send lens_serial with it")
     return None
+
+
+@router.patch("/photos", operation_id="changePhotos", responses=problems(404, 409, 422))
+def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
+    """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
+
+    Each photo changes as by itself; where one is gone or refuses nothing changes.
+    """
+    if (change.lens_id is None) == (change.new_lens is None) and not change.model_fields_set & {
+        *GIVEN_SETTINGS
+    }:
+        raise InvalidParameterError("send lens_id or new_lens, or the settings of these photos")
+    if change.lens_id is not None and change.new_lens is not None:
+        raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
+    if change.lens_id is not None:
+        find_lens(call, change.lens_id)
+    keys = list(dict.fromkeys(change.photo_ids))
+    given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
+    lens = change.lens_id if change.new_lens is None else NewCopy(change.new_lens.label)
+    call.store.photos.change_several(keys, call.owner, given, lens)
+    items = [described_photo(call, find_photo(call, key)) for key in keys]
+    return PhotoPage(items=items, next=None)

@@ -10,10 +10,8 @@ from fastapi import APIRouter, Depends, Response, status
 
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
 from app.http import psf_formats
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, QueryModel
 from app.http.model_cache import Fitted
-from app.http.picture_cache import DrawnPicture
-from app.http.questions import QueryModel
 from app.routes.common import Answers, matches_tag, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
@@ -189,16 +187,13 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 
-    def draw() -> DrawnPicture:
-        return psf_formats.field_map(
-            lambda place: fitted.model.query(place, setting, at.size),
-            columns=columns,
-            rows=rows,
-            size=at.size,
-            gamma=at.gamma,
-            aspect=at.aspect,
-            view=(left, top, wide, high),
-        )
-
-    picture = call.services.pictures.get(tag, draw)
-    return Response(picture.data, media_type="image/png", headers={**headers, **picture.headers})
+    picture, more = psf_formats.field_map(
+        lambda place: fitted.model.query(place, setting, at.size),
+        columns=columns,
+        rows=rows,
+        size=at.size,
+        gamma=at.gamma,
+        aspect=at.aspect,
+        view=(left, top, wide, high),
+    )
+    return Response(picture, media_type="image/png", headers={**headers, **more})

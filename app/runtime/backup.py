@@ -1,53 +1,39 @@
-"""Back up a running installation, restore it, and move it.
+"""Back up an installation that may be running, into a folder that is itself the data folder of one.
 
-A backup is a folder: `rows-....db`, a SQLite file with all rows of one moment, whatever database the service
-uses; `blobs/`, at least what these rows name; and `backup.json`, which names the first and is replaced last.
-So the folder is a complete backup at every moment, also while the next one is being written into it.
-
-Blobs are immutable; they are written before the rows that name them and deleted some time after these. So it
-is enough to copy blobs, then the rows, then the new blobs; a blob that was deleted in between is missing
-then, and newer rows are taken.
+`app.db` has all rows of one moment, `blobs/` at least what these rows name. Blobs are immutable, written
+before the rows that name them and deleted after these. So the rows are taken first, then the blobs that they
+name; one that was deleted in between is missing then, and newer rows are taken. `app.db` is replaced last:
+the folder is a complete backup at every moment, also while the next one is being written into it.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
 import sqlite3
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
-
-from sqlalchemy import Connection, select
+from typing import Final
 
 from app.blobs.storage import Storage
-from app.store.access import access_tables as _all_tables  # noqa: F401 - a copy holds every table
+from app.store import migrate
 from app.store.database import Database
-from app.store.tables import CorrectionRow, PhotoRow
-from app.store.upkeep import migrate, transfer
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.files import atomic
 from lensmodel.core.types import StepHook, ignore_step
 
-MANIFEST: Final = "backup.json"
+ROWS: Final = "app.db"
 BLOBS: Final = "blobs"
-FORMAT: Final = 1
-"""Raised when an older program could not read the backup."""
-
 TRIES: Final = 5
 """Snapshots until one has all its blobs (chosen): each failure needs a deletion in just these moments."""
 
-_LEFT_OUT: Final = ("probe/",)
+_NAMED: Final = """
+    SELECT blob_key FROM photo WHERE deleted_at IS NULL AND file_gone_at IS NULL
+    UNION SELECT result_key FROM correction WHERE state = 'succeeded' AND result_key IS NOT NULL"""
+"""The blobs that cannot be made again: photos, and results of corrections."""
 
 
 class BackupError(LensModelError):
-    """A backup cannot be made, or is damaged."""
+    """A backup cannot be made."""
 
     code = "backup_failed"
 
@@ -57,157 +43,57 @@ class Backup:
     """Contents of a backup."""
 
     made_at: str
-    rows: dict[str, int]
+    photos: int
     blobs: int
     byte_size: int
 
 
 def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook = ignore_step) -> Backup:
     """Bring a backup folder up to date with an installation, which may be running."""
-    transfer.check_schema(database)
+    if not database.is_sqlite:
+        raise InvalidInputError(
+            "the rows are in a database server: back them up by pg_dump, and after them the blobs by the "
+            "means of their storage; docs/topics/operating.md says how"
+        )
+    migrate.check(database)
     folder.mkdir(parents=True, exist_ok=True)
     target = Storage(f"file://{(folder / BLOBS).resolve()}")
-    have = dict(target.listed())
-    _fetch(storage, target, _differing(storage, have), on_step)
-    part, missing = folder / "rows.part", list[str]()
+    part = folder / f"{ROWS}.part"
+    missing: list[str] = []
     for _ in range(TRIES):
-        part.unlink(missing_ok=True)
-        moment = datetime.now(UTC)
-        rows, named = _rows(database, part)
-        stored, have = dict(storage.listed()), dict(target.listed())
-        fresh = sorted(key for key in named & stored.keys() if have.get(key) != stored[key])
-        _fetch(storage, target, fresh, on_step)
-        missing = sorted(named - dict(target.listed()).keys())
+        made_at = datetime.now(UTC).isoformat()
+        photos, named = _rows(database.path, part)
+        kept = dict(target.listed())
+        _fetch(storage, target, sorted(named - kept.keys()), on_step)
+        kept = dict(target.listed())
+        missing = sorted(named - kept.keys())
         if not missing:
-            result = _finish(folder, part, moment, rows, named)
-            for key in dict(target.listed()).keys() - named - stored.keys():
-                (folder / BLOBS / key).unlink(missing_ok=True)  # deleted in the installation, so deleted here
-            return result
-    part.unlink(missing_ok=True)
+            for log in ("-wal", "-shm"):  # of who looked into the backup before: they belong to the old rows
+                (folder / f"{ROWS}{log}").unlink(missing_ok=True)
+            part.replace(folder / ROWS)
+            for key in kept.keys() - named:
+                target.remove(key)
+            return Backup(made_at, photos, len(named), sum(kept[key] for key in named))
+    part.unlink()
     raise BackupError(f"{len(missing)} blobs are named and missing, {missing[0]} first: run lensmodel doctor")
 
 
-def _differing(storage: Storage, have: dict[str, int]) -> list[str]:
-    return [key for key, size in storage.listed() if have.get(key) != size and not key.startswith(_LEFT_OUT)]
+def _rows(database: Path, part: Path) -> tuple[int, set[str]]:
+    """Write the rows of one moment into a file; return how many photos, and which blobs they name."""
+    part.unlink(missing_ok=True)
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("VACUUM INTO ?", (str(part),))
+    with closing(sqlite3.connect(part)) as copy, copy:
+        copy.execute("DELETE FROM worker")  # none of them works on the copy
+        named = {str(row[0]) for row in copy.execute(_NAMED)}
+        photos = copy.execute("SELECT count(*) FROM photo WHERE deleted_at IS NULL").fetchone()[0]
+    return photos, named
 
 
-def _fetch(source: Storage, target: Storage, keys: Iterable[str], on_step: StepHook) -> None:
-    wanted = list(keys)
-    for done, key in enumerate(wanted, start=1):
+def _fetch(source: Storage, target: Storage, keys: list[str], on_step: StepHook) -> None:
+    for done, key in enumerate(keys, start=1):
         try:
             source.copy_to(target, key)
         except FileNotFoundError:  # deleted since: rows taken later do not name it
             continue
-        on_step(done, len(wanted))
-
-
-def _rows(database: Database, part: Path) -> tuple[dict[str, int], set[str]]:
-    """Write the rows of one moment into a file; return how many, and which blobs they name."""
-    with closing(Database(f"sqlite:///{part.resolve()}")) as copy:
-        migrate.upgrade(copy)
-        with transfer.snapshot(database) as moment:
-            rows = transfer.copy(moment, copy)
-        with copy.reader.connect() as connection:
-            named = _named(connection)
-    with closing(sqlite3.connect(part)) as connection:
-        connection.execute("PRAGMA journal_mode=DELETE")  # one file, without a log beside it
-    return rows, named
-
-
-def _named(rows: Connection) -> set[str]:
-    """Return the blobs that cannot be made again: photos, and results of corrections."""
-    alive = select(PhotoRow.blob_key).where(PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
-    results = select(CorrectionRow.result_key).where(
-        CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)
-    )
-    return {str(key) for query in (alive, results) for key in rows.execute(query).scalars()}
-
-
-def _finish(folder: Path, part: Path, moment: datetime, rows: dict[str, int], named: set[str]) -> Backup:
-    with part.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    name = f"rows-{digest[:16]}.db"
-    part.replace(folder / name)
-    kept = dict(Storage(f"file://{(folder / BLOBS).resolve()}").listed())
-    result = Backup(moment.isoformat(), rows, len(named), sum(kept[key] for key in named))
-    manifest = {
-        "format": FORMAT,
-        "program": version("lensmodel"),
-        "schema": migrate.head(),
-        "rows_file": name,
-        "sha256": digest,
-        "made_at": result.made_at,
-        "rows": rows,
-        "blobs": {key: kept[key] for key in sorted(named)},
-    }
-    with atomic(folder / MANIFEST) as file:
-        file.write(json.dumps(manifest, indent=1).encode())
-    for path in folder.glob("rows*.db*"):
-        if path.name != name:
-            path.unlink()
-    return result
-
-
-def restore(
-    folder: Path, database: Database, storage: Storage, on_step: StepHook = ignore_step
-) -> dict[str, int]:
-    """Fill an empty installation from a backup; return how many rows, by table.
-
-    Blobs come first and the rows in one transaction, so an interrupted restore can be repeated.
-    """
-    manifest = _manifest(folder)
-    source = Storage(f"file://{(folder / BLOBS).resolve()}")
-    kept = dict(source.listed())
-    damaged = [key for key, size in manifest["blobs"].items() if kept.get(key) != size]
-    if damaged:
-        raise BackupError(f"{len(damaged)} blobs of the backup are missing or cut off: {damaged[0]} first")
-    migrate.upgrade(database)
-    with _readable(folder / manifest["rows_file"]) as rows:
-        transfer.check_schema(rows)
-        with database.reader.connect() as connection:
-            if any(transfer.counts(connection).values()):
-                raise InvalidInputError("the installation is not empty: restore into an empty one")
-        storage.create()
-        stored = dict(storage.listed())
-        _fetch(source, storage, [key for key in sorted(kept) if stored.get(key) != kept[key]], on_step)
-        with transfer.snapshot(rows) as moment:
-            return transfer.copy(moment, database)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[Database]:
-    """Open a copy of the rows: opening a database changes its file, and a backup must not change."""
-    with tempfile.TemporaryDirectory(prefix="lensmodel-") as scratch:
-        copy = Path(shutil.copy(path, scratch))
-        with closing(Database(f"sqlite:///{copy}")) as rows:
-            yield rows
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    try:
-        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        with (folder / manifest["rows_file"]).open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise BackupError(f"{folder} holds no whole backup ({type(error).__name__})") from error
-    if manifest["format"] != FORMAT:
-        raise BackupError(f"the backup has format {manifest['format']}, this program reads {FORMAT}")
-    if digest != manifest["sha256"]:
-        raise BackupError(f"{manifest['rows_file']} is not what was written: use another backup")
-    return manifest
-
-
-def move(
-    source: tuple[Database, Storage], target: tuple[Database, Storage], on_step: StepHook = ignore_step
-) -> dict[str, int]:
-    """Copy a stopped installation to another database and storage; return how many rows, by table."""
-    migrate.upgrade(source[0])
-    migrate.upgrade(target[0])
-    stored = dict(target[1].listed())
-    _fetch(source[1], target[1], _differing(source[1], stored), on_step)
-    with transfer.snapshot(source[0]) as moment:
-        copied = transfer.copy(moment, target[0])
-    with target[0].reader.connect() as connection:
-        if transfer.counts(connection) != {name: n for name, n in copied.items() if name != "worker"}:
-            raise BackupError("rows were lost under way: use the old installation, and report it")
-    return copied
+        on_step(done, len(keys))

@@ -1,6 +1,6 @@
 """Examine an installation, running or not: whether its invariants hold and its blobs are complete.
 
-The tables are examined by `app.store.upkeep.invariants`, the same checks that end the tests with random
+The tables are examined by `app.store.invariants`, the same checks that end the tests with random
 deaths. Here the blobs are compared with the tables.
 """
 
@@ -19,10 +19,10 @@ from app.blobs.storage import Storage
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.access.owners import now
 from app.store.database import insert_new
+from app.store.invariants import INVARIANTS
+from app.store.owners import now
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
-from app.store.upkeep.invariants import INVARIANTS
 
 STILL_COMING: Final = timedelta(minutes=30)
 """Age of a blob without a row before it is deleted (chosen): its row may still be written."""
@@ -98,7 +98,7 @@ def _tables(store: Store, *, repair: bool) -> Iterator[Violation]:
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:
-    waiting = sum(store.operation.load().jobs.values())
+    waiting = sum(store.workers.load().jobs.values())
     if waiting and not store.workers.live(settings.lease_seconds):
         says = f"{waiting} jobs are unfinished and no worker lives"
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")

@@ -1,18 +1,13 @@
 """Metrics of the service, in the text format of Prometheus.
 
-The API measures requests and models, a worker its jobs. A worker has no address of its own unless
-`LENS_METRICS_PORT` gives it one, so it also writes its metrics to a file, and `/metrics` of an API with the
-same data folder serves them with its own. Queues and workers are read from the tables at each request, so
-that any API reports them for all machines. No label holds an id or the name of a person.
+The API measures requests and models under `/metrics`; a worker its jobs, where `LENS_METRICS_ADDRESS` gives
+it an address. Queues and workers are read from the tables at each request, so that any API reports them for
+all machines. No label holds an id or the name of a person.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import time
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Final
 
 from prometheus_client import (
@@ -22,20 +17,14 @@ from prometheus_client import (
     Histogram,
     generate_latest,
     start_http_server,
-    write_to_textfile,
 )
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_1_0_0
-from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
 from app.store import Store
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_1_0_0
-FOLDER: Final = "metrics"
-KEEP_S: Final = 86400.0
-"""How long the metrics of a worker that has ended still count (chosen: a day of restarts; shorter, sums fall
-with each, longer, files pile up)."""
 
 _QUICK: Final = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 _LONG: Final = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0)
@@ -90,7 +79,7 @@ class Tables(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield the present values."""
-        load = self._store.operation.load()
+        load = self._store.workers.load()
         depth = GaugeMetricFamily("lensmodel_queue_jobs", "Unfinished jobs.", labels=("kind", "state"))
         for (kind, state), count in load.jobs.items():
             depth.add_metric((kind, state), count)
@@ -109,55 +98,14 @@ class Tables(Collector):
         yield from (depth, age, workers, garbage, rows)
 
 
-class Written(Collector):
-    """Sums of the metrics that workers have written to files of a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield each family once, with the sums over all files."""
-        families: dict[str, Metric] = {}
-        sums: dict[str, dict[tuple[str, tuple[tuple[str, str], ...]], float]] = {}
-        for family in self._families():
-            families.setdefault(family.name, Metric(family.name, family.documentation, family.type))
-            added = sums.setdefault(family.name, {})
-            for sample in family.samples:
-                if not sample.name.endswith("_created"):  # times of creation cannot be added
-                    key = (sample.name, tuple(sorted(sample.labels.items())))
-                    added[key] = added.get(key, 0.0) + sample.value
-        for name, family in families.items():
-            for (sample_name, labels), value in sums[name].items():
-                family.add_sample(sample_name, dict(labels), value)
-            yield family
-
-    def _families(self) -> Iterable[Metric]:
-        for path in sorted(self._folder.glob("*.prom")):
-            with contextlib.suppress(OSError, ValueError):  # deleted, or half written
-                yield from text_string_to_metric_families(path.read_text(encoding="utf-8"))
-
-
-def of_service(store: Store, lease_s: float, data_dir: Path) -> bytes:
-    """Return the metrics of an API: its own, those of the tables and those of its folder's workers."""
+def of_service(store: Store, lease_s: float) -> bytes:
+    """Return the metrics of an API: its own, and those of the tables."""
     collected = CollectorRegistry()
     collected.register(Tables(store, lease_s))
-    collected.register(Written(data_dir / FOLDER))
     return generate_latest(API) + generate_latest(collected)
 
 
-def leave(data_dir: Path, worker_id: str) -> None:
-    """Write the metrics of this worker where an API finds them; remove those of workers long ended."""
-    folder = data_dir / FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in folder.glob("*.prom*"):
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > KEEP_S:
-                path.unlink()
-    write_to_textfile(os.fspath(folder / f"{worker_id}.prom"), WORKER)
-
-
-def publish(port: int, host: str, data_dir: Path) -> None:
-    """Serve the metrics of the workers of this folder on a port of their own."""
-    collected = CollectorRegistry()
-    collected.register(Written(data_dir / FOLDER))
-    start_http_server(port, addr=host, registry=collected)
+def publish(address: str) -> None:
+    """Serve the metrics of this worker on an address of its own, host:port."""
+    host, _, port = address.rpartition(":")
+    start_http_server(int(port), addr=host, registry=WORKER)

@@ -11,13 +11,15 @@ from typing import Final
 import uvicorn
 
 from app.runtime import logs
-from app.runtime.processes import end_with_parent
+from app.runtime.processes import end_with_parent, on_signals
 from app.runtime.settings import Settings
-from app.runtime.signals import on_signals
 from app.sandbox import confine
 
 SOCKET: Final = "LENSMODEL_SOCKET"
 """Environment variable with the file descriptor of the listening socket."""
+
+MAX_CONNECTIONS: Final = 1000
+"""Connections at once; more get 503 (chosen): fewer than the files that a process may have open."""
 
 GRACE_S: Final = 5
 """How long open requests may take after the order to stop (chosen): less than `supervisor.STOP_S`."""
@@ -35,7 +37,7 @@ def run(settings: Settings, listener: socket.socket) -> None:
         log_config=None,  # its records go to our handlers
         access_log=False,  # the application writes its own, without serials
         timeout_graceful_shutdown=GRACE_S,
-        limit_concurrency=settings.max_connections,
+        limit_concurrency=MAX_CONNECTIONS,
     )
     _Server(config).run(sockets=[listener])
 
@@ -71,3 +73,7 @@ def main() -> None:
     number = os.environ.pop(SOCKET, None)
     listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))
     run(settings, listener)
+
+
+if __name__ == "__main__":
+    main()

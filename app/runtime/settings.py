@@ -1,7 +1,7 @@
 """Settings, read once from the environment (prefix `LENS_`).
 
 Every setting has a default that works on one machine without anything else installed. A second
-machine needs other addresses for the database, the jobs and the storage, and nothing else.
+machine needs other addresses for the database and the storage, and nothing else.
 """
 
 from __future__ import annotations
@@ -38,9 +38,6 @@ class Settings(BaseSettings):
     database_url: str = Field(
         default="", description="SQLAlchemy address; empty = sqlite file in the data folder."
     )
-    jobs_url: str = Field(
-        default="", description="Database of the job engine; empty = sqlite file in the data folder."
-    )
     storage_url: str = Field(
         default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
     )
@@ -48,9 +45,6 @@ class Settings(BaseSettings):
         default=20.0, gt=0, description="Longest that one request to an object store may take."
     )
     shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
-    sqlite_synchronous: Literal["NORMAL", "FULL"] = Field(
-        default="NORMAL", description="FULL survives power loss too."
-    )
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
@@ -61,25 +55,14 @@ class Settings(BaseSettings):
             "keys where others can reach it, or once there is a key."
         ),
     )
-    public: bool = Field(
-        default=False, description="Others can reach it, also where it listens on loopback: behind a proxy."
-    )
-    session_hours: float = Field(
-        default=12.0, gt=0, description="How long a browser that has signed in stays so."
-    )
     requests_per_minute: int = Field(
         default=6000, ge=0, description="Requests of one owner with keys in one API process; 0 = any number."
     )
 
     allowed_hosts: str = Field(
         default="",
-        description="Names that the service answers to, besides addresses and local ones; by commas.",
+        description="Names by which others reach it, by commas: behind a proxy, or in a network.",
     )
-    upload_seconds: float = Field(
-        default=3600.0, gt=0, description="Longest that a photo may be on its way to us."
-    )
-    max_connections: int = Field(default=1000, ge=1, description="Connections at once; more get 503.")
-    max_uploads: int = Field(default=8, ge=1, description="Photos that are received at once.")
 
     max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
     max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
@@ -89,7 +72,6 @@ class Settings(BaseSettings):
     max_stored_gb: float = Field(
         default=200.0, gt=0, description="Bytes of photos and results of one owner, in GiB."
     )
-    max_photos: int = Field(default=100_000, ge=1, description="Photos of one owner.")
     keep_photos: Literal["never", "corrections", "always"] = Field(
         default="always",
         description=(
@@ -133,34 +115,24 @@ class Settings(BaseSettings):
     lease_seconds: float = Field(
         default=20.0, gt=0, description="A worker silent for so long is taken for dead."
     )
-    sweep_seconds: float = Field(
-        default=0.5, gt=0, description="How often a worker looks for new work in the tables."
-    )
     outage_hours: float = Field(
         default=12.0,
         ge=0,
         description="How long a job waits for a database, a storage or a disk before it fails.",
     )
-    inspect_seconds: float = Field(
-        default=20.0, gt=0, description="Longest that reading the header of a photo may take."
-    )
-    develop_seconds: float = Field(
-        default=180.0, gt=0, description="Longest that developing a photo may take."
-    )
-    patch_seconds: float = Field(
-        default=600.0, gt=0, description="Longest that estimating one patch may take."
-    )
-    correct_seconds: float = Field(
-        default=3600.0, gt=0, description="Longest that correcting a photo may take."
-    )
 
+    task_seconds: float = Field(
+        default=3600.0,
+        gt=0,
+        description="Longest that correcting a photo may take; reading its header a 180th of it, developing "
+        "a 20th, estimating in one cell a 6th.",
+    )
     patches: int = Field(
         default=0,
         ge=0,
         le=1000,
         description="Patches that are used of one photo; 0: as the model of its lens.",
     )
-    min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
     kernel_size: int = Field(
         default=55, ge=3, le=55, description="Largest side of the estimated kernels in pixels, odd."
     )
@@ -176,20 +148,15 @@ class Settings(BaseSettings):
     model_cache_mb: int = Field(
         default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
     )
-    long_poll_seconds: float = Field(
-        default=20.0, ge=0, le=60, description="Longest that a question for a job waits for a change of it."
+    metrics_address: str = Field(
+        default="",
+        description="Where a worker has /metrics of its own, as 127.0.0.1:9000; empty: nowhere.",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least that is logged."
     )
     log_format: Literal["text", "json"] = Field(
         default="text", description="Lines for people, or one JSON object a line for collectors."
-    )
-    metrics_port: int = Field(
-        default=0, ge=0, le=65535, description="Port of a worker's own /metrics; 0 = none, the API has them."
-    )
-    metrics_host: str = Field(
-        default="127.0.0.1", description="Address of that port: it asks nobody for a key."
     )
 
     @model_validator(mode="before")
@@ -245,32 +212,22 @@ class Settings(BaseSettings):
                 "a database server means several machines, but storage_url is a folder of one: "
                 "use s3://..., or set LENS_SHARED_FILESYSTEM=true where all machines see that folder"
             )
-        if many and not self.jobs_url:
-            raise ValueError(
-                "a database server means several machines, but the jobs would be in a file of each: "
-                "set LENS_JOBS_URL to a database of that server"
-            )
         return self
 
     @model_validator(mode="after")
     def _open_only_on_loopback(self) -> Settings:
         if self.auth == "none" and self.is_open_to_others:
             raise ValueError(
-                f"others can reach it (host {self.host}, LENS_PUBLIC={str(self.public).lower()}) and "
+                f"others can reach it (host {self.host}, LENS_ALLOWED_HOSTS={self.allowed_hosts}) and "
                 "LENS_AUTH=none lets everybody in: leave LENS_AUTH out and make keys by `lensmodel keys "
-                "create`, or listen on 127.0.0.1 without LENS_PUBLIC"
-            )
-        if self.public and not self.hosts:
-            raise ValueError(
-                "LENS_PUBLIC=true needs LENS_ALLOWED_HOSTS: the names under which browsers reach it, "
-                "such as lens.example.org, or localhost where there are none"
+                "create`, or listen on 127.0.0.1 without LENS_ALLOWED_HOSTS"
             )
         return self
 
     @property
     def is_open_to_others(self) -> bool:
         """Whether more than this machine can reach it."""
-        return self.public or self.host not in LOOPBACK
+        return bool(self.hosts) or self.host not in LOOPBACK
 
     @property
     def needs_keys(self) -> bool:
@@ -284,7 +241,7 @@ class Settings(BaseSettings):
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Names that the service answers to, besides addresses and local ones."""
+        """Names by which others reach it, besides addresses and local ones."""
         return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
 
     @property
@@ -294,8 +251,9 @@ class Settings(BaseSettings):
 
     @property
     def jobs(self) -> str:
-        """Address of the job engine's own tables."""
-        return self.jobs_url or f"sqlite:///{self.data_dir.resolve() / 'jobs.db'}"
+        """Address of the job engine's own tables: on a server it has a schema of its own."""
+        file = f"sqlite:///{self.data_dir.resolve() / 'jobs.db'}"
+        return file if self.database.startswith("sqlite") else self.database
 
     @property
     def storage(self) -> str:
@@ -303,6 +261,34 @@ class Settings(BaseSettings):
         return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
 
     @property
+    def inspect_seconds(self) -> float:
+        """Longest that reading the header of a photo may take."""
+        return self.task_seconds / 180
+
+    @property
+    def develop_seconds(self) -> float:
+        """Longest that developing a photo may take, or reading a profile."""
+        return self.task_seconds / 20
+
+    @property
+    def patch_seconds(self) -> float:
+        """Longest that estimating in one cell may take."""
+        return self.task_seconds / 6
+
+    @property
     def max_upload_bytes(self) -> int:
         """Largest photo file in bytes."""
         return self.max_upload_mb * MIB
+
+
+def table() -> str:
+    """Return all settings as the table of docs/service.md: `python -m app.runtime.settings` prints it."""
+    rows = ["| setting | default | |", "|---|---|---|"]
+    for name, field in Settings.model_fields.items():
+        default = "cores of the machine" if field.default_factory else str(field.default).lower() or "none"
+        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {field.description} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())  # noqa: T201 - this is its answer

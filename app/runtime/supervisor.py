@@ -25,13 +25,12 @@ from pathlib import Path
 from typing import Final
 
 from app.runtime import server
-from app.runtime.processes import PARENT
+from app.runtime.processes import PARENT, on_signals
 from app.runtime.settings import PREFIX, Settings
-from app.runtime.signals import on_signals
 from app.sandbox import confine
-from app.store.access.keys import KeyStore
+from app.store import migrate
 from app.store.database import Database
-from app.store.upkeep import migrate
+from app.store.keys import KeyStore
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
@@ -47,7 +46,7 @@ READY_POLL_S: Final = 0.25
 STOP_S: Final = 15.0
 """How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""
 
-WORKER, API = "app.runtime.worker_main", "app.runtime.api_main"
+WORKER, API = "app.runtime.worker_main", "app.runtime.server"
 """Modules of the members; tests replace the worker."""
 
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -95,9 +94,9 @@ def _prepare(settings: Settings) -> None:
     if usable:
         return
     raise UsageError(
-        f"the service asks for keys (LENS_HOST={settings.host}, LENS_PUBLIC={str(settings.public).lower()}, "
+        f"the service asks for keys (LENS_HOST={settings.host}, LENS_ALLOWED_HOSTS={settings.allowed_hosts}, "
         f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
-        "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_PUBLIC"
+        "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_ALLOWED_HOSTS"
     )
 
 

@@ -12,9 +12,8 @@ from typing import Any
 from sqlalchemy import Select, func, select, update
 
 from app.errors import BusyError, ConflictError, UnknownPhotoError
-from app.store.access.owners import ANY_OWNER, LATE, Owner, find_owned, find_to_change, is_id, now, owned
-from app.store.database import Database, insert_new
-from app.store.ids import new_id
+from app.store.database import Database, insert_new, new_id
+from app.store.owners import ANY_OWNER, LATE, Owner, find_owned, find_to_change, is_id, now, owned
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 ACTIVE = ("queued", "running")

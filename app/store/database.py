@@ -8,11 +8,14 @@ consistent snapshot (WAL) and cannot write at all.
 
 from __future__ import annotations
 
+import secrets
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
+from uuid import UUID
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
@@ -42,19 +45,18 @@ class Database:
     ----------
     url : str
         SQLAlchemy address; sqlite or postgresql.
-    synchronous : {"NORMAL", "FULL"}
-        SQLite only. NORMAL never corrupts but can lose the last commits when the power fails.
     """
 
-    def __init__(self, url: str, *, synchronous: str = "NORMAL") -> None:
+    def __init__(self, url: str) -> None:
         self.url = make_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.path = Path(self.url.database or "")
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = _sqlite(url, "BEGIN IMMEDIATE", synchronous)
+            # NORMAL never corrupts, but can lose the last commits when the power fails
+            self.writer = _sqlite(url, "BEGIN IMMEDIATE", "NORMAL")
             self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
-            self.reader = _sqlite(url, "BEGIN", synchronous, read_only=True)
+            self.reader = _sqlite(url, "BEGIN", "NORMAL", read_only=True)
         else:
             self.writer = self.durable = create_engine(
                 url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
@@ -125,3 +127,16 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
     for row in rows:  # values given here, not in the statement, which else is made anew for each row
         inserted += len(connection.execute(statement, row).all())
     return inserted
+
+
+def new_id() -> str:
+    """Return a UUID of version 7 (RFC 9562, section 5.7) as 32 hexadecimal digits.
+
+    48 bits of milliseconds followed by 74 random bits: ids made later sort later, so lists
+    in the order of ids are lists in the order of time.
+    """
+    millis = time.time_ns() // 1_000_000
+    value = (millis & (1 << 48) - 1) << 80 | secrets.randbits(80)
+    value = value & ~(0xF << 76) | 7 << 76
+    value = value & ~(0b11 << 62) | 0b10 << 62
+    return UUID(int=value).hex

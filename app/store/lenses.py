@@ -1,29 +1,44 @@
-"""Lenses: which copy it is, what was learned of it, and when."""
+"""Lenses: which copy it is, what was learned of it, and its version, which grows when its samples change.
+
+The version grows under the lens's row lock, so that versions and the samples that belong to them become
+visible in the same order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from datetime import timedelta
+from typing import Any, Final, Literal
 
-from sqlalchemy import and_, delete, func, or_, select, update
+from sqlalchemy import and_, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import BusyError
-from app.store.access.owners import ANY_OWNER, LATE, Owner, find_owned, now, owned
-from app.store.database import Database, insert_new
-from app.store.ids import new_id
-from app.store.kinds import identity_key
-from app.store.tables import PHOTO_RUNNING, CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
-
-TEACHES: Final = and_(
-    or_(PhotoRow.state == "counted", PhotoRow.relearning.is_(True)), PhotoRow.deleted_at.is_(None)
+from app.store.database import Database, insert_new, new_id
+from app.store.owners import ANY_OWNER, LATE, Owner, ensure_owner, find_owned, find_to_change, now, owned
+from app.store.tables import (
+    PHOTO_RUNNING,
+    CorrectionRow,
+    EventRow,
+    GarbageRow,
+    LensRow,
+    PatchRow,
+    PhotoRow,
+    SampleRow,
 )
-"""Photos that count, including those that are being estimated anew."""
+from lensmodel.core.names import name_key, serial_key
+
+TEACHES: Final = and_(PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
+LEARNING: Final = ("received", *PHOTO_RUNNING)
+NO_RESULT: Final = ("failed", "cancelled")
 
 TRIES: Final = 10
 """How often to look again for a lens that was deleted between insert and select (chosen): each
 time its last photo must have been deleted in between."""
+
+STILL_WRITTEN: Final = timedelta(minutes=30)
+"""How long the previous version is kept (chosen): a worker may still be reporting of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,107 +52,9 @@ class LensName:
     label: str | None = None
 
 
-def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:
-    """Return the lens of an inspected photo; a photo that calibrates creates it where there is none."""
-    lens_id = photo.given.get("lens_id")
-    if lens_id is not None:
-        chosen = session.scalar(
-            select(LensRow).where(
-                LensRow.public_id == lens_id, LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None)
-            )
-        )
-        if chosen is not None:
-            return chosen
-    if photo.lens_serial is None and not (single_copy and photo.lens_model):
-        return None
-    key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
-    fresh = _new_lens(
-        photo.owner_id,
-        key,
-        maker=photo.lens_maker,
-        model=photo.lens_model,
-        serial=photo.lens_serial,
-        source=photo.lens_serial_source or "none",
-        way=photo.given.get("model"),
-    )
-    for _ in range(TRIES):
-        if photo.calibrate:
-            insert_new(session, LensRow, [fresh])
-        # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
-        lens = session.scalar(
-            select(LensRow)
-            .where(
-                LensRow.owner_id == photo.owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
-            )
-            .with_for_update()
-        )
-        if lens is not None or not photo.calibrate:
-            return lens
-    return None
-
-
-def _new_lens(
-    owner_id: int,
-    key: str,
-    *,
-    maker: str | None,
-    model: str | None,
-    serial: str | None,
-    source: str,
-    way: str | None,
-) -> dict[str, Any]:
-    return {
-        "public_id": new_id(),
-        "owner_id": owner_id,
-        "identity_key": key,
-        "maker": maker,
-        "model": model,
-        "serial": serial,
-        "serial_source": source if serial else "none",
-        "way": way or "default",
-        "answering_way": way or "default",
-        "created_at": now(),
-        "version": 0,
-        "rebuild_epoch": 0,
-        "photo_count": 0,
-        "sample_count": 0,
-    }
-
-
-def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
-    """Return the lens of a serial, creating it if need be; a label always creates a new lens.
-
-    `way` is how a new lens is learned.
-    """
-    key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
-    fresh = _new_lens(
-        owner_id,
-        key,
-        maker=name.maker,
-        model=name.model,
-        serial=name.serial,
-        source=name.serial_source,
-        way=way,
-    )
-    if name.label:
-        fresh |= {"label": name.label, "serial_source": "user"}
-    same = select(LensRow).where(
-        LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
-    )
-    for _ in range(TRIES):
-        insert_new(session, LensRow, [fresh])
-        lens = session.scalar(same.with_for_update())
-        if lens is not None:
-            return lens
-    raise BusyError(f"{TRIES} times the lens was forgotten just then: name it again")
-
-
-def delete_corrections(session: Session, photo: PhotoRow) -> None:
-    """Remove a photo's corrections; their blobs become garbage."""
-    keys = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id == photo.id))
-    rows = [{"prefix": f"corrections/{key}/", "not_before": now() + LATE} for key in keys]
-    insert_new(session, GarbageRow, rows)
-    session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
+def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
+    """Return the key by which two photos are known to show the same copy."""
+    return f"{name_key(maker)}|{name_key(model)}|{serial_key(serial)}"
 
 
 class LensStore:
@@ -222,13 +139,6 @@ class LensStore:
                 focals[key] |= set() if focal is None else {focal}
         return {key: (sorted(apertures[key]), sorted(focals[key])) for key in keys}
 
-    def learned_anew(self, lens: LensRow) -> int:
-        """Return how many photos of a lens that changes its way are still being estimated anew."""
-        anew = (PhotoRow.relearning.is_(True), PhotoRow.state.in_(("received", *PHOTO_RUNNING)))
-        query = select(func.count()).where(PhotoRow.lens_id == lens.id, *anew, PhotoRow.deleted_at.is_(None))
-        with self._db.reading() as session:
-            return session.scalar(query) or 0
-
     def lateral_of(self, lens: LensRow) -> list[dict[str, Any]]:
         """Return the lateral colour of each counted photo of a lens that shows it."""
         query = select(PhotoRow.lateral).where(PhotoRow.lens_id == lens.id, TEACHES)
@@ -240,12 +150,8 @@ class LensStore:
         count = func.count()
         query = (
             select(PhotoRow.height, PhotoRow.width)
-            .where(
-                PhotoRow.lens_id == lens.id,
-                TEACHES,
-                PhotoRow.width.is_not(None),
-                PhotoRow.height.is_not(None),
-            )
+            .where(PhotoRow.lens_id == lens.id, TEACHES)
+            .where(PhotoRow.width.is_not(None), PhotoRow.height.is_not(None))
             .group_by(PhotoRow.height, PhotoRow.width)
             .order_by(count.desc(), PhotoRow.width.desc())
             .limit(1)
@@ -266,27 +172,16 @@ class LensStore:
             return list(session.scalars(query))
 
     def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
-        """Store the metrics of one version, once: held-out `error`, `coverage`, `bandwidth`."""
+        """Store the metrics of one version, once: held-out `error` and `coverage`."""
         with self._db.writing() as session:
             lens = find_owned(session, LensRow, lens_id, ANY_OWNER)
             if lens is not None:
                 session.execute(
                     update(EventRow)
-                    .where(
-                        EventRow.lens_id == lens.id, EventRow.version == version, EventRow.metrics.is_(None)
-                    )
+                    .where(EventRow.lens_id == lens.id, EventRow.version == version)
+                    .where(EventRow.metrics.is_(None))
                     .values(metrics=metrics)
                 )
-
-    def measured(self) -> list[tuple[str, int, int]]:
-        """Return `(lens_id, version, rebuild_epoch)` of the newest versions that were measured."""
-        query = (
-            select(LensRow.public_id, LensRow.version, LensRow.rebuild_epoch)
-            .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
-            .where(EventRow.metrics.is_not(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
-        )
-        with self._db.reading() as session:
-            return [(row[0], row[1], row[2]) for row in session.execute(query)]
 
     def unmeasured(self, limit: int = 10) -> list[tuple[str, int]]:
         """Return `(lens_id, version)` of the newest versions that were not measured yet."""
@@ -298,3 +193,323 @@ class LensStore:
         )
         with self._db.reading() as session:
             return [(row[0], row[1]) for row in session.execute(query)]
+
+    def create(self, owner: str, label: str) -> str:
+        """Create a lens of that name; return its id."""
+        with self._db.writing() as session:
+            name = LensName(None, None, None, label=label)
+            return named(session, ensure_owner(session, owner), name).public_id
+
+    def rename(self, lens_id: str, owner: str, label: str | None) -> bool:
+        """Set or remove the name that an owner gives a lens; False if there is no such lens."""
+        with self._db.writing() as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            if lens is None:
+                return False
+            lens.label = label
+            return True
+
+    def merge(self, lens_id: str, into: str, owner: str) -> bool:
+        """Give all photos of a lens to another one and forget it: they were one copy all along.
+
+        False if one of the two does not exist, photos of the first are still being learned from, or the two
+        have different models.
+        """
+        with self._db.writing() as session:
+            # always locked in the same order: two merges at once must not wait for each other
+            rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
+            lens, target = rows[lens_id], rows[into]
+            if lens is None or target is None or lens.id == target.id or lens.way != target.way:
+                return False
+            query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+            photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
+            if any(photo.state in LEARNING for photo in photos):
+                return False
+            for photo in photos:
+                move_photo(session, photo, target)
+            target.complete(lens.maker, lens.model)
+            session.flush()
+            _forget(session, lens)
+            return True
+
+    def go_back(self, lens_id: str, owner: str, version: int) -> int | None:
+        """Exclude the photos that joined a lens after a version; return how many, None without a lens.
+
+        They stay, and can be included again one by one.
+        """
+        with self._db.writing() as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            if lens is None:
+                return None
+            events = select(EventRow).where(EventRow.lens_id == lens.id).order_by(EventRow.version)
+            joined: dict[str, int] = {}
+            for event in session.scalars(events):
+                if event.photo_public_id is not None and event.kind in {"photo_added", "photo_included"}:
+                    joined[event.photo_public_id] = event.version
+            later = [key for key, at in joined.items() if at > version]
+            photos = session.scalars(
+                select(PhotoRow).where(PhotoRow.public_id.in_(later), PhotoRow.lens_id == lens.id)
+            )
+            return sum(switch(session, photo, "excluded") for photo in photos)
+
+    def delete(self, lens_id: str, owner: Owner) -> bool:
+        """Delete a lens with all that was learned of it; its photos stay and can be corrected with another.
+
+        Work on photos that would teach it is cancelled. False if there is no such lens.
+        """
+        with self._db.writing() as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            if lens is None:
+                return False
+            taught = select(PhotoRow).where(PhotoRow.lens_id == lens.id).with_for_update()
+            for photo in session.scalars(taught):
+                _unlearn(session, photo)
+            session.execute(
+                update(CorrectionRow)
+                .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(("queued", "running")))
+                .values(state="cancelled", finished_at=now())
+            )
+            session.flush()
+            _forget(session, lens)
+            return True
+
+
+# --- identity -------------------------------------------------------------------------------------
+
+
+def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:
+    """Return the lens of an inspected photo; a photo that calibrates creates it where there is none."""
+    lens_id = photo.given.get("lens_id")
+    if lens_id is not None:
+        of_owner = (LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
+        chosen = session.scalar(select(LensRow).where(LensRow.public_id == lens_id, *of_owner))
+        if chosen is not None:
+            return chosen
+    if photo.lens_serial is None and not (single_copy and photo.lens_model):
+        return None
+    name = LensName(photo.lens_maker, photo.lens_model, photo.lens_serial, photo.lens_serial_source or "none")
+    way = photo.given.get("model")
+    return _found(session, photo.owner_id, name, way=way, creates=photo.calibrate)
+
+
+def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
+    """Return the lens of a serial, creating it if need be; a label always creates a new lens.
+
+    `way` is how a new lens is learned.
+    """
+    lens = _found(session, owner_id, name, way=way, creates=True)
+    if lens is None:
+        raise BusyError(f"{TRIES} times the lens was forgotten just then: name it again")
+    return lens
+
+
+def _found(
+    session: Session, owner_id: int, name: LensName, *, way: str | None, creates: bool
+) -> LensRow | None:
+    key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
+    fresh = {
+        "public_id": new_id(),
+        "owner_id": owner_id,
+        "identity_key": key,
+        "maker": name.maker,
+        "model": name.model,
+        "serial": name.serial,
+        "serial_source": "user" if name.label else name.serial_source if name.serial else "none",
+        "label": name.label,
+        "way": way or "default",
+        "created_at": now(),
+        **dict.fromkeys(("version", "rebuild_epoch", "photo_count", "sample_count"), 0),
+    }
+    same = (LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None))
+    for _ in range(TRIES):
+        if creates:
+            insert_new(session, LensRow, [fresh])
+        # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
+        lens = session.scalar(select(LensRow).where(*same).with_for_update())
+        if lens is not None or not creates:
+            return lens
+    return None
+
+
+# --- samples and versions -------------------------------------------------------------------------
+
+
+def join(session: Session, photo: PhotoRow, kind: str) -> int:
+    """Let the samples of a counted photo join its lens; return the new version of the lens."""
+    assert photo.lens_id is not None
+    version = new_version(session, photo.lens_id, rebuild=kind != "photo_added")
+    added = _set_samples(session, photo, lens_id=photo.lens_id, version_added=version)
+    record_event(session, photo.lens_id, version, kind, photo, samples_added=added)
+    return version
+
+
+def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
+    """Take the samples of a photo out of its lens, which gets a new version that must be fitted anew."""
+    assert photo.lens_id is not None
+    version = new_version(session, photo.lens_id, rebuild=True)
+    dropped = _set_samples(session, photo, lens_id=None, version_added=None)
+    record_event(session, photo.lens_id, version, kind, photo, samples_added=-dropped)
+
+
+def switch(session: Session, photo: PhotoRow, after: Literal["counted", "excluded"]) -> bool:
+    """Exclude a counted photo from its lens's model, or include it again; False if it is in another state."""
+    if photo.state != ("counted" if after == "excluded" else "excluded"):
+        return False
+    photo.state, photo.stage_at = after, now()
+    session.flush()
+    if after == "excluded":
+        give_back(session, photo, "photo_excluded")
+    else:
+        join(session, photo, "photo_included")
+    return True
+
+
+def may_move(photo: PhotoRow, lens: LensRow) -> bool:
+    """Whether a photo can be given to a lens: its samples mean nothing to a lens of another model."""
+    return photo.state not in {"counted", "excluded"} or photo.way == lens.way
+
+
+def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
+    """Give a finished photo that `may_move` to another lens; both get a new version if it counts."""
+    if photo.lens_id == lens.id:
+        return
+    if photo.state == "counted":
+        give_back(session, photo, "photo_removed")
+    photo.lens_id = lens.id
+    photo.given = {**photo.given, "lens_id": lens.public_id}
+    session.flush()
+    if photo.state == "counted":
+        join(session, photo, "photo_included")
+
+
+def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
+    """Raise the version by one and return it.
+
+    The UPDATE locks the lens's row until the transaction ends. `rebuild` says that samples went away or
+    changed: models in memory must be fitted anew instead of extended.
+    """
+    raised = 1 if rebuild else 0
+    version, epoch, public_id = session.execute(
+        update(LensRow)
+        .where(LensRow.id == lens_id)
+        .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + raised)
+        .returning(LensRow.version, LensRow.rebuild_epoch, LensRow.public_id)
+    ).one()
+    if version > 1:  # before the first there was nothing to report
+        outdated = _reports_prefix(public_id, version - 1, epoch - raised)
+        insert_new(session, GarbageRow, [{"prefix": outdated, "not_before": now() + STILL_WRITTEN}])
+    return int(version)
+
+
+def _reports_prefix(lens_id: str, version: int, epoch: int) -> str:
+    return f"models/{lens_id}/{version}-{epoch}/"
+
+
+def report_key(lens_id: str, version: int, epoch: int) -> str:
+    """Return the key of the report that a worker makes of one version of a lens."""
+    return f"{_reports_prefix(lens_id, version, epoch)}report.json"
+
+
+def _set_samples(session: Session, photo: PhotoRow, **columns: int | None) -> int:
+    """Let the samples of a photo belong to its lens, or to none; return how many."""
+    assert photo.lens_id is not None
+    statement = update(SampleRow).where(SampleRow.photo_id == photo.id).values(**columns)
+    changed = session.connection().execute(statement).rowcount
+    recount_samples(session, photo.lens_id)
+    return changed
+
+
+def recount_samples(session: Session, lens_id: int) -> None:
+    """Count the samples and photos of a lens anew: recomputed, never incremented."""
+    samples, photos = session.execute(
+        select(func.count(), func.count(SampleRow.photo_id.distinct())).where(SampleRow.lens_id == lens_id)
+    ).one()
+    session.execute(
+        update(LensRow).where(LensRow.id == lens_id).values(sample_count=samples, photo_count=photos)
+    )
+
+
+def record_event(
+    session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow, *, samples_added: int
+) -> None:
+    """Write one line of the lens's history."""
+    samples, photos = session.execute(
+        select(LensRow.sample_count, LensRow.photo_count).where(LensRow.id == lens_id)
+    ).one()
+    session.add(
+        EventRow(
+            lens_id=lens_id,
+            version=version,
+            kind=kind,
+            photo_public_id=photo.public_id,
+            epoch=photo.epoch,
+            samples_added=samples_added,
+            samples=samples,
+            photos=photos,
+            created_at=now(),
+        )
+    )
+
+
+# --- deletion -------------------------------------------------------------------------------------
+
+
+def forget_if_empty(session: Session, photo: PhotoRow) -> None:
+    """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it.
+
+    A lens that the owner named stays as long as there is any photo of it, even a failed one.
+    """
+    if photo.lens_id is None:
+        return
+    lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
+    session.flush()
+    others = select(PhotoRow.id).where(
+        PhotoRow.lens_id == photo.lens_id, PhotoRow.deleted_at.is_(None), PhotoRow.id != photo.id
+    )
+    named_by_owner = lens is not None and (lens.label is not None or lens.serial_source == "user")
+    if not named_by_owner:
+        others = others.where(PhotoRow.state.not_in(NO_RESULT))
+    keeps = named_by_owner and photo.deleted_at is None
+    if lens is None or lens.deleted_at is not None or keeps or session.scalar(others.limit(1)) is not None:
+        return
+    session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
+    photo.lens_id = None
+    session.flush()
+    _forget(session, lens)
+
+
+def _unlearn(session: Session, photo: PhotoRow) -> None:
+    if photo.state in LEARNING:
+        photo.state, photo.finished_at = "cancelled", now()
+    elif photo.state in {"counted", "excluded"}:
+        photo.state, photo.calibrate = "stored", False
+    photo.stage_at = now()
+    photo.lens_id, photo.counted_at = None, None
+    photo.given = {name: value for name, value in photo.given.items() if name != "lens_id"}
+    photo.patches_total = photo.patches_done = photo.patches_rejected = 0
+    photo.windows, photo.windows_rejected = None, 0
+    session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
+    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+
+
+def _forget(session: Session, lens: LensRow) -> None:
+    """Empty the row of a lens that no photo belongs to any more; its reports become garbage.
+
+    The row stays because finished corrections refer to it.
+    """
+    session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
+    lens.serial = lens.label = None
+    lens.serial_source = "none"
+    lens.identity_key = f"deleted|{lens.public_id}"
+    lens.photo_count = lens.sample_count = 0
+    lens.deleted_at = now()
+    models = f"models/{lens.public_id}/"
+    insert_new(session, GarbageRow, [{"prefix": models, "not_before": now() + STILL_WRITTEN}])
+
+
+def delete_corrections(session: Session, photo: PhotoRow) -> None:
+    """Remove a photo's corrections; their blobs become garbage."""
+    keys = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id == photo.id))
+    rows = [{"prefix": f"corrections/{key}/", "not_before": now() + LATE} for key in keys]
+    insert_new(session, GarbageRow, rows)
+    session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))

@@ -7,7 +7,7 @@ updates give every effect exactly once, however often a step is repeated.
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any, ClassVar, Final, get_args
 
 from sqlalchemy import (
@@ -15,12 +15,15 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     DateTime,
+    Dialect,
     ForeignKey,
     Index,
+    Integer,
     LargeBinary,
     MetaData,
     String,
     Text,
+    TypeDecorator,
     UniqueConstraint,
     false,
     text,
@@ -28,7 +31,6 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from app.schemas import CorrectionState, PhotoState
-from app.store.columns import BigKey, UtcTime
 
 PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
@@ -39,14 +41,33 @@ PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
 PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
 CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
-EVENT_KINDS: Final = (
-    *("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed"),
-    "model_changed",
-)
+EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
 
 
 def _one_of(column: str, values: tuple[str, ...]) -> str:
     return f"{column} IN ({', '.join(repr(value) for value in values)})"
+
+
+class UtcTime(TypeDecorator[datetime]):
+    """Points in time: aware in Python, UTC in the table, also where SQL knows no zones."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Bring to UTC; naive times are a programming error."""
+        del dialect
+        if value is not None and value.tzinfo is None:
+            raise ValueError(f"time without a zone: {value}")
+        return None if value is None else value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Give back with the zone that SQLite forgets."""
+        del dialect
+        return value.replace(tzinfo=UTC) if value is not None and value.tzinfo is None else value
+
+
+BigKey = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts rows only in INTEGER keys
 
 
 class Base(DeclarativeBase):
@@ -107,10 +128,7 @@ class LensRow(Base):
     identity_key: Mapped[str]
     label: Mapped[str | None]
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """How its photos are learned from, a value of `PsfModel`; `model` is what its maker calls it."""
-
-    answering_way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """The way of the samples that count; differs from `way` until its photos are estimated anew."""
+    """How its photos are learned from, fixed when it is founded: a value of `PsfModel`."""
 
     version: Mapped[int] = mapped_column(default=0)
     rebuild_epoch: Mapped[int] = mapped_column(default=0)
@@ -154,7 +172,7 @@ class PhotoRow(Base):
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
     given: Mapped[dict[str, Any]]
-    """What the owner said about the photo; goes before what the file says, except `photo_steps.FALLBACKS`."""
+    """What the owner said about the photo; goes before what the file says, except `photos.FALLBACKS`."""
 
     width: Mapped[int | None]
     height: Mapped[int | None]
@@ -171,7 +189,7 @@ class PhotoRow(Base):
     aperture: Mapped[float | None]
     focal_mm: Mapped[float | None]
     focus_m: Mapped[float | None]
-    """As `app.schemas.distances` writes it."""
+    """As `app.distances` writes it."""
 
     pixel_pitch_um: Mapped[float | None]
     iso: Mapped[float | None]
@@ -186,9 +204,6 @@ class PhotoRow(Base):
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
     """The way of its lens when this epoch began."""
 
-    relearning: Mapped[bool] = mapped_column(default=False, server_default=false())
-    """Its samples of an earlier epoch count until all photos of its lens are estimated in another way."""
-
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     error_code: Mapped[str | None] = mapped_column(String(40))
@@ -200,7 +215,7 @@ class PhotoRow(Base):
     """How many windows were rejected before anything was estimated in them."""
 
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
-    """Those windows, as `app.store.windows` writes them: thousands, never queried one by one."""
+    """Those windows, as `app.store.samples` writes them: thousands, never queried one by one."""
 
     received_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
@@ -304,12 +319,11 @@ class EventRow(Base):
     lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id"))
     version: Mapped[int]
     kind: Mapped[str] = mapped_column(String(20))
-    photo_public_id: Mapped[str | None] = mapped_column(String(40))
+    photo_public_id: Mapped[str] = mapped_column(String(40))
     epoch: Mapped[int]
     samples_added: Mapped[int]
     samples: Mapped[int]
     photos: Mapped[int]
-    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
     metrics: Mapped[dict[str, Any] | None]
     created_at: Mapped[datetime]
 
@@ -392,3 +406,35 @@ class GarbageRow(Base):
     not_before: Mapped[datetime]
     claimed: Mapped[bool] = mapped_column(default=False, server_default=false())
     """Whether a worker has begun to delete them: from then on no upload may keep them."""
+
+
+class KeyRow(Base):
+    """One key of an owner; only its hash is stored."""
+
+    __tablename__ = "api_key"
+    __table_args__ = (Index("ix_api_key_owner_id", "owner_id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
+    prefix: Mapped[str] = mapped_column(String(20), unique=True)
+    key_hash: Mapped[str] = mapped_column(String(200), unique=True)
+    label: Mapped[str | None]
+    scopes: Mapped[str] = mapped_column(String(60))
+    """Words of `app.access.keys.SCOPES`, separated by spaces."""
+
+    created_at: Mapped[datetime]
+    last_used_at: Mapped[datetime | None]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+
+
+class SessionRow(Base):
+    """One browser that has signed in with a key; it ends with the key."""
+
+    __tablename__ = "session"
+    __table_args__ = (Index("ix_session_key_id", "key_id"),)
+
+    token_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    key_id: Mapped[int] = mapped_column(ForeignKey("api_key.id", ondelete="CASCADE"))
+    created_at: Mapped[datetime]
+    expires_at: Mapped[datetime]

@@ -78,13 +78,8 @@ class Commands(OnDemand):
             "app.commands.upkeep:backup",
             "Copy all rows and blobs of an installation into a folder, even while it runs.",
         ),
-        "restore": CommandEntry("app.commands.upkeep:restore", "Fill an empty installation from a backup."),
-        "migrate": CommandEntry(
-            "app.commands.upkeep:migrate",
-            "Move a stopped installation to another database, and to another storage.",
-        ),
         "demo": CommandEntry(
-            "app.commands.demonstration:demo",
+            "lab.demo.command:demo",
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
         ),
         "reproduce": CommandEntry(

@@ -24,11 +24,10 @@ from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
 from app.sandbox.outcome import Outcome
 from app.store import LensName, NewPatch, NewSample, Store, database
-from app.store.access.owners import ANY_OWNER
-from app.store.database import Database
-from app.store.ids import new_id
+from app.store.database import Database, new_id
+from app.store.migrate import downgrade, upgrade
+from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
-from app.store.upkeep.migrate import downgrade, upgrade
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
@@ -75,9 +74,9 @@ class Steps:
         self.store.photos.set_state(photo.public_id, ("received",), "inspecting")
         self.store.photos.record_inspection(
             photo.public_id,
+            LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none"),
             width=6000,
             height=4000,
-            identity=LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none"),
             aperture=aperture,
             focal_mm=24.0,
             focus_m=None,
@@ -141,9 +140,7 @@ def usual_settings() -> Settings:
     """Read and check the environment once: for each test anew it takes as long as a small test."""
     return Settings(
         database_url=SERVER,
-        jobs_url="sqlite:///jobs.db",
         shared_filesystem=True,
-        long_poll_seconds=2.0,
         min_free_mb=0,
         task_user="none",  # trying others out takes a process for each folder
         task_niceness=0,  # tests wait for photos too: beside other programs they would starve
@@ -155,7 +152,7 @@ def usual_settings() -> Settings:
 @pytest.fixture
 def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
     data = tmp_path / "data"
-    return usual_settings.model_copy(update={"data_dir": data, "jobs_url": f"sqlite:///{data / 'jobs.db'}"})
+    return usual_settings.model_copy(update={"data_dir": data})
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -258,9 +255,10 @@ def reading(settings: Settings, store: Store) -> Iterator[None]:
 
 
 @pytest.fixture
-def client(settings: Settings, store: Store) -> Iterator[TestClient]:
+def client(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
     """Speak HTTP with the service; `store` and `steps` see the same database."""
     from app.main import create_app  # noqa: PLC0415 - most tests of the store need no application
 
+    monkeypatch.setattr("app.routes.jobs.LONG_POLL_S", 2.0)
     with TestClient(create_app(settings), raise_server_exceptions=False) as opened:
         yield opened

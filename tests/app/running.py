@@ -35,11 +35,10 @@ SETTINGS = {
     "LENS_ESTIMATOR": "default",
     "LENS_PATCHES": "3",
     "LENS_KERNEL_SIZE": "15",
-    "LENS_SWEEP_SECONDS": "0.25",  # oftener, and a busy machine spends its time on looking
     "LENS_WORKER_SLOTS": "2",
     "LENS_MIN_FREE_MB": "0",
     "LENS_SANDBOX": "try",  # whatever this machine has
-    "LENS_INSPECT_SECONDS": f"{stretched(20.0):.0f}",
+    "LENS_TASK_SECONDS": f"{stretched(3600.0):.0f}",
     "LENS_TASK_NICENESS": "0",  # tests wait for photos too: beside other programs they would starve
 }
 PROGRAM = [sys.executable, "-m", "lensmodel"]

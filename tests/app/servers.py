@@ -191,7 +191,6 @@ def main() -> None:
     with postgres() as server, moto(bucket) as store:
         values = {
             "LENS_DATABASE_URL": server.url("app"),
-            "LENS_JOBS_URL": server.url("jobs"),
             "LENS_STORAGE_URL": f"s3://{bucket}",
             **store.environment,
         }

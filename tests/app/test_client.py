@@ -13,14 +13,14 @@ from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
 from app.client import Client, JobEndedError, JobPatienceError, ServiceProblemError
-from app.demo.own_service import own_service
 from app.main import create_app
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
-from app.store.versions import report_key
+from app.store.lenses import report_key
+from app.store.owners import ANY_OWNER
+from lab.demo.own_service import own_service
 from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
 from lensmodel.model import LensModel
@@ -94,11 +94,13 @@ def test_waiting_for_a_failed_or_stuck_job_raises_why(api: Client, steps: Steps,
     assert api.cancel(slow.public_id).state == "cancelled"
 
 
-def test_waiting_leaves_a_service_in_peace_that_answers_at_once(steps: Steps, settings: Settings) -> None:
+def test_waiting_leaves_a_service_in_peace_that_answers_at_once(
+    steps: Steps, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     photo = steps.receive()
-    hasty = settings.model_copy(update={"long_poll_seconds": 0.0})
+    monkeypatch.setattr("app.routes.jobs.LONG_POLL_S", 0.0)
     asked: list[httpx2.Request] = []
-    with TestClient(create_app(hasty)) as http:
+    with TestClient(create_app(settings)) as http:
         http.event_hooks["request"].append(asked.append)
         with pytest.raises(JobPatienceError):
             Client(http=http).wait(photo.public_id, timeout=3.0)
@@ -176,13 +178,15 @@ def test_a_profile_is_saved_and_added(api: Client, steps: Steps, tmp_path: Path)
     one, other = (steps.lens_id(steps.counted(serial=serial)) for serial in "12")
 
     path = api.save_profile(one, tmp_path / "one.lensprofile")
-    added = api.add_profile(other, path)
+    with pytest.raises(ServiceProblemError, match="other_lens"):
+        api.add_profile(other, path)
+    added = api.add_profile(other, path, any_lens=True)
 
     assert added.photos == 2
     assert added.samples == 2 * api.lens(one).samples
     imported = next(photo for photo in api.photos(lens_id=other) if photo.sha256 and not photo.width)
     api.delete_photo(imported.id)
-    assert api.add_profile(other, path).photos == 2
+    assert api.add_profile(other, path, any_lens=True).photos == 2
 
 
 def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
@@ -241,3 +245,59 @@ def test_an_error_page_of_a_proxy_is_told_as_it_is() -> None:
 
     with Client(http=http) as client, pytest.raises(ServiceProblemError, match="bad gateway"):
         client.photo("x")
+
+
+def test_an_upload_says_how_far_it_is(api: Client, tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    path.write_bytes(b"II*\x00" + bytes(600_000))
+    progress: list[tuple[int, int]] = []
+
+    api.upload(path, calibrate=False, on_progress=lambda *far: progress.append(far))
+
+    assert progress == [(600_004, 600_004)]
+
+
+class Flaky(httpx2.BaseTransport):
+    """Answers in turn; an exception is raised."""
+
+    def __init__(self, *answers: httpx2.Response | Exception) -> None:
+        self.answers = list(answers)
+
+    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def job_of(state: str) -> httpx2.Response:
+    job = JobOut.model_validate(
+        {
+            **dict.fromkeys(("stage", "eta_seconds", "error", "started_at", "finished_at")),
+            "id": "1",
+            "kind": "photo",
+            "state": state,
+            "attempt": 1,
+            "created_at": "2026-01-01T00:00:00Z",
+            "progress": {"done": 0, "total": 1, "unit": "patches"},
+            "links": {"self": "/v1/jobs/1", **dict.fromkeys(("photo", "lens", "correction", "result"))},
+        }
+    )
+    return httpx2.Response(200, content=job.model_dump_json(), headers={"ETag": f'"{state}"'})
+
+
+def test_waiting_outlasts_a_restart_of_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.client.AWAY_SECONDS", 0.0)
+    away = (httpx2.ConnectError("no"), httpx2.Response(502), httpx2.Response(503))
+    flaky = Flaky(job_of("running"), *away, job_of("succeeded"))
+
+    with httpx2.Client(transport=flaky, base_url="http://x") as http:
+        assert Client(http=http).wait("1").state == "succeeded"
+
+
+def test_waiting_does_not_begin_where_there_is_no_service() -> None:
+    with (
+        httpx2.Client(transport=Flaky(httpx2.ConnectError("no")), base_url="http://x") as http,
+        pytest.raises(httpx2.ConnectError),
+    ):
+        Client(http=http).wait("1")

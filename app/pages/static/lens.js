@@ -261,20 +261,15 @@ export function setUpLensActions() {
   for (const form of holder.querySelectorAll("form")) acting(form, holder.querySelector(".alert"), acts[form.dataset.act]);
 }
 
-// Its model, and its earlier versions.
+// Its earlier versions.
 export function setUpVersions() {
-  const form = byId("model");
-  if (!form) return;
-  const change = async (wish) => {
-    await send("PATCH", `/v1/lenses/${form.dataset.lens}`, wish);
-    location.reload();
-  };
-  acting(form, byId("model-alert"), (fields) => change({ model: fields.get("model") }));
   for (const back of document.querySelectorAll("[data-back]"))
     acting(back, byId("back-alert"), async () => {
       const version = Number(back.dataset.back);
       const question = `Go back to version ${version}? Photos that joined later are left out; they stay and can be counted again.`;
-      if (await confirmed(question, "Go back")) await change({ back_to: version });
+      if (!(await confirmed(question, "Go back"))) return;
+      await send("PATCH", `/v1/lenses/${back.dataset.lens}`, { back_to: version });
+      location.reload();
     });
 }
 

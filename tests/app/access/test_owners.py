@@ -15,18 +15,18 @@ from fastapi.routing import APIRoute
 from sqlalchemy import select, update
 from starlette.testclient import TestClient
 
-from app.access import keys, rate_limits
+from app.access import authentication, keys
 from app.main import create_app
-from app.pages import lens_pages, photo_pages, picture_routes, signing
+from app.pages import lens_pages, photo_pages, pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.access.access_tables import KeyRow, SessionRow
-from app.store.access.owners import ANY_OWNER, now
 from app.store.corrections import Result
-from app.store.upkeep.migrate import upgrade
+from app.store.migrate import upgrade
+from app.store.owners import ANY_OWNER, now
+from app.store.tables import KeyRow, SessionRow
 
-METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")
 OPEN = {"/healthz", "/readyz", "/sign-in", "/v1/session"}
 NEEDED = {
     "psf": {"r": 0.5},
@@ -103,8 +103,8 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
     """Yield every path with every method: those of the OpenAPI document, and the pages that are not in it."""
     app: Any = client.app
     described = set(app.openapi()["paths"])
-    rooms = (page_routes, photo_pages, lens_pages, picture_routes, signing)  # a stream of events has no end
-    hidden = [route for room in rooms for route in room.router.routes]
+    rooms = (page_routes, photo_pages, lens_pages, pictures)  # a stream of events has no end
+    hidden = [route for room in rooms for route in room.router.routes] + page_routes.strangers.routes
     pages = {route.path for route in hidden if isinstance(route, APIRoute)}
     for path in sorted(described | pages):
         name = path.rpartition("/")[2]
@@ -367,13 +367,13 @@ def test_more_requests_than_there_may_be_are_told_when_to_come_again(
 def test_a_bucket_fills_again(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    bucket = rate_limits.Rates(60)
+    bucket = authentication.Rates(60)
     taken = [bucket.wait_of("anna") for _ in range(11)]
 
     assert taken == [0.0] * 10 + [1.0]
     clock[0] += 1.0
     assert (bucket.wait_of("anna"), bucket.wait_of("anna")) == (0.0, 1.0)
-    assert rate_limits.Rates(0).wait_of("anna") == 0.0
+    assert authentication.Rates(0).wait_of("anna") == 0.0
 
 
 def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: Store) -> None:
@@ -391,7 +391,7 @@ def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: S
     assert (account["photos"], account["max_photos"], account["stored_bytes"]) == (1, 1, 203)
 
 
-@pytest.mark.parametrize("open_to", [{"host": "0.0.0.0"}, {"public": True, "allowed_hosts": "localhost"}])
+@pytest.mark.parametrize("open_to", [{"host": "0.0.0.0"}, {"allowed_hosts": "localhost"}])
 def test_what_others_can_reach_does_not_start_without_a_key(
     settings: Settings, store: Store, open_to: dict[str, Any]
 ) -> None:

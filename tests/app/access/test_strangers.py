@@ -13,10 +13,10 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.http import bodies, psf_formats
-from app.http.bodies import MAX_JSON_BYTES
-from app.http.picture_cache import DrawnPicture
+from app.http import middleware
+from app.http.middleware import MAX_JSON_BYTES
 from app.main import create_app
+from app.routes import photos
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
@@ -96,8 +96,9 @@ def answer_of(port: int, sent: bytes, then: Callable[[socket.socket], None] = la
 
 @pytest.fixture
 def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    monkeypatch.setattr(bodies, "JSON_SECONDS", 0.5)
-    with served(settings.model_copy(update={"upload_seconds": 0.5})) as opened:
+    monkeypatch.setattr(middleware, "JSON_SECONDS", 0.5)
+    monkeypatch.setattr(photos, "UPLOAD_S", 0.5)
+    with served(settings) as opened:
         yield opened
 
 
@@ -137,7 +138,7 @@ def test_photos_are_received_only_so_many_at_once(client: TestClient) -> None:
     assert (refused.status_code, refused.json()["code"]) == (503, "busy")
     assert refused.headers["retry-after"] == "5"
     assert taken.status_code == 202
-    assert (places.free, free) == (1, Settings().max_uploads)
+    assert (places.free, free) == (1, photos.MAX_UPLOADS)
 
 
 # --- other sites ------------------------------------------------------------------------------
@@ -191,7 +192,7 @@ def test_every_route_that_changes_something_asks_where_it_comes_from(client: Tes
 
 
 def test_a_public_service_answers_to_the_names_that_it_is_given(settings: Settings, store: Store) -> None:
-    public = settings.model_copy(update={"public": True, "allowed_hosts": "Lens.example.org, other.example"})
+    public = settings.model_copy(update={"allowed_hosts": "Lens.example.org, other.example"})
     key = {"Authorization": f"Bearer {store.keys.create('anna', ['write']).text}"}
     with TestClient(create_app(public)) as client:
         hosts = ("lens.example.org", "lens.example.org:443", "other.example", "evil.example", "127.0.0.1")
@@ -204,11 +205,6 @@ def test_a_public_service_answers_to_the_names_that_it_is_given(settings: Settin
 
     assert {host for host, status in answers.items() if status != 200} == {"evil.example"}
     assert behind.status_code == 202  # a proxy that passes on an address as Host
-
-
-def test_a_public_service_has_to_be_given_its_names() -> None:
-    with pytest.raises(ValueError, match="LENS_ALLOWED_HOSTS"):
-        Settings(host="0.0.0.0", public=True)
 
 
 @pytest.mark.parametrize(
@@ -287,15 +283,6 @@ def test_no_text_forges_a_record() -> None:
 # --- small things of HTTP ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", ["/healthz", "/v1/photos", "/openapi.json", "/", "/docs"])
-def test_head_answers_as_get_without_a_body(client: TestClient, path: str) -> None:
-    full, only_head = client.get(path), client.head(path)
-
-    assert only_head.status_code == full.status_code == 200
-    assert only_head.content == b""
-    assert only_head.headers["content-length"] == full.headers["content-length"]
-
-
 @pytest.mark.parametrize("body", [{"aperture": True}, {"focal_length_mm": False}, {"focus_distance_m": True}])
 def test_true_is_no_number(client: TestClient, steps: Any, body: dict[str, bool]) -> None:
     photo = steps.receive()
@@ -325,24 +312,3 @@ def test_a_map_of_the_field_is_bounded(client: TestClient, steps: Any) -> None:
     assert (largest.status_code, largest.json()["code"]) == (422, "invalid_parameter")
     assert "40.6 million pixels" in largest.json()["detail"]
     assert client.get(f"/v1/lenses/{lens}/field.png?grid=9x6&size=55&aperture=1.4").status_code == 200
-
-
-def test_a_map_of_the_field_is_drawn_once_for_each_version(
-    client: TestClient, steps: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lens, drawn = steps.lens_id(steps.counted()), []
-    really = psf_formats.field_map
-
-    def field_map(*arguments: Any, **options: Any) -> DrawnPicture:
-        drawn.append(options["columns"])
-        return really(*arguments, **options)
-
-    monkeypatch.setattr(psf_formats, "field_map", field_map)
-    path = f"/v1/lenses/{lens}/field.png?grid=3x2&size=15&aperture=1.4"
-
-    same = {client.get(path).content for _ in range(3)}
-    once = len(drawn)
-    steps.counted()  # a new version
-    client.get(path)
-
-    assert (len(same), once, len(drawn)) == (1, 1, 2)

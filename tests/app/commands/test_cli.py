@@ -598,7 +598,7 @@ def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
             (output / name).write_text(f'{{"run": {len(runs)}}}', encoding="utf-8")
         return True
 
-    monkeypatch.setattr("app.demo.run.run", run)
+    monkeypatch.setattr("lab.demo.run.run", run)
     return runs
 
 

@@ -32,10 +32,10 @@ from app.blobs.storage import Storage
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.access.access_tables import KeyRow
-from app.store.access.keys import KeyStore
 from app.store.database import Database
-from app.store.upkeep.migrate import upgrade
+from app.store.keys import KeyStore
+from app.store.migrate import upgrade
+from app.store.tables import KeyRow
 from lab import targets
 from lensmodel.cli.main import app, main
 from lensmodel.cli.on_demand import OnDemand
@@ -116,8 +116,6 @@ QUICK = {
     "config --json",
     "doctor --deep --json",
     "backup my-backup",
-    "restore my-backup --data restored",
-    "migrate --to sqlite:///elsewhere.db",
 }
 """One of each command that takes a second at most; the others are run among the slow tests."""
 

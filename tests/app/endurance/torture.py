@@ -46,9 +46,9 @@ from app.runtime.doctor import examine  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
 from app.runtime.supervisor import environment  # noqa: E402
 from app.store import Store  # noqa: E402
-from app.store.ids import new_id  # noqa: E402
+from app.store.database import new_id  # noqa: E402
+from app.store.migrate import upgrade  # noqa: E402
 from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow  # noqa: E402
-from app.store.upkeep.migrate import upgrade  # noqa: E402
 
 OWNERS = ("one", "two")
 CELLS, CHANNELS = 8, 3
@@ -187,7 +187,7 @@ def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
         disk = folder / "disk"
         disk.mkdir()
         small = stack.enter_context(small_disk(disk, 128))
-        common = {"data_dir": disk / "data", "lease_seconds": 4.0, "sweep_seconds": 0.1, "worker_slots": 2}
+        common = {"data_dir": disk / "data", "lease_seconds": 4.0, "worker_slots": 2}
         full: list[Spell] = [lambda: kept_full(disk)] if small else []
         if not servers:
             settings = Settings(**common, min_free_mb=0)  # type: ignore[arg-type]  # checked by pydantic
@@ -204,7 +204,6 @@ def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
             **common,  # type: ignore[arg-type]  # checked by pydantic
             min_free_mb=0,
             database_url=server.url("app"),
-            jobs_url=server.url("jobs"),
             storage_url="s3://torture",
             storage_seconds=3.0,
         )

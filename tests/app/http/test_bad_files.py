@@ -100,7 +100,7 @@ OWN = {
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    limits = {"LENS_INSPECT_SECONDS": "30", "LENS_WORKER_MEMORY_MB": "3000", "LENS_MAX_MEGAPIXELS": "50"}
+    limits = {"LENS_TASK_SECONDS": "5400", "LENS_WORKER_MEMORY_MB": "3000", "LENS_MAX_MEGAPIXELS": "50"}
     with running(tmp_path_factory.mktemp("bad") / "data", LIGHT, **limits) as made:
         yield made
 

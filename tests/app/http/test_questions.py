@@ -10,9 +10,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.testclient import TestClient
 
-from app.http.questions import QueryModel
-from app.schemas import FieldQuery, PsfQuery
-from app.schemas.fields import Question
+from app.http.dependencies import QueryModel
+from app.schemas import FieldQuery, PsfQuery, Question
 
 ASKED = QueryModel(PsfQuery)
 

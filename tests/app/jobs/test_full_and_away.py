@@ -22,8 +22,8 @@ from app.routes import health
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store import photos as photo_store
+from app.store.migrate import upgrade
 from app.store.tables import PhotoRow
-from app.store.upkeep.migrate import upgrade
 
 TIFF = b"II*\x00" + bytes(9000)
 
@@ -115,11 +115,12 @@ def test_an_upload_whose_twin_is_deleted_meanwhile_is_stored(
 
 @pytest.mark.tools
 @pytest.mark.slow
-def test_the_same_bytes_are_sent_and_deleted_by_many_at_once(settings: Settings, tmp_path: Path) -> None:
+def test_the_same_bytes_are_sent_and_deleted_by_many_at_once(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.routes.photos.MAX_UPLOADS", 50)
     with postgres() as server:
-        many = settings.model_copy(
-            update={"database_url": server.url("app"), "jobs_url": server.url("jobs"), "max_uploads": 50}
-        )
+        many = settings.model_copy(update={"database_url": server.url("app")})
         opened = Store(many)
         upgrade(opened.database)
         said: Counter[tuple[str, int]] = Counter()

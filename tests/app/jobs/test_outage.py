@@ -31,10 +31,10 @@ from app.runtime.outage import Patience, is_outage
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import LensName, Store
-from app.store.access.owners import ANY_OWNER
-from app.store.ids import new_id
+from app.store.database import new_id
+from app.store.migrate import upgrade
+from app.store.owners import ANY_OWNER
 from app.store.tables import EventRow, PhotoRow, SampleRow
-from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
@@ -313,7 +313,7 @@ def check_counted_once(store: Store, photos: int) -> None:
 
 
 def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store, tmp_path: Path) -> None:
-    settings = settings.model_copy(update={"worker_slots": 2, "sweep_seconds": 0.1})
+    settings = settings.model_copy(update={"worker_slots": 2})
     storage = Storage(settings.storage)
     assert storage.folder is not None
     aside = storage.folder.with_name("aside")
@@ -334,7 +334,7 @@ def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store,
 
 @pytest.mark.slow
 def test_workers_that_start_while_the_storage_is_away_wait_for_it(settings: Settings, store: Store) -> None:
-    settings = settings.model_copy(update={"worker_slots": 2, "sweep_seconds": 0.1})
+    settings = settings.model_copy(update={"worker_slots": 2})
     storage = Storage(settings.storage)
     assert storage.folder is not None
     send(store, storage, 2)
@@ -361,10 +361,8 @@ def test_photos_outlast_a_database_that_is_away(tmp_path: Path) -> None:
         settings = Settings(
             data_dir=tmp_path / "data",
             database_url=server.url("app"),
-            jobs_url=server.url("jobs"),
             shared_filesystem=True,
             worker_slots=2,
-            sweep_seconds=0.1,
             min_free_mb=0,
         )
         settings.data_dir.mkdir()

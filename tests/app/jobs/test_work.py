@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,20 +22,18 @@ from app.http import views
 from app.jobs import tasks
 from app.jobs.context import JobContext, JobFailedError, NotWantedError
 from app.jobs.correction_work import CorrectionWork
-from app.jobs.location_work import remove_location
-from app.jobs.missing_reports import ask_for_reports
+from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import KERNELS, PREVIEW, SAMPLES
+from app.jobs.task_files import KERNELS, R_MAP, SAMPLES
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
+from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
-from app.store.versions import report_key
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
@@ -335,14 +333,14 @@ def test_a_photo_focused_at_infinity_says_so_to_the_model(
 def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
     work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted
 ) -> None:
-    def with_preview(arguments: dict[str, Any], folder: Path) -> Outcome:
-        (folder / PREVIEW).write_bytes(b"a small picture")
+    def with_a_map(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / R_MAP).write_bytes(b"a small picture")
         return develop(arguments, folder)
 
-    sandbox.answers["develop"] = [with_preview]
+    sandbox.answers["develop"] = [with_a_map]
     work.photo(photo.public_id, 1)
 
-    assert context.storage.get(f"photos/{photo.public_id}/{PREVIEW}") == b"a small picture"
+    assert context.storage.get(f"photos/{photo.public_id}/{R_MAP}") == b"a small picture"
 
 
 def test_running_a_finished_photo_again_changes_nothing(
@@ -658,18 +656,6 @@ def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
     assert [one[3] for one in used] == [55, 55]
 
 
-def test_a_photo_that_is_learned_anew_is_chosen_from_and_estimated_in_the_new_way(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any
-) -> None:
-    work.photo(photo.public_id, 1)
-    context.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
-
-    work.photo(photo.public_id, 2)
-
-    used = [sandbox.seen[task]["estimator"] for task in ("select", "estimate")]
-    assert used == ["michaeli-irani"] * 2
-
-
 def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
     work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
@@ -679,12 +665,7 @@ def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
 
     refused = steps.fresh(asking)
     assert (refused.state, refused.error_code) == ("failed", "conflict")
-    assert f"PATCH /v1/lenses/{steps.lens_id(photo)}" in refused.error_detail
-    context.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
-    assert context.store.photos.retry(asking.public_id, ANY_OWNER)
-    for one in (photo, asking):
-        work.photo(one.public_id, 2)
-    assert [steps.fresh(one).state for one in (photo, asking)] == ["counted", "counted"]
+    assert "its lens has the model default" in refused.error_detail
 
 
 def test_the_model_of_a_lens_decides_how_it_is_measured_and_its_photos_are_corrected(
@@ -787,37 +768,6 @@ def test_a_version_that_cannot_be_measured_is_not_tried_for_ever(
     CorrectionWork(context).measure(steps.lens_id(counted), 1)
 
     assert context.store.lenses.unmeasured() == []
-
-
-class Asked:
-    """An engine that only notes what it is asked for."""
-
-    def __init__(self) -> None:
-        self.jobs: list[Job] = []
-
-    def enqueue(self, job: Job) -> None:
-        self.jobs.append(job)
-
-
-def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
-    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
-) -> None:
-    first = {"error": {"mid": 0.2}, "coverage": {"mid": 4}}
-    sandbox.answers["measure"] = [ok(first), ok({"error": {"mid": 9.9}, "coverage": {"mid": 4}})]
-    lens_id = steps.lens_id(counted)
-    work, engine = CorrectionWork(context), cast("Any", Asked())
-    assert ask_for_reports(context.store, context.storage, engine) == 0  # not measured yet: that makes one
-    work.measure(lens_id, 1)
-    assert ask_for_reports(context.store, context.storage, engine) == 1
-    (job,) = engine.jobs
-    assert job.id != Job("measure", (lens_id, 1)).id
-
-    work.measure(*job.arguments)
-    lens = context.store.lenses.get(lens_id, ANY_OWNER)
-    assert lens is not None
-    assert context.store.lenses.history(lens)[-1].metrics == first
-    context.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
-    assert ask_for_reports(context.store, context.storage, engine) == 0
 
 
 def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(

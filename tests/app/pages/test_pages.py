@@ -698,27 +698,6 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     expect(page.locator(".facts").first).to_contain_text("1 photo")
 
 
-@pytest.mark.slow  # page and request without a browser: test_parts.py, test_lens_model.py
-def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tmp_path: Path) -> None:
-    lens = service.calibrated(write_photo(tmp_path / "w.dng", 71, serial="W-1"))["lens_id"]
-    page.goto(f"/lenses/{lens}/tests")
-    part, choice = page.locator("section[aria-labelledby=research-title]"), page.locator("#model")
-    expect(part).to_contain_text("Model: default")
-    choice.get_by_label("Change it to").select_option("paper")
-    choice.get_by_role("button", name="Change").click()
-    expect(page.locator("#lens-state")).to_contain_text(
-        "Being measured anew for the model paper: 1 photo to go"
-    )
-    expect(part).to_contain_text("Model: default")
-    assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "paper"
-
-    choice.get_by_label("Change it to").select_option("default")
-    choice.get_by_role("button", name="Change").click()
-    expect(page.locator("#lens-state")).not_to_contain_text("measured anew")
-    assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "default"
-    assert service.get(f"/v1/lenses/{lens}")["version"] == 1  # nothing was lost, nothing done twice
-
-
 def test_a_page_does_not_go_while_somebody_is_asked(page: Page, learned: dict[str, Any]) -> None:
     def still_counting(route: Route) -> None:
         answer = route.fetch()

@@ -19,18 +19,17 @@ from starlette.testclient import TestClient
 from app.blobs.storage import Storage
 from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
-from app.jobs.body_keys import body_key
-from app.jobs.task_files import PREVIEW, R_MAP, SIDES, THUMBNAIL
+from app.jobs.inspection import body_key
+from app.jobs.task_files import R_MAP, SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.batch import unused_name
-from app.pages.groups import grouped
 from app.pages.pictures import in_sensor, upright_point
+from app.pages.shown import grouped
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
-from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
-from app.store.photo_steps import photo_folder
+from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.core.types import ignore_step
 from lensmodel.photo import upright
@@ -54,10 +53,10 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright(
     Image.fromarray(scene).save(tmp_path / "p.jpg", exif=exif, quality=95)
     tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
     photo = steps.counted()
-    for name in (PREVIEW, R_MAP):
+    for name in (SHOWN, R_MAP):
         Storage(settings.storage).put_file(f"{photo_folder(photo)}{name}", tmp_path / name)
 
-    for name in (PREVIEW, R_MAP):
+    for name in ("preview.jpg", R_MAP):
         assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
 
 
@@ -66,7 +65,7 @@ def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
 
     tasks.develop({"path": str(tmp_path / "p.png"), "max_megapixels": 1.0}, tmp_path, ignore_step)
 
-    assert {PREVIEW, R_MAP} <= {path.name for path in tmp_path.iterdir()}
+    assert {SHOWN, R_MAP} <= {path.name for path in tmp_path.iterdir()}
 
 
 def a_picture() -> NDArray[np.uint8]:
@@ -369,37 +368,19 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
     assert "77 places" in page
 
 
-def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
-    photos = [steps.counted() for _ in range(2)]
-    lens = steps.lens_id(photos[0])
+def test_the_page_of_a_lens_says_which_model_it_has(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive(model="paper")
+    steps.inspect(photo, serial="2")
+    steps.plan(photo)
+    steps.estimate(photo)
+    steps.store.photos.finish(photo.public_id, 1)
+    plain, paper = (
+        client.get(f"/lenses/{steps.lens_id(one)}/tests").text for one in (steps.counted(), photo)
+    )
 
-    def shown() -> str:
-        answer = client.get(f"/lenses/{lens}/tests")
-        assert answer.status_code == 200, answer.text
-        return answer.text
-
-    assert "Model: default, from" in shown()
-    assert "to compare with" in shown()
-    assert "measured anew" not in shown()
-    client.patch(f"/v1/lenses/{lens}", json={"model": "paper"})
-    page = shown()
-    assert "Being measured anew for the model paper: 2 photos to go." in page
-    assert ("Model: default, from" in page, '<option value="paper" selected>' in page) == (True, True)
-    for photo in photos:
-        store.photos.fail(photo.public_id, 2, "no_usable_patches", "nothing there")
-    assert "None of its photos could be measured for the model paper, so the model default" in shown()
-    assert store.photos.retry(photos[0].public_id, ANY_OWNER)
-    again = steps.fresh(photos[0])
-    steps.inspect(again)
-    steps.plan(again)
-    steps.estimate(again)
-    store.photos.finish(again.public_id, again.epoch)
-    assert "Model: paper, from" in shown()
-    assert "Model:" not in client.get(f"/lenses/{lens}").text
-    assert "all photos measured anew, model paper" in shown()
-    photo_page = client.get(f"/photos/{photos[0].public_id}").text
+    assert ("Model: default" in plain, "guards photos" in plain) == (True, False)
+    assert ("Model: paper" in paper, "guards photos" in paper) == (True, True)
+    photo_page = client.get(f"/photos/{photo.public_id}").text
     assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
 
 

@@ -18,7 +18,7 @@ from app.jobs.measurement_work import _checked
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SAMPLES
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
+from app.store.owners import ANY_OWNER
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.registry import Registry

@@ -15,8 +15,8 @@ from app.routes import jobs
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
-from app.store.photo_reads import PhotoReads
+from app.store.owners import ANY_OWNER
+from app.store.photos import PhotoStore
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(9000)
@@ -317,7 +317,7 @@ def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, setti
 def test_a_photo_that_is_deleted_while_it_is_sent_is_told_as_it_was_received(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(PhotoReads, "get", lambda *_: None)
+    monkeypatch.setattr(PhotoStore, "get", lambda *_: None)
 
     answer = client.post("/v1/photos", content=TIFF)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from app.schemas.psf import PsfQuery
+from app.schemas import PsfQuery
 
 
 @pytest.mark.parametrize("name", ["focus_distance_m", "pixel_pitch_um"])

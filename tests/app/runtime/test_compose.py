@@ -41,14 +41,14 @@ def test_every_setting_is_known_and_they_fit_together(
     for name, value in ours(compose)["api"]["environment"].items():
         monkeypatch.setenv(name, filled(value))
 
-    settings = Settings(host="0.0.0.0", public=True)
+    settings = Settings(host="0.0.0.0")
 
     assert settings.database.startswith("postgresql")
     assert settings.jobs.startswith("postgresql")
     assert settings.storage == "s3://lensmodel"
     assert settings.hosts
     names = [name for name in ours(compose)["api"]["environment"] if name.startswith(PREFIX)]
-    assert len(names) == 4
+    assert len(names) == 3
 
 
 def test_our_containers_have_no_rights_and_a_root_that_nobody_writes_to(compose: dict[str, Any]) -> None:

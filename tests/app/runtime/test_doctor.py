@@ -16,9 +16,9 @@ from app.blobs.storage import Storage
 from app.runtime.doctor import DoctorReport, examine
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.access.owners import now
+from app.store.invariants import INVARIANTS
+from app.store.owners import now
 from app.store.tables import EventRow, LensRow, PatchRow, PhotoRow, SampleRow
-from app.store.upkeep.invariants import INVARIANTS
 from lensmodel.cli.main import app
 
 

@@ -28,8 +28,8 @@ from app.blobs.storage import Storage
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.migrate import upgrade
 from app.store.tables import PhotoRow, SampleRow
-from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
@@ -177,13 +177,10 @@ def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
             "storage_url": f"s3://{BUCKET}",
             "storage_seconds": 5.0,
             "lease_seconds": LEASE_S,
-            "sweep_seconds": 0.1,
             "worker_slots": 2,
             "min_free_mb": 0,
         }
-        here = Settings(
-            data_dir=tmp_path / "here", database_url=server.url("app"), jobs_url=server.url("jobs"), **common
-        )
+        here = Settings(data_dir=tmp_path / "here", database_url=server.url("app"), **common)
         store = Store(here)
         upgrade(store.database)
         site = Installation(store, Storage(here.storage), here, hosts)
@@ -195,10 +192,8 @@ def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
                 **s3.environment_at(host.gateway),
                 "LENS_DATA_DIR": str(host.data),
                 "LENS_DATABASE_URL": server.url("app", host.gateway),
-                "LENS_JOBS_URL": server.url("jobs", host.gateway),
                 "LENS_HOST": host.address,
                 "LENS_PORT": str(API_PORT),
-                "LENS_PUBLIC": "true",
                 "LENS_SANDBOX": "try",  # whatever this machine has
                 "LENS_ALLOWED_HOSTS": "localhost",
                 "PYTHONPATH": os.pathsep.join(

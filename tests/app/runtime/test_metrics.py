@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import time
-from pathlib import Path
+import socket
 from typing import Any
 
+import httpx2
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
@@ -14,7 +13,6 @@ from starlette.testclient import TestClient
 from app.jobs.job_log import accounted
 from app.runtime import metrics
 from app.runtime.outage import OutageError
-from app.runtime.settings import Settings
 
 
 def numbers(text: str) -> dict[str, float]:
@@ -70,40 +68,18 @@ def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
     assert not any(lens in name or "somewhere" in name for name in after)
 
 
-def test_what_workers_leave_in_files_is_told_by_the_api_and_added_up(
-    client: TestClient, settings: Settings
-) -> None:
+def test_a_worker_tells_its_own_where_it_has_an_address() -> None:
     with accounted("photo", ("p", 1)) as record:
         record.retries(OutageError())
-    own = numbers(metrics.generate_latest(metrics.WORKER).decode())
-    for worker in ("one", "two"):
-        metrics.leave(settings.data_dir, worker)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    values = asked(client)
+    metrics.publish(address)
 
-    for name in (
-        "lensmodel_job_seconds_count{'ending': 'done', 'kind': 'photo'}",
-        "lensmodel_job_retries_total{'cause': 'outage', 'kind': 'photo'}",
-    ):
-        assert own[name] >= 1
-        assert values[name] == 2 * own[name]
-
-
-def test_numbers_of_workers_long_gone_are_forgotten(tmp_path: Path) -> None:
-    metrics.leave(tmp_path, "old")
-    old = tmp_path / metrics.FOLDER / "old.prom"
-    os.utime(old, (0, time.time() - metrics.KEEP_S - 60))
-
-    metrics.leave(tmp_path, "new")
-
-    assert [path.name for path in (tmp_path / metrics.FOLDER).iterdir()] == ["new.prom"]
-
-
-def test_a_torn_file_of_a_worker_hides_nothing_else(client: TestClient, settings: Settings) -> None:
-    metrics.leave(settings.data_dir, "whole")
-    (settings.data_dir / metrics.FOLDER / "torn.prom").write_text('lensmodel_job_seconds_count{kind="ph')
-
-    assert "lensmodel_workers_fenced_total{}" in asked(client)
+    values = numbers(httpx2.get(f"http://{address}/metrics").text)
+    assert values["lensmodel_job_seconds_count{'ending': 'done', 'kind': 'photo'}"] >= 1
+    assert values["lensmodel_job_retries_total{'cause': 'outage', 'kind': 'photo'}"] >= 1
 
 
 @pytest.mark.parametrize(("ending", "error"), [("done", None), ("raised", RuntimeError)])

@@ -12,7 +12,7 @@ import pytest
 # Waits so often that a handler which took the event's lock would soon meet its own thread inside it.
 WAITS = """
 import threading
-from app.runtime.signals import on_signals
+from app.runtime.processes import on_signals
 arrived = threading.Event()
 on_signals(lambda number: (print(number.name, flush=True), arrived.set()))
 print("ready", flush=True)
@@ -52,7 +52,7 @@ async def application(scope, receive, send):
     await send({"type": "lifespan.shutdown.complete"})
 
 sys.modules["app.main"] = types.SimpleNamespace(create_app=lambda settings: application)
-interrupt.install()
+ending.install()
 server.run(Settings(data_dir=Path(sys.argv[1])), server.listen("127.0.0.1", 0))
 print("stopped", flush=True)
 """

@@ -6,6 +6,7 @@ import threading
 import zlib
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,13 @@ from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError
 
 from app.errors import BusyError
-from app.runtime.settings import Settings
+from app.runtime.settings import Settings, table
 from app.store import LensName, NewPatch, Store, corrections, lenses
-from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.database import Database
+from app.store.migrate import current, downgrade, head, upgrade
+from app.store.owners import ANY_OWNER
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
-from app.store.upkeep.migrate import current, downgrade, head, upgrade
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian
 
@@ -493,14 +494,21 @@ def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
     assert Settings(estimator="michaeli-irani").estimator == "michaeli-irani"
 
 
+def test_the_page_of_the_service_lists_all_settings() -> None:
+    page = Path(__file__).parents[3] / "docs" / "service.md"
+
+    assert table() in page.read_text(encoding="utf-8")
+
+
 def test_a_database_server_needs_shared_storage() -> None:
     with pytest.raises(ValueError, match="s3://"):
         Settings(database_url="postgresql+psycopg://db/lens")
 
 
-def test_a_database_server_needs_jobs_that_all_machines_see() -> None:
-    with pytest.raises(ValueError, match="LENS_JOBS_URL"):
-        Settings(database_url="postgresql+psycopg://db/lens", storage_url="s3://lensmodel")
+def test_the_jobs_of_a_database_server_lie_where_all_machines_see_them() -> None:
+    settings = Settings(database_url="postgresql+psycopg://db/lens", storage_url="s3://lensmodel")
+
+    assert settings.jobs == settings.database
 
 
 def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:

@@ -1,0 +1,113 @@
+"""What a worker reads of a file before all else: its place, which is removed, its header, a small picture.
+
+A child searches the file, which may be hostile, and writes another one of the same length without the place
+where the photo was taken. That one gets a key of its own: blobs never change, so that a backup need not look
+into them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from app.jobs.answers import Inspected, checked
+from app.jobs.context import SPARE_MB, JobContext, JobFailedError
+from app.jobs.task_files import CLEANED, THUMBNAIL
+from app.sandbox.outcome import TaskLimits
+from app.store import LensName
+from app.store.owners import ANY_OWNER
+from app.store.photos import photo_folder
+from app.store.tables import PhotoRow
+from lensmodel.core.names import name_key, serial_key
+
+log = logging.getLogger(__name__)
+
+_COLUMNS: Final = (
+    *("camera_maker", "camera_model", "aperture", "focal_mm", "focus_m", "pixel_pitch_um"),
+    *("orientation", "iso", "exposure_s"),
+)
+"""Fields of a header that have columns of the same name."""
+
+
+def inspect(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
+    """Read and record the header of a photo, and store a small picture of it."""
+    limits = TaskLimits(memory_mb=SPARE_MB, wall_s=context.settings.inspect_seconds)
+    with context.original(photo) as path, context.sandbox.folder() as folder:
+        arguments = {"path": str(path), "max_megapixels": context.settings.max_megapixels}
+        info = context.attempt(
+            "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
+        )
+        info = checked(Inspected, info)
+        _keep_thumbnail(context, photo, info, path, wanted)
+    _record(context, photo, info)
+
+
+def _record(context: JobContext, photo: PhotoRow, info: dict[str, Any]) -> None:
+    metadata, lens = info["metadata"], info["metadata"]["lens"]
+    taken, camera = metadata["taken_at"], (metadata["camera_maker"], metadata["camera_model"])
+    context.store.photos.record_inspection(
+        photo.public_id,
+        LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
+        width=info["width"],
+        height=info["height"],
+        body_key=body_key(*camera, metadata.get("body_serial")),
+        # cameras write local time without a zone; as UTC it at least sorts
+        taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
+        **{name: metadata[name] for name in _COLUMNS},
+    )
+
+
+def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:
+    """Return a digest of a camera's name and serial; None without a serial."""
+    if not serial:
+        return None
+    identity = "|".join((name_key(maker), name_key(model), serial_key(serial)))
+    return hashlib.sha256(identity.encode()).hexdigest()[:16]
+
+
+def _keep_thumbnail(
+    context: JobContext, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
+) -> None:
+    """Store a small picture of the photo at `path`; none where it cannot be rendered."""
+    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
+    arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
+    with context.sandbox.folder() as folder:
+        outcome = context.sandbox.run(
+            "thumbnail", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
+        )
+        if outcome.ending == "ok" and (folder / THUMBNAIL).is_file():
+            context.storage.put_file(f"{photo_folder(photo)}{THUMBNAIL}", folder / THUMBNAIL)
+
+
+def remove_location(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
+    """Remove the place from the file of a photo, once; return the photo with the file that it has now."""
+    if photo.location is not None or photo.file_gone_at is not None:
+        return photo
+    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
+    with context.original(photo) as path, context.sandbox.folder() as folder:
+        try:
+            found = context.attempt(
+                "location", {"path": str(path)}, folder=folder, limits=limits, wanted=wanted, reads=[path]
+            )
+        except JobFailedError as error:
+            log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
+            found = "unknown"
+        _record_location(context, photo, found, folder / CLEANED)
+    return context.store.photos.get(photo.public_id, ANY_OWNER) or photo
+
+
+def _record_location(context: JobContext, photo: PhotoRow, found: Any, cleaned: Path) -> None:  # noqa: ANN401 - a child's JSON
+    photos = context.store.photos
+    word = found if found in {"none", "removed"} else "unknown"
+    if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
+        with cleaned.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        key = f"{photo_folder(photo)}cleaned-{digest[:16]}"
+        context.storage.put_file(key, cleaned)
+        photos.record_location(photo, word, key=key, digest=digest)
+    else:
+        photos.record_location(photo, word)

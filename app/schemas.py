@@ -1,0 +1,682 @@
+"""What crosses HTTP: one model for each question and answer; units and bounds sit in the fields."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Final, Generic, Literal, TypeVar, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    computed_field,
+    field_validator,
+)
+
+from lensmodel.core.types import Channel
+
+V1: Final = "/v1"
+T = TypeVar("T")
+
+MAX_PSF_SIZE = 255
+"""Side of a kernel in pixels at most (chosen): that of a profile."""
+
+MAX_VERSION: Final = 2**31 - 1
+"""The largest number of an INTEGER column of PostgreSQL."""
+
+
+def blank_is_none(value: object) -> object:
+    """Take an empty field of a form for one that was left out."""
+    return None if isinstance(value, str) and not value.strip() else value
+
+
+def _printable(value: str) -> str:
+    if not value.isprintable():
+        raise ValueError("must not hold control characters")
+    return value.strip()
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError(f"must be odd, so that there is a middle pixel: {value - 1} or {value + 1}")
+    return value
+
+
+PsfModel = Literal["default", "paper"]
+"""How a lens is learned and its photos are corrected: names of `lensmodel.workflow.sampling`."""
+
+Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
+
+OptionalName = Annotated[Name | None, BeforeValidator(blank_is_none)]
+
+Id = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")]
+
+OptionalId = Annotated[Id | None, BeforeValidator(blank_is_none)]
+
+Aperture = Annotated[float, Field(ge=0.5, le=128, allow_inf_nan=False, description="f-number")]
+
+FocalLength = Annotated[float, Field(ge=0.1, le=20000, allow_inf_nan=False, description="mm")]
+
+FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, allow_inf_nan=False, description="m")]
+
+PixelPitch = Annotated[float, Field(gt=0.1, le=1000, allow_inf_nan=False, description="micrometres")]
+
+KernelSize = Annotated[
+    int, Field(ge=3, le=MAX_PSF_SIZE, description="odd side in pixels"), AfterValidator(_odd)
+]
+
+
+class Model(BaseModel):
+    """Common to what we send."""
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="null", protected_namespaces=())
+
+
+class Page(Model, Generic[T]):
+    """Some of many, and where the next ones are."""
+
+    items: list[T]
+    next: str | None = None
+
+
+class Question(BaseModel):
+    """Common to what we are sent: a name that we do not know is an error, and not ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _true_is_no_number(cls, value: object, info: ValidationInfo) -> object:
+        kind = cls.model_fields[str(info.field_name)].annotation
+        if isinstance(value, bool) and bool not in {kind, *get_args(kind)}:
+            raise ValueError(f"{str(value).lower()} is no value of this field")
+        return value
+
+
+class FieldError(Model):
+    """One offending field."""
+
+    field: str
+    message: str
+    value: str | None = None
+
+
+class Problem(Model):
+    """Why something did not work (RFC 9457)."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    code: str = Field(description="Fixed word by which programs tell the cases apart.")
+    instance: str | None = None
+    errors: list[FieldError] = []
+    request_id: str | None = None
+    candidates: list[str] | None = Field(default=None, description="Lenses that the photo may belong to.")
+
+
+MeasurementKind = Literal["target", "pair", "points", "edges"]
+PhotoState = Literal[
+    "received",
+    "inspecting",
+    "developing",
+    "selecting",
+    "estimating",
+    "counted",
+    "stored",
+    "needs_lens",
+    "excluded",
+    "failed",
+    "cancelled",
+]
+
+
+class UploadFields(Question):
+    """What an owner may say about a photo.
+
+    The lens that it names goes before that of the file; a setting counts where the file says none.
+    """
+
+    calibrate: bool = Field(default=True, description="false only stores the photo to correct it")
+    kind: Annotated[MeasurementKind | None, BeforeValidator(blank_is_none)] = Field(
+        default=None, description="what a photo made to measure the lens shows; nothing for ordinary photos"
+    )
+    reference_id: OptionalId = Field(default=None, description="of a pair: the photo closed to about f/8")
+    model: Annotated[PsfModel | None, BeforeValidator(blank_is_none)] = Field(
+        default=None,
+        description="of a new lens: how it is learned, default or the paper's own way; a lens that is there "
+        "must have it already",
+    )
+    selector: OptionalName = Field(
+        default=None,
+        description="who chooses its patches, one of GET /v1/formats; else whom the service has",
+    )
+    lens_id: OptionalId = None
+    lens_serial: OptionalName = None
+    lens_model: OptionalName = None
+    lens_maker: OptionalName = None
+    aperture: Annotated[Aperture | None, BeforeValidator(blank_is_none)] = None
+    focal_length_mm: Annotated[FocalLength | None, BeforeValidator(blank_is_none)] = None
+    focus_distance_m: Annotated[FocusDistance | None, BeforeValidator(blank_is_none)] = None
+    pixel_pitch_um: Annotated[PixelPitch | None, BeforeValidator(blank_is_none)] = None
+
+
+class NewLens(Question):
+    """A lens that only its owner can tell from others."""
+
+    label: Name
+
+
+class PhotoChange(Question):
+    """What to change about a photo; at least one field. It goes before what the file says."""
+
+    lens_id: Id | None = None
+    lens_serial: Name | None = None
+    lens_model: Name | None = None
+    lens_maker: Name | None = None
+    new_lens: NewLens | None = None
+    aperture: Aperture | None = None
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: PixelPitch | None = None
+    excluded: bool | None = None
+    calibrate: bool | None = Field(
+        None, description="true: learn the lens from a photo that was stored without"
+    )
+
+
+class PhotosChange(Question):
+    """What to say of several photos at once: which lens it was, and at which settings."""
+
+    photo_ids: list[Id] = Field(min_length=1, max_length=1000)
+    lens_id: Id | None = None
+    new_lens: NewLens | None = None
+    aperture: Aperture | None = None
+    focal_length_mm: FocalLength | None = None
+
+
+class PatchCounts(Model):
+    """How far the patches of a photo are."""
+
+    total: int
+    done: int
+    rejected: int
+
+
+class PhotoLinks(Model):
+    """Where to go from a photo."""
+
+    self: str
+    job: str
+    lens: str | None
+
+
+class PhotoOut(Model):
+    """A photo."""
+
+    id: str
+    filename: str
+    sha256: str
+    state: PhotoState
+    calibrate: bool
+    lens_id: str | None
+    aperture: float | None
+    focal_length_mm: float | None
+    focus_distance_m: float | None
+    pixel_pitch_um: float | None
+    camera: str | None
+    lens_model: str | None
+    width: int | None
+    height: int | None
+    kind: MeasurementKind | None = Field(
+        default=None, description="what a photo made to measure the lens shows"
+    )
+    reference_id: str | None = Field(default=None, description="of a pair: the photo closed to about f/8")
+    patches: PatchCounts
+    error: Problem | None
+    created_at: datetime
+
+    @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
+    @property
+    def links(self) -> PhotoLinks:
+        """Where to go from here."""
+        lens = None if self.lens_id is None else f"{V1}/lenses/{self.lens_id}"
+        return PhotoLinks(self=f"{V1}/photos/{self.id}", job=f"{V1}/jobs/{self.id}", lens=lens)
+
+
+class PatchOut(Model):
+    """One window of a photo, used or rejected."""
+
+    index: int
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    score: float | None
+    state: str
+    reason: str | None
+
+
+class PhotoPage(Page[PhotoOut]):
+    """Some photos, newest first."""
+
+
+class PatchPage(Page[PatchOut]):
+    """The patches of a photo."""
+
+
+CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+OutputFormat = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
+
+ColorSpace = Literal["same", "srgb", "camera-linear"]
+
+
+class OutputOptions(Question):
+    """How a corrected photo is written."""
+
+    format: OutputFormat = "tiff16"
+    color_space: ColorSpace = "same"
+    quality: int = Field(default=95, ge=1, le=100, description="of JPEG")
+
+
+class Region(Question):
+    """A part of a photo in pixels of the sensor orientation."""
+
+    x: int = Field(ge=0)
+    y: int = Field(ge=0)
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+
+
+class CorrectionIn(Question):
+    """What to correct, with what, into what."""
+
+    photo_id: Id
+    lens_id: Id | None = Field(None, description="default: the lens of the photo")
+    lens_version: int | None = Field(None, ge=1, le=MAX_VERSION, description="default: the newest")
+    any_lens: bool = Field(default=False, description="also where the photo seems to be of another lens")
+    method: str | None = Field(
+        None,
+        min_length=1,
+        max_length=60,
+        description="default: standard, and paper where the model of the lens is that of the paper",
+    )
+    strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
+    halo: float | None = Field(
+        None,
+        ge=0,
+        allow_inf_nan=False,
+        description="how far beside edges to leave the range of light around; default: by the model's error",
+    )
+    texture: float = Field(
+        1.0, ge=0, le=1, allow_inf_nan=False, description="how much of its faint texture the photo keeps"
+    )
+    denoise: float = Field(
+        0.0, ge=0, le=1, allow_inf_nan=False, description="how much of the photo's grain to take away"
+    )
+    output: OutputOptions = OutputOptions()
+    roi: Region | None = None
+    layers: bool = Field(
+        default=False,
+        description="with roi: keep it without faint texture and without grain as well, for a preview to mix",
+    )
+
+
+class CorrectionLinks(Model):
+    """Where to go from a correction."""
+
+    self: str
+    job: str
+    result: str | None
+
+
+class CorrectionOut(Model):
+    """A correction."""
+
+    id: str
+    photo_id: str
+    lens_id: str
+    lens_version: int
+    state: CorrectionState
+    method: str
+    strength: float
+    output: dict[str, Any]
+    roi: dict[str, Any] | None
+    report: dict[str, Any] | None
+    error: Problem | None
+    created_at: datetime
+    finished_at: datetime | None
+
+    @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
+    @property
+    def links(self) -> CorrectionLinks:
+        """Where to go from here."""
+        own = f"{V1}/corrections/{self.id}"
+        result = f"{own}/result" if self.state == "succeeded" else None
+        return CorrectionLinks(self=own, job=f"{V1}/jobs/{self.id}", result=result)
+
+
+class CorrectionPage(Page[CorrectionOut]):
+    """Some corrections, newest first."""
+
+
+JobState = Literal["queued", "running", "waiting", "succeeded", "failed", "cancelled"]
+
+
+class JobProgress(Model):
+    """How far a job is."""
+
+    done: int
+    total: int
+    unit: str
+
+
+class JobLinks(Model):
+    """Where to go from a job."""
+
+    self: str
+    photo: str | None
+    lens: str | None
+    correction: str | None
+    result: str | None
+
+
+class JobOut(Model):
+    """Background work: of a photo or of a correction; its id is that of what it makes."""
+
+    id: str
+    kind: Literal["photo", "correction", "rebuild"]
+    state: JobState
+    stage: str | None
+    progress: JobProgress
+    eta_seconds: float | None
+    attempt: int
+    error: Problem | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    links: JobLinks
+
+
+class RetriedOut(Model):
+    """How many jobs were started anew."""
+
+    retried: int
+
+
+class JobPage(Page[JobOut]):
+    """Some jobs, newest first."""
+
+
+SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
+
+
+class LensLinks(Model):
+    """Where to go from a lens."""
+
+    self: str
+    psf: str
+    field: str
+    calibrations: str
+    lateral_colour: str
+    photos: str
+
+
+class LensOut(Model):
+    """One copy of a lens and what is known of it."""
+
+    id: str
+    maker: str | None
+    model: str | None
+    serial: str | None
+    serial_source: SerialSource
+    label: str | None
+    psf_model: PsfModel = Field(
+        default="default",
+        description="how it is learned and its photos are corrected, as its first photo was sent",
+    )
+    version: int
+    photos: int
+    samples: int
+    apertures: list[float]
+    focal_lengths_mm: list[float]
+    created_at: datetime
+
+    @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
+    @property
+    def links(self) -> LensLinks:
+        """Where to go from here."""
+        own = f"{V1}/lenses/{self.id}"
+        return LensLinks(
+            self=own,
+            psf=f"{own}/psf",
+            field=f"{own}/field.png",
+            calibrations=f"{own}/calibrations",
+            lateral_colour=f"{own}/lateral-colour",
+            photos=f"{V1}/photos?lens_id={self.id}",
+        )
+
+
+class CalibrationOut(Model):
+    """One version of a lens: what changed, and how good the model was then."""
+
+    version: int
+    kind: str
+    photo_id: str | None
+    samples_added: int
+    samples: int
+    photos: int
+    error: dict[str, Any] | float | None = Field(description="held-out error; null until it is measured")
+    coverage: dict[str, Any] | None
+    created_at: datetime
+
+
+class LateralOut(Model):
+    """Lateral colour of a lens: what a point shown by green at r is shown at by red and blue.
+
+    The polynomials are (a, b, c, v) of r_src = r (v + c r + b r^2 + a r^3), with r in half
+    diagonals; (0, 0, 0, 1) is no shift.
+    """
+
+    lens_id: str
+    version: int
+    photos: int
+    red: tuple[float, float, float, float]
+    blue: tuple[float, float, float, float]
+
+
+class LensPage(Page[LensOut]):
+    """Some lenses, newest first."""
+
+
+class CalibrationPage(Page[CalibrationOut]):
+    """Some versions of a lens, oldest first."""
+
+
+class PsfQuery(Question):
+    """Where and how to ask for a PSF."""
+
+    r: float = Field(ge=0, le=1, allow_inf_nan=False, description="half diagonals: 0 centre, 1 corner")
+    phi: float = Field(
+        0.0, ge=-100, le=100, allow_inf_nan=False, description="radians, counter-clockwise from the right"
+    )
+    aperture: Aperture | None = None
+    channel: Channel = "g"
+    size: KernelSize = 55
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: float | None = Field(
+        None,
+        gt=0.1,
+        le=100,
+        allow_inf_nan=False,
+        description="pixel of the answer; that of most photos by default",
+    )
+    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
+    strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
+
+
+class KernelOut(Model):
+    """A kernel: row 0 is the top, the sum is 1, the centre of mass on the middle pixel."""
+
+    shape: tuple[int, int]
+    dtype: Literal["float32"]
+    data: list[list[float]]
+
+
+class QueryOut(Model):
+    """The question as it was understood."""
+
+    r: float
+    phi: float
+    aperture: float | None
+    channel: Channel
+    size: int
+    focal_length_mm: float | None
+    focus_distance_m: float | None
+
+
+class Support(Model):
+    """What an answer rests on."""
+
+    effective_samples: float
+    photos: int
+    extrapolated: bool
+    beyond: list[str] = Field(
+        default_factory=list, description="in which variables it lies outside the samples"
+    )
+    predicted_error: float | None
+    model: PsfModel = Field(default="default", description="the model of the lens that answered")
+    answered_by: str = Field(
+        description="what made the answer: network, regression, network and regression, or paper; the "
+        "numbers here are of that"
+    )
+    weights: str = Field(default="", description="fingerprint of the network's weights")
+    nearest: float = Field(
+        default=0.0,
+        description="distance to the nearest sample: 1 is a fifth of the half diagonal, a stop, or half an "
+        "octave of focal length",
+    )
+
+
+class Units(Model):
+    """Units of the answer."""
+
+    r: str = "half-diagonal"
+    phi: str = "radian"
+    pixel_pitch_um: float | None
+
+
+class PsfOut(Model):
+    """The PSF of a lens at one place and setting."""
+
+    lens_id: str
+    version: int
+    query: QueryOut
+    psf: KernelOut
+    support: Support
+    bandwidth: dict[str, float]
+    units: Units
+
+
+class FieldQuery(Question):
+    """What a field map shows."""
+
+    aperture: Aperture | None = None
+    channel: Channel = "g"
+    grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
+    size: KernelSize = 55
+    aspect: float = Field(
+        1.5, ge=0.2, le=5, allow_inf_nan=False, description="width over height of the picture"
+    )
+    view: str = Field(
+        "0,0,1,1",
+        pattern=r"^(0|1|0?\.\d{1,6})(,(0|1|0?\.\d{1,6})){3}$",
+        description="part of the picture that is shown: left, top, width and height as shares of it",
+    )
+    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
+    gamma: float = Field(0.5, ge=0.1, le=2, allow_inf_nan=False, description="brightness ~ value^gamma")
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+
+
+class Health(Model):
+    """The process lives."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Readiness(Model):
+    """Whether work can be taken, and what is missing."""
+
+    status: Literal["ready", "not ready"]
+    checks: dict[str, str]
+    sandbox: dict[str, bool] = Field(
+        description="Which measures of the kernel confine what decodes photos, in all workers."
+    )
+
+
+class VersionOut(Model):
+    """What runs here."""
+
+    name: str
+    version: str
+    api: str
+    schema_revision: str | None
+
+
+class FormatsOut(Model):
+    """What can be read and written, and the methods by name."""
+
+    read: list[str]
+    write: list[str]
+    color_spaces: list[str]
+    psf: list[str]
+    methods: list[str]
+    estimators: list[str]
+    selectors: list[str]
+
+
+class LimitsOut(Model):
+    """How much of everything."""
+
+    max_upload_bytes: int
+    max_megapixels: float
+    max_queued_photos: int
+    max_stored_bytes: int
+    max_psf_size: int
+    long_poll_seconds: float
+    keep_results_days: float
+
+
+class SignIn(Question):
+    """The key with which a browser signs in."""
+
+    key: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class SessionOut(Model):
+    """Who is signed in, and what he may; on a service of one owner without keys, that one."""
+
+    owner: str
+    scopes: list[Literal["read", "write", "admin"]]
+    needed: bool = Field(description="whether one must sign in here at all")
+
+
+class AccountOut(Model):
+    """What an owner has, and may have."""
+
+    owner: str
+    scopes: list[Literal["read", "write", "admin"]]
+    photos: int
+    max_photos: int
+    stored_bytes: int
+    max_stored_bytes: int
+    lenses: int
+    corrections: int
+    created_at: datetime | None

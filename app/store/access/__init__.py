@@ -1,1 +1,0 @@
-"""Rows of owners, keys and sessions."""

@@ -1,0 +1,75 @@
+"""A service of one's own for as long as a program needs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+
+from app.client import Client
+from lensmodel.core.errors import LensModelError
+
+_START_SECONDS = 90.0
+_STOP_SECONDS = 40.0
+"""Longest waits for the service to start and to stop (chosen): it kills its members after 15 s."""
+
+
+class ServiceDidNotStartError(LensModelError):
+    """The service ended, or was not ready in time; the text says where its log is."""
+
+
+@contextmanager
+def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None = None) -> Iterator[Client]:
+    """Start the real service on a free loopback port, wait until it is ready, and stop it at the end.
+
+    Parameters
+    ----------
+    data : Path
+        Folder of everything that it keeps.
+    log_file : Path
+        Where its log goes; what an earlier one wrote there is replaced.
+    settings : mapping of str to str, optional
+        Values of the environment, such as `LENS_ESTIMATOR`; nothing else of that prefix is passed on.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+    environment |= settings or {}
+    data.mkdir(parents=True, exist_ok=True)
+    with log_file.open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lensmodel", "serve", "--port", "0", "--data", str(data)],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+    try:
+        with Client(_ready(process, data, log_file), key="") as client:  # nobody is asked here
+            yield client
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(_STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def _ready(process: subprocess.Popen[bytes], data: Path, log_file: Path) -> str:
+    until = time.monotonic() + _START_SECONDS
+    while time.monotonic() < until and process.poll() is None:
+        try:
+            url = str(json.loads((data / "service.json").read_text(encoding="utf-8"))["url"])
+            if httpx2.get(f"{url}/readyz", timeout=5).status_code == httpx2.codes.OK:
+                return url
+        except (OSError, ValueError, KeyError, httpx2.HTTPError):
+            pass  # not there yet: asked again until the time is up
+        time.sleep(0.2)
+    status = process.poll()
+    became = f"was not ready within {_START_SECONDS:g} s" if status is None else f"ended with status {status}"
+    raise ServiceDidNotStartError(f"the service {became}; {log_file} says why")

@@ -33,6 +33,12 @@ def state(call: Call, ids: str) -> dict[str, Any]:
     return {
         "rows": list(zip(plans, map(views.correction_out, plans), jobs, strict=True)),
         "left": sum(job.state in {"queued", "running"} for job in jobs),
+        "share": sum(
+            1.0
+            if job.state not in {"queued", "running"}
+            else job.progress.done / max(job.progress.total or 1, 1)
+            for job in jobs
+        ),
         "done": sum(job.state == "succeeded" for job in jobs),
         "ids": ids,
     }

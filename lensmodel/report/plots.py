@@ -36,6 +36,7 @@ try:
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.patches import Circle, Rectangle
+    from matplotlib.ticker import MaxNLocator
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
@@ -342,7 +343,7 @@ def over_apertures(ax: Axes, report: LensReport, unit: Unit = "c/px") -> None:
     ax.set_xticks(list(stops), [one.at for one in known])
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel(f"MTF50, {_UNITS[unit]}")
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=4)  # seen also where the right is cut off
 
 
 def lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
@@ -382,8 +383,9 @@ def difference(ax: Axes, comparison: Comparison) -> None:
 
 
 def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
-    ax.set(xlim=(0.0, 1.0), ylim=(low, top), xlabel="0 centre, 1 corner", ylabel=words)
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    ax.set(xlim=(0.0, 1.0), ylim=(low, top), ylabel=words)
+    ax.set_xlabel("0 centre, 1 corner", loc="right")
+    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=4)  # seen also where the right is cut off
 
 
 # --- pages ------------------------------------------------------------------------------------
@@ -405,8 +407,9 @@ def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Uni
         image = sharpness_map(ax, found, values, factor=factor, top=top, error=unit is None)
         ax.set_xlabel(name)
     scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
-    ticks = np.linspace(0.0, top, 6)
-    scale.set_ticks(ticks.tolist(), labels=[_number(t, factor) for t in ticks])
+    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, top * factor)
+    ticks = [tick / factor for tick in round_ticks if tick <= top * factor]
+    scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
 
 
 def _photographer(report: LensReport) -> Figure:

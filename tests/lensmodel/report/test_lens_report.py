@@ -208,11 +208,20 @@ def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensRepor
         save(front, tmp_path / "front.bmp")
 
 
+def test_scales_of_maps_have_round_ticks(soft: LensReport) -> None:
+    scales = [ax for figure in pages(soft) for ax in figure.axes if ax.get_label() == "<colorbar>"]
+
+    assert len(scales) >= 2
+    for scale in scales:
+        step = float(np.diff(scale.get_xticks())[0])
+        assert round(step / 10.0 ** math.floor(math.log10(step)), 6) in {1.0, 2.0, 2.5, 5.0, 10.0}
+
+
 def test_maps_are_in_the_unit_that_was_asked_for(soft: LensReport) -> None:
     map_, errors = charts(soft, None, "lp/mm")[:2]
 
     assert map_.title == "MTF50 in line pairs per mm, f/2.8"
-    assert b">83<" in map_.svg  # half a cycle at 6 micrometres
+    assert b">80<" in map_.svg  # below half a cycle at 6 micrometres, 83
     assert errors.title.startswith("Standard error")
 
 

@@ -189,6 +189,21 @@ def test_the_page_of_a_photo_shows_its_correction(client: TestClient, corrected:
     assert "Nothing to correct here.</b> Removing the blur would not make it visibly better" in page
 
 
+def test_a_jpeg_without_gain_says_so_in_one_sentence_with_the_reason(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.counted()
+    assert store.photos.set_state(photo.public_id, ("counted",), "counted", kind="jpeg")
+
+    page = client.get(f"/photos/{photo.public_id}").text
+
+    said = re.search(r'data-nothing="([^"]*)"', page)
+    assert said is not None
+    assert said[1].startswith("Nothing to correct here. The camera has sharpened and compressed this JPEG")
+    assert said[1].count(". ") == 1
+    assert '<option value="jpeg" selected>' in page
+
+
 def test_corrections_are_followed_and_fetched_together(client: TestClient, corrected: dict[str, Any]) -> None:
     wish = {"photo_id": corrected["photo_id"], "output": {"format": "png8"}}
     waiting = client.post("/v1/corrections", json=wish).json()["id"]

@@ -37,7 +37,7 @@ Selector = Annotated[
 def calibrate(
     context: typer.Context,
     photos: Photos,
-    profile: Profile,
+    profile: Profile = None,
     aperture: Aperture = None,
     model: Annotated[
         str | None,
@@ -93,7 +93,7 @@ def calibrate(
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     run(
         photos,
-        profile,
+        files.named(profile),
         CalibrationOptions(
             aperture,
             estimator,

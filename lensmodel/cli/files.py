@@ -69,6 +69,16 @@ def same(first: Path, second: Path) -> bool:
     return first.exists() and second.exists() and first.samefile(second)
 
 
+def named(profile: Path | None) -> Path:
+    """Where the lens is written; it has no usual place, since a person may have several."""
+    if profile is None:
+        raise UsageError(
+            "what is learned is written to a lens profile; add its name, "
+            "for example --profile my-24mm.lensprofile"
+        )
+    return profile
+
+
 def profile_at(path: Path) -> LensProfile:
     """Open a profile."""
     if path.is_dir():

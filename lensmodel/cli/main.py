@@ -54,6 +54,7 @@ class Commands(OnDemand):
         "export": CommandEntry(
             "lensmodel.cli.report:export_psfs",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
+            panel="Research",
         ),
         "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
         "api": CommandEntry(
@@ -69,27 +70,39 @@ class Commands(OnDemand):
         "config": CommandEntry(
             "app.commands.service:config",
             "Print the effective settings as environment variables; secrets are masked.",
+            panel="Administration",
         ),
         "doctor": CommandEntry(
             "app.commands.upkeep:doctor",
             "Check an installation, running or not: tables, blobs, and whether a worker is running.",
+            panel="Administration",
         ),
         "backup": CommandEntry(
             "app.commands.upkeep:backup",
             "Copy all rows and blobs of an installation into a folder, even while it runs.",
+            panel="Administration",
+        ),
+        "restore": CommandEntry(
+            "app.commands.upkeep:restore", "Fill an empty installation from a backup.", panel="Administration"
         ),
         "demo": CommandEntry(
             "lab.demo.command:demo",
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
+            panel="Research",
         ),
         "reproduce": CommandEntry(
             "lab.commands.reproduce:reproduce",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
+            panel="Research",
         ),
         "keys": CommandEntry(
-            "app.commands.keys:keys", "Make, list, renew and end the keys of a service that others can reach."
+            "app.commands.keys:keys",
+            "Make, list, renew and end the keys of a service that others can reach.",
+            panel="Administration",
         ),
-        "bench": CommandEntry("lab.commands.benchmarks:bench", "Measure quality and speed."),
+        "bench": CommandEntry(
+            "lab.commands.benchmarks:bench", "Measure quality and speed.", panel="Research"
+        ),
     }
 
 

@@ -46,7 +46,7 @@ def measure(
     context: typer.Context,
     kind: Annotated[str, typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show.")],
     photos: Photos,
-    profile: Profile,
+    profile: Profile = None,
     aperture: Aperture = None,
     size: Annotated[
         int, typer.Option(min=9, max=101, metavar="N", help="Side of a PSF in pixels, an odd number.")
@@ -105,7 +105,7 @@ def measure(
             raise UsageError("--output shows the edges of one photo: lensmodel measure edges PHOTO -o DIR")
         files.refuse_existing(*(output / name for name in EDGE_FILES), force=force)
     options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens, output)
-    _run(photos, profile, options, shown, as_json=json_output)
+    _run(photos, files.named(profile), options, shown, as_json=json_output)
 
 
 def _run(

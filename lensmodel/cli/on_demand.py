@@ -19,6 +19,7 @@ class CommandEntry:
     home: str
     summary: str  # first sentence of its help
     hidden: bool = False  # whether the list leaves it out
+    panel: str | None = None  # under which heading the list has it; None: first, under Commands
 
 
 class OnDemand(TyperGroup):
@@ -30,7 +31,9 @@ class OnDemand(TyperGroup):
     def __init__(self, **given: Any) -> None:  # noqa: ANN401 - what Typer passes
         super().__init__(**given)
         for name, entry in self.entries.items():
-            self.add_command(TyperCommand(name, help=entry.summary, hidden=entry.hidden))
+            self.add_command(
+                TyperCommand(name, help=entry.summary, hidden=entry.hidden, rich_help_panel=entry.panel)
+            )
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - Typer's own
         """Import the command that the words name."""

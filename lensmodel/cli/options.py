@@ -60,7 +60,9 @@ def aperture_option(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` re
 Photos = Annotated[
     list[str], typer.Argument(metavar="PHOTO", help="Files, folders, or quoted patterns such as '*.dng'.")
 ]
-Profile = Annotated[Path, typer.Option("--profile", "-p", metavar="FILE", help="The lens profile.")]
+Profile = Annotated[
+    Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The lens profile; always needed.")
+]
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
 Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
 AnyLens = Annotated[

@@ -22,7 +22,6 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.types import BayerPattern, NoiseModel, Plane, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
-from lensmodel.photo.headers.ciff import read_ciff
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
@@ -78,6 +77,10 @@ class DevelopedRaw:
     defects: int
 
 
+_KNOWN_WHOLE: Final = ((6, b"HEAPCCDR"), (8, b"CR\x02"), (0, b"\0MRM"))
+"""CRW, CR2, MRW: LibRaw reads every camera that wrote them, so that one it does not know is damaged."""
+
+
 @contextmanager
 def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
     """Open a RAW file with LibRaw's header parser; foreign errors become ours."""
@@ -88,10 +91,11 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
     except LensModelError:
         raise
     except rawpy.LibRawFileUnsupportedError as error:
-        crw = read_ciff(path.read_bytes())
-        if crw is not None and crw.model is None:  # cut off, its directory is missing: that is at the end
+        with path.open("rb") as file:
+            head = file.read(16)
+        if any(head[at : at + len(magic)] == magic for at, magic in _KNOWN_WHOLE):
             raise TruncatedImageError(
-                "the RAW file ends before its data do; the upload was cut off"
+                "the RAW file is damaged, or ends before its data do: the upload may have been cut off"
             ) from error
         raise UnsupportedFormatError(
             "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,15 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.names import full_name
 from lensmodel.core.psf import PsfSample, centred
-from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEFAULT_SIZE = 55
 """Side of a kernel in pixels (chosen): what a correction uses, so that the same numbers are seen."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Lens:
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
@@ -40,6 +44,12 @@ class Lens:
     """
 
     profile: LensProfile
+
+    def __repr__(self) -> str:
+        apertures = sorted({s.settings.aperture for s in self.samples if s.settings.aperture is not None})
+        span = "" if not apertures else f", f/{apertures[0]:g}"
+        span += f" to f/{apertures[-1]:g}" if len(apertures) > 1 else ""
+        return f"<Lens: {self.description}, {len(self.samples)} samples{span}>"
 
     @classmethod
     def from_kernels(
@@ -190,13 +200,25 @@ class Lens:
             `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2;
             `.answered_by` what made it; `.photos` and `.effective_samples` what of.
 
+        Warns
+        -----
+        UserWarning
+            If no photo shows this place at these settings.
+
         Raises
         ------
         InvalidInputError
             If a value is out of its range.
         """
         settings = LensSettings(aperture, focal_mm, focus_m, channel)
-        return self.model.query(FieldPosition(r, phi), settings, size)
+        answer = self.model.query(FieldPosition(r, phi), settings, size)
+        if answer.extrapolated:
+            warnings.warn(
+                f"no photo shows r = {r:g}, phi = {phi:g} at these settings: the PSF there is a guess, "
+                f"expected to be wrong by {answer.predicted_error:.0%}",
+                stacklevel=2,
+            )
+        return answer
 
     def kernels(
         self,
@@ -315,6 +337,116 @@ class Lens:
             for along, turn in enumerate((0.0, np.pi / 2.0)):
                 out[(along, *index)] = mtf50_from_kernel(kernels[index], float(phi[index]) + turn)
         return out
+
+    def psf_grid(
+        self,
+        rows: int = 5,
+        cols: int = 7,
+        *,
+        aspect: float = 1.5,
+        aperture: float | None = None,
+        channels: Sequence[Channel] = CHANNELS,
+        size: int = 31,
+    ) -> dict[str, Any]:
+        """Return the kernels over the picture with their axes, as `xarray.DataArray.from_dict` takes them.
+
+        Parameters
+        ----------
+        rows, cols : int
+            Equal cells of the picture; each kernel is that of its cell's center.
+        aspect : float
+            Width over height of the picture.
+        aperture, size
+            As of `psf`.
+        channels : sequence of {"r", "g", "b"}
+            Colors.
+
+        Returns
+        -------
+        dict
+            `dims` channel, row, col, v, u; `data`, an ndarray of float64; `coords` with `r` and `phi` of each
+            cell, and pixels from the kernel's middle: `u` to the right, `v` downwards.
+        """
+        r, phi = field_grid(rows, cols, aspect=aspect)
+        data = np.stack([self.kernels(r, phi, aperture=aperture, channel=c, size=size) for c in channels])
+        pixels = np.arange(size) - size // 2
+        coords = {
+            "channel": {"dims": ("channel",), "data": list(channels)},
+            "r": {"dims": ("row", "col"), "data": r},
+            "phi": {"dims": ("row", "col"), "data": phi},
+            "u": {"dims": ("u",), "data": pixels},
+            "v": {"dims": ("v",), "data": pixels},
+        }
+        dims = ("channel", "row", "col", "v", "u")
+        return {
+            "dims": dims,
+            "coords": coords,
+            "data": data,
+            "name": "psf",
+            "attrs": {"lens": self.description},
+        }
+
+    def plot_field(
+        self,
+        rows: int = 5,
+        cols: int = 7,
+        *,
+        aspect: float = 1.5,
+        aperture: float | None = None,
+        channel: Channel = "g",
+        size: int = 25,
+    ) -> Figure:
+        """Draw the PSF over the picture, each cell to its own brightest pixel; needs the extra `report`.
+
+        Parameters
+        ----------
+        rows, cols, aspect, aperture, channel, size
+            As of `psf_grid`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Shown by a notebook as it is; `.savefig(...)` writes it.
+        """
+        from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+
+        grid = self.psf_grid(rows, cols, aspect=aspect, aperture=aperture, channels=(channel,), size=size)
+        figure = Figure(figsize=(1.3 * cols, 1.3 * rows + 0.4), layout="constrained")
+        figure.suptitle(f"{self.description}{'' if aperture is None else f', f/{aperture:g}'}")
+        for axes, kernel in zip(
+            figure.subplots(rows, cols, squeeze=False).flat, grid["data"].reshape(-1, size, size), strict=True
+        ):
+            axes.imshow(kernel, cmap="gray", vmin=0.0)
+            axes.set(xticks=[], yticks=[])
+        return figure
+
+    def sample_table(self) -> dict[str, NDArray[Any]]:
+        """Return what the lens was made of as columns of one length; `pandas.DataFrame` takes them.
+
+        Returns
+        -------
+        dict of str to ndarray
+            r, phi, aperture, focal_mm, focus_m, channel, weight, error, photo, estimator; numbers that are
+            not known are NaN.
+        """
+        own = self.samples
+        numbers = {
+            "r": [s.position.r for s in own],
+            "phi": [s.position.phi for s in own],
+            "aperture": [s.settings.aperture for s in own],
+            "focal_mm": [s.settings.focal_mm for s in own],
+            "focus_m": [s.settings.focus_m for s in own],
+            "weight": [s.weight for s in own],
+            "error": [s.error for s in own],
+        }
+        texts = {
+            "channel": [s.settings.channel for s in own],
+            "photo": [self.profile.photos.get(s.photo, s.photo) for s in own],
+            "estimator": [s.estimator for s in own],
+        }
+        return {name: np.array(column, dtype=np.float64) for name, column in numbers.items()} | {
+            name: np.array(column, dtype=np.str_) for name, column in texts.items()
+        }
 
     @property
     def model(self) -> LensModel:

@@ -442,6 +442,8 @@ def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
 # --- refusals ----------------------------------------------------------------------------------
 
 REFUSED = {
+    "nowhere to write": (["calibrate", "one.dng"], 2, "add its name, for example --profile my-24mm"),
+    "nowhere to measure into": (["measure", "edges", "one.dng"], 2, "add its name, for example --profile"),
     "missing photo": (["calibrate", "gone.dng", "-p", "new"], 2, "no photo called gone.dng"),
     "empty folder": (["calibrate", "empty", "-p", "new"], 2, "no photo in the folder empty"),
     "no image": (["correct", "text.dng", "-p", PROFILE, "-o", "out"], 1, "belong to no photo format"),

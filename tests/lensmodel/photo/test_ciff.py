@@ -255,5 +255,13 @@ def test_a_crw_that_is_cut_off_is_damaged_not_of_an_unknown_kind(kept: float, tm
         (tmp_path / name).write_bytes(data)
 
     raw_size(tmp_path / "whole.crw")
-    with pytest.raises(TruncatedImageError, match="ends before its data"):
+    with pytest.raises(TruncatedImageError, match="damaged"):
         raw_size(tmp_path / "cut.crw")
+
+
+@pytest.mark.parametrize("head", [b"II*\0\x10\0\0\0CR\x02\0", b"\0MRM"], ids=["CR2", "MRW"])
+def test_other_kinds_that_no_camera_writes_anew_are_damaged_too(head: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "photo.raw"
+    path.write_bytes(head + bytes(400))
+    with pytest.raises(TruncatedImageError, match="damaged"):
+        raw_size(path)

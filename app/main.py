@@ -11,8 +11,7 @@ from fastapi import APIRouter, Depends, FastAPI
 from starlette.routing import BaseRoute
 
 from app import pages
-from app.access.authentication import Gate
-from app.blobs.folder_creation import settle_folder
+from app.access import Gate
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.dependencies import Fresh, Places, Services, call_of
@@ -48,7 +47,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store = Store(chosen)
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
-            settle_folder(store, storage)
+            storage.settle(store.photos.newest_file)
         cache = ModelCache(store, chosen.model_cache_mb * MIB)
         app.state.services = Services(
             chosen,

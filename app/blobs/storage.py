@@ -10,7 +10,7 @@ import contextlib
 import errno
 import os
 import shutil
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -20,6 +20,7 @@ from urllib.parse import unquote, urlsplit
 
 import obstore
 from obstore.store import LocalStore, ObjectStore, from_url
+from sqlalchemy.exc import OperationalError, ProgrammingError
 
 from app.store.database import new_id
 
@@ -82,8 +83,8 @@ class Storage:
         How long one request to an object store may take. It is retried once, quickly; jobs wait for
         longer outages, and requests are answered with an error.
     create : bool
-        Whether to create a missing folder. Where it may be unmounted rather than new use
-        `app.blobs.folder_creation`: a folder that is created while its disk is missing hides that.
+        Whether to create a missing folder. Where it may be unmounted rather than new use `settle`: a folder
+        that is created while its disk is missing hides that.
     """
 
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
@@ -106,6 +107,21 @@ class Storage:
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / MARK).write_text("Without this file the folder counts as not mounted.\n")
+
+    def settle(self, newest: Callable[[], str | None]) -> None:
+        """Create the folder if it is new; leave one whose disk is only unmounted as it is.
+
+        It is new as long as no row names a file; `newest` returns the key of the file of the newest photo, by
+        which a folder is recognised that is older than the mark.
+        """
+        if self.folder is None or self.is_there:
+            return
+        try:
+            key = newest()
+        except (OperationalError, ProgrammingError):
+            return  # the tables are missing or away: nothing is decided, and /readyz says so
+        if key is None or (self.folder / key).is_file():
+            self.create()
 
     @property
     def is_there(self) -> bool:

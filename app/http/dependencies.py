@@ -16,7 +16,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
-from app.access.authentication import Gate, Who
+from app.access import Gate, Who
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings

@@ -21,10 +21,10 @@ REPORT: Final = "report.json"
 """The report of a lens test."""
 
 R_MAP: Final = "r-map.png"
-"""Where the edges of a developed photo tell about the blur, by `app.blobs.previews`."""
+"""Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`."""
 
 THUMBNAIL: Final = "glance.jpg"
-"""Small picture of a photo before it is developed, by `app.blobs.thumbnails`; stored ones have this name."""
+"""Small picture of a photo before it is developed, by `app.blobs.small_pictures`; stored ones too."""
 
 SHOWN: Final = "shown.tiles"
 """The developed photo in full size, by `app.blobs.tiles`."""

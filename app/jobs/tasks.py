@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from app import distances
-from app.blobs import previews, thumbnails
+from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
@@ -110,7 +110,8 @@ def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
 def thumbnail(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Render a small picture of the photo at `path`."""
     del progress
-    picture = thumbnails.thumbnail(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
+    kind, orientation = arguments["kind"], arguments["orientation"] or 1
+    picture = small_pictures.thumbnail(Path(arguments["path"]), kind, orientation)
     (folder / THUMBNAIL).write_bytes(picture)
     return {}
 
@@ -121,7 +122,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
     sampling.save_developed(developed, folder)
-    (folder / R_MAP).write_bytes(previews.confidence_map(developed))
+    (folder / R_MAP).write_bytes(small_pictures.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 

@@ -16,12 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from app.blobs.erasure import erase
-from app.blobs.folder_creation import settle_folder
+from app.blobs.account_data import erase
 from app.blobs.storage import Storage
-from app.jobs.context import JobContext, JobFailedError
+from app.jobs.context import JobContext, JobFailedError, drop_developed
 from app.jobs.correction_work import CorrectionWork
-from app.jobs.developed_cache import drop_developed
 from app.jobs.inspection import remove_location
 from app.jobs.job_log import JobRecord, accounted
 from app.jobs.photo_work import PhotoWork
@@ -133,7 +131,7 @@ class Worker:
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         lease = self._start_thread(beat_s, self._keep_lease)
-        self._insist(lambda: settle_folder(self._store, self._context.storage))
+        self._insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
         photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
         self._engine.start(
             {

@@ -10,9 +10,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
-from app.access.authentication import COOKIE, SESSION
-from app.blobs.erasure import erase
-from app.blobs.export import exported
+from app.access import COOKIE, SESSION
+from app.blobs.account_data import erase, exported
 from app.http.dependencies import CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import most

@@ -1,23 +1,45 @@
-"""Keys and sessions as rows: create, look up, end."""
+"""Keys and sessions: their format and hashes; as rows created, looked up, ended.
+
+A key is `lpk_<prefix>_<secret>`. The prefix finds its row and may be shown; the secret is 32 random bytes,
+shown once, and only its hash is kept.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import re
+import secrets
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Final
+from typing import Final, Literal, TypeAlias, get_args
 
 from sqlalchemy import ColumnElement, Select, delete, or_, select, update
 from sqlalchemy.orm import Session
 
-from app.access import keys
-from app.access.keys import NewKey, Scope
 from app.store.database import Database
 from app.store.owners import ensure_owner, now
 from app.store.tables import KeyRow, OwnerRow, SessionRow
 
+Scope: TypeAlias = Literal["read", "write", "admin"]
+SCOPES: Final[tuple[Scope, ...]] = get_args(Scope)
+"""Each includes those before it: read, write to change data, admin to erase the account."""
+
+_KEY: Final = re.compile(r"lpk_([a-z0-9]{8})_([A-Za-z0-9_-]{43})", re.ASCII)
+_PREFIX_SIGNS: Final = "abcdefghijkmnpqrstuvwxyz23456789"
+"""Characters of a prefix, without those that look alike."""
+
 USE_PRECISION: Final = timedelta(minutes=10)
 """Precision of `last_used_at` (chosen): each update is a write."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewKey:
+    """A new key: `text` is shown once, the others are stored."""
+
+    text: str
+    prefix: str
+    key_hash: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +78,7 @@ class KeyStore:
         quota_photos: int | None = None,
     ) -> NewKey:
         """Create a key for an owner, and the owner if new; quotas that are given replace the present ones."""
-        key = keys.make()
+        key = make()
         with self._db.writing(durable=True) as session:
             owner_key = ensure_owner(session, owner)
             quotas = {"quota_bytes": quota_bytes, "quota_photos": quota_photos}
@@ -71,7 +93,7 @@ class KeyStore:
 
         None if there is no such key, or it is no longer valid.
         """
-        key = keys.make()
+        key = make()
         with self._db.writing(durable=True) as session:
             old = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix, _valid()).with_for_update())
             if old is None:
@@ -182,3 +204,27 @@ def _add(
 def _end(session: Session, key: KeyRow) -> None:
     key.revoked_at = key.revoked_at or now()
     session.execute(delete(SessionRow).where(SessionRow.key_id == key.id))
+
+
+def make() -> NewKey:
+    """Generate a key."""
+    prefix = "".join(secrets.choice(_PREFIX_SIGNS) for _ in range(8))
+    text = f"lpk_{prefix}_{secrets.token_urlsafe(32)}"
+    return NewKey(text, prefix, digest_of(text))
+
+
+def prefix_of(text: str) -> str | None:
+    """Return the prefix of a text in the format of a key, None of any other."""
+    match = _KEY.fullmatch(text)
+    return None if match is None else match[1]
+
+
+def digest_of(text: str) -> str:
+    """Return the hash of a key or session token, which have 256 random bits: a slow one would add nothing."""
+    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()
+
+
+def covers(held: Iterable[str], wanted: Scope) -> bool:
+    """Say whether scopes include one of them."""
+    ranks = [SCOPES.index(scope) for scope in SCOPES if scope in set(held)]
+    return bool(ranks) and max(ranks) >= SCOPES.index(wanted)

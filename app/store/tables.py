@@ -420,7 +420,7 @@ class KeyRow(Base):
     key_hash: Mapped[str] = mapped_column(String(200), unique=True)
     label: Mapped[str | None]
     scopes: Mapped[str] = mapped_column(String(60))
-    """Words of `app.access.keys.SCOPES`, separated by spaces."""
+    """Words of `app.store.keys.SCOPES`, separated by spaces."""
 
     created_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]

@@ -18,7 +18,6 @@ import pytest
 from sqlalchemy import Engine, create_engine
 from starlette.testclient import TestClient
 
-from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
@@ -198,7 +197,7 @@ def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
         shutil.copy(empty_database, settings.data_dir / "app.db")
     opened = Store(settings)
     # before rows that name files which are not there
-    settle_folder(opened, Storage(settings.storage, create=False))
+    Storage(settings.storage, create=False).settle(opened.photos.newest_file)
     yield opened
     opened.close()
 

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import func, select, update
 from starlette.testclient import TestClient
 
-from app.blobs.erasure import erase
+from app.blobs.account_data import erase
 from app.store import Store
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import (

@@ -15,12 +15,12 @@ from fastapi.routing import APIRoute
 from sqlalchemy import select, update
 from starlette.testclient import TestClient
 
-from app.access import authentication, keys
+from app import access
 from app.main import create_app
 from app.pages import lens_pages, photo_pages, pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
-from app.store import Store
+from app.store import Store, keys
 from app.store.corrections import Result
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER, now
@@ -262,7 +262,7 @@ def test_another_site_cannot_sign_a_browser_in(guarded: TestClient, store: Store
 def test_keys_end_by_revoking_expiry_and_rotation(
     guarded: TestClient, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)  # each request looks
+    monkeypatch.setattr("app.access.FRESH_S", 0.0)  # each request looks
     made = store.keys.create("anna", ["read"], lasts=timedelta(days=1))
 
     def status(key: str) -> int:
@@ -308,7 +308,7 @@ def test_scopes_allow_what_they_say(
 def test_loopback_asks_nobody_until_there_is_a_key(
     client: TestClient, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)
+    monkeypatch.setattr("app.access.FRESH_S", 0.0)
     photo = steps.receive()
 
     before = client.get("/v1/session").json()
@@ -323,7 +323,7 @@ def test_loopback_asks_nobody_until_there_is_a_key(
 def test_a_stream_of_events_ends_with_the_key(
     guarded: TestClient, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)
+    monkeypatch.setattr("app.access.FRESH_S", 0.0)
     monkeypatch.setattr("app.routes.jobs.LOOK_S", 0.1)
     steps.owner = "anna"
     photo = steps.receive()
@@ -367,13 +367,13 @@ def test_more_requests_than_there_may_be_are_told_when_to_come_again(
 def test_a_bucket_fills_again(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    bucket = authentication.Rates(60)
+    bucket = access.Rates(60)
     taken = [bucket.wait_of("anna") for _ in range(11)]
 
     assert taken == [0.0] * 10 + [1.0]
     clock[0] += 1.0
     assert (bucket.wait_of("anna"), bucket.wait_of("anna")) == (0.0, 1.0)
-    assert authentication.Rates(0).wait_of("anna") == 0.0
+    assert access.Rates(0).wait_of("anna") == 0.0
 
 
 def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: Store) -> None:

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 from starlette.requests import Request
 
-from app.access import keys
-from app.access.keys import SCOPES, Scope
 from app.errors import ForbiddenError, NotSignedInError, QuotaError
-from app.store.keys import Holder, KeyStore
+from app.store import keys
+from app.store.keys import SCOPES, Holder, KeyStore, Scope
 from app.store.owners import LOCAL
 
 if TYPE_CHECKING:

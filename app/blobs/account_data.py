@@ -1,4 +1,4 @@
-"""All data of an owner as one ZIP file, written while it is sent: never whole in memory."""
+"""All data of an owner: as one ZIP file, written while it is sent and never whole in memory; and erased."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from app.blobs.storage import Storage
 from app.store import Store
+from app.store.accounts import AccountStore
 from app.store.tables import Base, CorrectionRow, EventRow, KeyRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 TABLES: Final[Mapping[str, type[Base]]] = {
@@ -120,3 +121,10 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of any type
     if isinstance(value, datetime):
         return value.isoformat()
     return base64.b64encode(value).decode("ascii") if isinstance(value, bytes) else value
+
+
+def erase(accounts: AccountStore, storage: Storage, owner_key: int) -> None:
+    """Erase what is left of an owner, rows before blobs. If killed, a later call continues."""
+    while (prefixes := accounts.erase_some(owner_key)) is not None:
+        for prefix in prefixes:
+            storage.delete(prefix)

@@ -1,4 +1,4 @@
-"""A small picture of a photo before it is developed, by which its owner recognises it."""
+"""Small pictures that children make: of a photo before it is developed, and of its r-map afterwards."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ import rawpy
 import tifffile
 from PIL import Image, ImageOps
 
-from lensmodel.photo import upright
+from lensmodel.patches import r_map
+from lensmodel.photo import LinearPhoto, upright
 
-SIDE: Final = 480
+THUMBNAIL_SIDE: Final = 480
 """Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""
+
+MAP_SIDE: Final = 1600
+"""Longer side of the picture in pixels at most (chosen): fills a usual screen."""
 
 _EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}
 """LibRaw's `flip` as EXIF orientation."""
@@ -38,11 +42,11 @@ def thumbnail(path: Path, kind: str, orientation: int) -> bytes:
     """
     if kind in _PLAIN:
         with Image.open(path) as image:
-            image.draft("RGB", (2 * SIDE, 2 * SIDE))
+            image.draft("RGB", (2 * THUMBNAIL_SIDE, 2 * THUMBNAIL_SIDE))
             return _small(_turned(image, orientation))
     if kind == "tiff":
         pixels = tifffile.imread(path)
-        step = max(1, max(pixels.shape[:2]) // SIDE)
+        step = max(1, max(pixels.shape[:2]) // THUMBNAIL_SIDE)
         return _small(Image.fromarray(upright(_eight_bits(pixels[::step, ::step]), orientation)))
     with rawpy.imread(str(path)) as raw:
         flip = _EXIF_OF_FLIP.get(int(raw.sizes.flip), 1)
@@ -52,7 +56,7 @@ def thumbnail(path: Path, kind: str, orientation: int) -> bytes:
             return _small(Image.fromarray(raw.postprocess(half_size=True, use_camera_wb=True, output_bps=8)))
         if isinstance(thumb.data, bytes):
             with Image.open(io.BytesIO(thumb.data)) as image:
-                image.draft("RGB", (2 * SIDE, 2 * SIDE))
+                image.draft("RGB", (2 * THUMBNAIL_SIDE, 2 * THUMBNAIL_SIDE))
                 return _small(_turned(image, flip))
         return _small(Image.fromarray(np.ascontiguousarray(upright(thumb.data, flip))))
 
@@ -75,7 +79,24 @@ def _eight_bits(pixels: np.ndarray) -> np.ndarray:
 
 def _small(image: Image.Image) -> bytes:
     shown = image.convert("RGB")
-    shown.thumbnail((SIDE, SIDE))
+    shown.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     out = io.BytesIO()
     shown.save(out, "JPEG", quality=82)
     return out.getvalue()
+
+
+def confidence_map(developed: LinearPhoto) -> bytes:
+    """Render the r-map of the green plane as a PNG: bright at informative edges."""
+    step = _step(developed)
+    values = r_map(np.ascontiguousarray(developed.planes[1][::step, ::step]))
+    scaled = (255 * np.clip(values / max(float(np.quantile(values, 0.99)), 1e-6), 0, 1)).astype(np.uint8)
+    heat = np.stack([scaled, scaled // 2, np.zeros_like(scaled)], axis=-1)
+    out = io.BytesIO()
+    turned = upright(heat, developed.encoding.orientation)
+    Image.fromarray(np.ascontiguousarray(turned)).save(out, "PNG", compress_level=3)
+    return out.getvalue()
+
+
+def _step(developed: LinearPhoto) -> int:
+    short, long = sorted((developed.frame.height, developed.frame.width))
+    return min(-(-long // MAP_SIDE), short // 2)  # at least two rows of a panorama

@@ -1,1 +1,0 @@
-"""Authentication and authorisation: keys, browser sessions, rate limits."""

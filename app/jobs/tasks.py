@@ -61,13 +61,12 @@ LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
 """What the library imports where it is used: here the fork server does it once, not each of its children."""
 
 for _module in LATE:
-    with contextlib.suppress(ImportError):  # loops are compiled where an extra is installed
-        importlib.import_module(_module)
+    importlib.import_module(_module)
 
 
 def _ready_for_loops() -> None:
     """Let Numba set up what every compiled loop needs: each child would take a third of a second for it."""
-    with contextlib.suppress(ImportError, AttributeError):  # an extra, and names that it may change
+    with contextlib.suppress(ImportError, AttributeError):  # names that it may change
         target = importlib.import_module("numba.core.registry").cpu_target
         target.typing_context.refresh()
         target.target_context.refresh()

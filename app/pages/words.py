@@ -46,16 +46,9 @@ FILES: Final[Mapping[str, str]] = {
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 CHECKS: Final[Mapping[str, str]] = {
-    "too dark": "darker than anything nearby",
-    "too bright": "brighter than anything nearby",
     "isolated pixels": "single pixels that stand out",
-    "hue, spots": "spots of a colour that the photo does not have there",
-    "hue, area": "a tint that the photo does not have there",
     "re-blur": "detail that does not match the photo",
-    "spectrum": "sharper than this lens allows",
-    "comb": "lines beside lines",
-    "ringing": "rings beside edges",
-    "grain": "grain beyond that of the photo",
+    "spectrum": "finer contrast than the photo can have held",
 }
 LEAST: Final = 0.005
 """Share below which a check is not mentioned (chosen): less than can be seen."""

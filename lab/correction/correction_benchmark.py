@@ -16,6 +16,7 @@ import numpy as np
 from scipy import special
 from skimage import restoration
 
+from lab.compiled_transforms import bare_transforms
 from lab.correction.methods import compared
 from lab.peers import Peer
 from lensmodel.core.errors import InvalidInputError
@@ -25,7 +26,6 @@ from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel, Pla
 from lensmodel.correction import Deconvolver, Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
-from lensmodel.correction.engine import compiled
 from lensmodel.quality.images import to_srgb
 
 _TILE = 256  # pixels: a tile of the engine
@@ -216,22 +216,20 @@ def _kernel_times() -> dict[str, float]:
             wide, blur.kernel.astype(np.float32), num_iter=4
         )
 
-    loops = compiled("auto")
-    works = {"ours": ours, "scikit_image": theirs}
-    if loops is not None:
-        from lab.compiled_transforms import bare_transforms  # noqa: PLC0415 - needs Numba
-
-        canvas = np.zeros(fast_shape((_TILE, _TILE)), dtype=np.float32)
-        works["bare_transforms"] = lambda: bare_transforms(canvas, 2 * steps)
+    canvas = np.zeros(fast_shape((_TILE, _TILE)), dtype=np.float32)
+    works = {
+        "ours": ours,
+        "scikit_image": theirs,
+        "bare_transforms": lambda: bare_transforms(canvas, 2 * steps),
+    }
     spent = _cpu(works)
     times = {
         "ours": spent["ours"] / steps / megapixels,
         "scikit_image": spent["scikit_image"] / 4 / (wide.size / 1e6),
     }
     times["share_of_scikit_image"] = times["ours"] / times["scikit_image"]
-    if loops is not None:
-        times["bare_transforms"] = spent["bare_transforms"] / steps / megapixels
-        times["over_bare_transforms"] = times["ours"] / times["bare_transforms"]
+    times["bare_transforms"] = spent["bare_transforms"] / steps / megapixels
+    times["over_bare_transforms"] = times["ours"] / times["bare_transforms"]
     return times
 
 

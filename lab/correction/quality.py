@@ -1,15 +1,12 @@
 """Windows of a large frame, photographed through lenses with known PSFs.
 
 A frame of 6 megapixels is photographed only where it is looked at: a window in the center, one half
-way out and one in a corner, where the kernels are those of the whole field. Every window shows the
-left half of one photograph and the right half of another.
+way out and one in a corner, where the kernels are those of the whole field.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,22 +15,14 @@ from scipy import signal
 
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
-from lensmodel.simulate import load_scene
-
-EXPOSURES: Final[dict[str, NoiseModel]] = {
-    "base ISO": NoiseModel(1 / 50_000, 0.001**2),
-    "high ISO": NoiseModel(1 / 2_500, 0.003**2),
-}
-"""Full well of 50,000 and 2,500 electrons, read noise of 0.1 and 0.3 percent of full scale (chosen)."""
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, Planes
 
 FRAME: Final = Frame(2000, 3000)
 WINDOW: Final = (320, 480)  # rows and columns (chosen): a whole frame would take too long
 CORNERS: Final[dict[str, tuple[int, int]]] = {"center": (840, 1260), "mid": (340, 660), "corner": (0, 0)}
 """First pixel of each window."""
-_AROUND, _KERNEL, _NODES, _RIM = 64, 55, 120, 8
-"""Pixels around a window that are corrected with it, across a kernel, between kernels, and along the rim that
-does not count (chosen)."""
+_AROUND, _KERNEL, _NODES = 64, 55, 120
+"""Pixels around a window that are corrected with it, across a kernel, and between kernels (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,23 +46,6 @@ class FrameWindow:
     light: Planes  # blurred light without noise, wider than the window by what the correction looks at
     scene: Planes  # the sharp light at the same pixels
     roi: tuple[int, int, int, int]  # the window, as `correct_planes` takes it
-
-    def inner(self, planes: Planes) -> Planes:
-        """Cut the window, less a rim, out of planes of what was photographed."""
-        top, left = self.roi[0] - self.top + _RIM, self.roi[1] - self.left + _RIM
-        return planes[:, top : top + self.roi[2] - 2 * _RIM, left : left + self.roi[3] - 2 * _RIM]
-
-
-def composed(files: Sequence[Path], gain: float = 1.0) -> Planes:
-    """Left half of one photograph and right half of another, as large as a window and all around it."""
-    rows, cols = (extent + 2 * (_AROUND + _KERNEL) for extent in WINDOW)
-    halves = []
-    for path in files:
-        scene = load_scene(path)
-        wide = cols // len(files)
-        top, left = (scene.shape[1] - rows) // 2, (scene.shape[2] - wide) // 2
-        halves.append(scene[:, top : top + rows, left : left + wide])
-    return np.ascontiguousarray(np.concatenate(halves, axis=2) * np.float32(gain), dtype=np.float32)
 
 
 def view(zone: str, scene: Planes, field: PsfField) -> FrameWindow:
@@ -109,9 +81,3 @@ def _nodes(extent: int) -> list[tuple[float, NDArray[np.float32]]]:
         (float(p), np.interp(t, places, row).astype(np.float32))
         for p, row in zip(places, np.eye(count), strict=True)
     ]
-
-
-def exposed(light: Planes, noise: NoiseModel, rng: np.random.Generator) -> Planes:
-    """Light on the sensor with noise, clipped at saturation."""
-    seen = light + rng.standard_normal(light.shape) * np.sqrt(noise.variance(light))
-    return np.minimum(seen, 1.0).astype(np.float32)

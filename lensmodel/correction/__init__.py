@@ -11,12 +11,12 @@ from lensmodel.correction.deconvolver import (
     restore_planes,
 )
 from lensmodel.correction.expected_gain import ZoneReport
-from lensmodel.correction.limits.bounds import Bounds
-from lensmodel.correction.limits.chroma import StoredColour
+from lensmodel.correction.limit import Bounds
 from lensmodel.correction.methods.catalogue import deconvolvers
 from lensmodel.correction.methods.direct import DirectFilter
 from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.lattice import Roi
 from lensmodel.correction.whole_photo import Corrected, PsfError, correct_planes
 

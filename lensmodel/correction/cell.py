@@ -1,4 +1,4 @@
-"""Correct one cell of a photo: plan, restore, return texture, limit, audit."""
+"""Correct one cell of a photo: plan, restore, limit, audit."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lensmodel.core.belief import Belief
 from lensmodel.core.errors import InvalidInputError
@@ -26,16 +27,16 @@ from lensmodel.core.types import (
 )
 from lensmodel.correction.audit import Evidence, TileAudit, held_back
 from lensmodel.correction.blur import Drift, UniformBlur
-from lensmodel.correction.deconvolver import Deconvolver, Sensor, restore_planes
+from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
-from lensmodel.correction.lights.beside_clipped import held_beside_clipped
-from lensmodel.correction.lights.saturation import far
-from lensmodel.correction.limits.bounds import Bounds, photo_around
-from lensmodel.correction.limits.chroma import StoredColour
-from lensmodel.correction.limits.hue import HUE_REACH, hue_bounded, hue_held
+from lensmodel.correction.limit import Bounds, limited
+from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.canvas import fitted_halo
 from lensmodel.correction.tiles.lattice import Cell
-from lensmodel.correction.tiles.texture import SHARE, texture_kept
+
+_WINDOW, _NOISE, _TEXTURE = 7, 1.5, 4.0
+"""Side of the window in pixels in which what is unexplained is compared with the noise, and its power over
+that of the noise up to which it is noise, and from which it is texture (chosen: more than chance makes)."""
 
 
 class LateralColourShift(Protocol):
@@ -47,6 +48,10 @@ class LateralColourShift(Protocol):
 
 MIN_HALO, MORE = 12, 6
 """Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
+
+SHARE: Final = 0.87
+"""Share of what the prior took that is added back: three quarters of the power of the grain, so that together
+with grain that the inverse of the blur amplifies it is no more than there was (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,16 +184,12 @@ class _CellTile:
         return self.photo[self.inner]
 
 
-Solution = tuple[Sequence[UniformBlur], Planes]
-"""Blurs of a tile by channel, and the tile without them."""
-
-
 def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
     """Restore one cell, halo cut off again."""
     tile = _CellTile.of(job, cell)
 
     @lru_cache  # different bounds seldom change the kernels' shares
-    def solved(shares: tuple[float, ...]) -> Solution:
+    def solved(shares: tuple[float, ...]) -> tuple[Sequence[UniformBlur], Solution]:
         blurs = [
             job.blur(cell, channel, share, tile.corner)
             for channel, share in zip(CHANNELS, shares, strict=True)
@@ -204,7 +205,7 @@ def _within(
     job: CorrectionJob,
     tile: _CellTile,
     bounds: Bounds,
-    solved: Callable[[tuple[float, ...]], Solution],
+    solved: Callable[[tuple[float, ...]], tuple[Sequence[UniformBlur], Solution]],
 ) -> RestoredCell:
     """Restore a tile within bounds, checked; cut its halo off."""
     cell, sensors = tile.cell, tile.sensors
@@ -214,12 +215,12 @@ def _within(
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.plain):
         return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), None, left=True)
-    blurs, restored = solved((1.0,) * len(CHANNELS) if job.plain else plans.shares)
+    blurs, solution = solved((1.0,) * len(CHANNELS) if job.plain else plans.shares)
     if job.plain:
-        return RestoredCell(job.weakened(tile.cell_pixels, restored[tile.inner]), expected, None)
-    restored, audit = _checked(job, tile, bounds, blurs, restored)
+        return RestoredCell(job.weakened(tile.cell_pixels, solution.planes[tile.inner]), expected, None)
+    restored, audit = _checked(job, tile, bounds, blurs, solution)
     if expected.changed(tile.cell_pixels, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:
-        # so little passed bounds and audit that the rest would smooth the photo, not sharpen it
+        # so little passed limit and audit that the rest would smooth the photo, not sharpen it
         return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), audit, left=True)
     restored = job.weakened(tile.cell_pixels, restored)
     return RestoredCell(restored, expected.changed(tile.cell_pixels, restored), audit)
@@ -230,30 +231,37 @@ def _checked(
     tile: _CellTile,
     bounds: Bounds,
     blurs: Sequence[UniformBlur],
-    restored: Planes,
+    solution: Solution,
 ) -> tuple[Planes, TileAudit | None]:
-    """Return texture, limit what a lens cannot have hidden, audit; the cell without its halo."""
+    """Add back what the prior took, limit, audit; the cell without its halo."""
     photo, sensors, errors = tile.photo, tile.sensors, [belief.error for belief in tile.beliefs]
-    restored = texture_kept(photo, restored, blurs, sensors, texture=bounds.texture, denoise=bounds.denoise)
-    restored = hue_held(photo, restored, blurs, sensors, errors)
-    restored = held_beside_clipped(photo, restored, blurs, sensors, errors)
+    restored = solution.planes
+    if solution.unexplained is not None and bounds.texture > 0.0:
+        share = np.float32(SHARE * bounds.texture) * texture_share(
+            photo, solution.unexplained, sensors, bounds.denoise
+        )
+        restored = restored + share * solution.unexplained
     if job.stored is not None:
         restored = job.stored.held(photo, restored)
-    verdict: TileAudit | None = None
-    if job.audited:
-        evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
-        # before the bounds, which would hide the signs of a wrong kernel: light below black, foreign hues
-        restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
-    else:
-        restored = restored[tile.inner]
-    corner, spread = (tile.cell.top, tile.cell.left), max(map(far, blurs))
-    restored = bounds.hold(job.planes, corner, restored, errors, spread)
-    around = photo_around(job.planes, corner, restored, HUE_REACH)
-    dark = [sensor.noise.sigma_at(0.0) for sensor in sensors]
-    restored = hue_bounded(around, restored, job.clip, dark)
-    if bounds.halo is not None:  # a range that the user set holds to the last bit
-        restored = bounds.hold(job.planes, corner, restored, errors, spread)
-    return restored, None if verdict is None else verdict.without_map()
+    restored = limited(photo, restored, blurs, sensors, errors, bounds.halo)
+    if not job.audited:
+        return restored[tile.inner], None
+    evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
+    restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
+    return restored, verdict.without_map()
+
+
+def texture_share(
+    photo: Planes, unexplained: Planes, sensors: Sequence[Sensor], denoise: float
+) -> NDArray[np.float32] | np.float32:
+    """1 where what is unexplained is texture, 1 - denoise where it is noise."""
+    if denoise <= 0.0:
+        return np.float32(1.0)
+    noise = np.mean([s.variance(p) for s, p in zip(sensors, photo, strict=True)], axis=0)
+    power = np.square(unexplained).mean(axis=0)
+    ratio = ndimage.uniform_filter(power, _WINDOW) / np.maximum(ndimage.uniform_filter(noise, _WINDOW), 1e-12)
+    t = np.clip((ratio - _NOISE) / (_TEXTURE - _NOISE), 0.0, 1.0)
+    return np.asarray(1.0 - denoise * (1.0 - t * t * (3.0 - 2.0 * t)), dtype=np.float32)
 
 
 def _mixed(kernel: Kernel, share: float) -> Kernel:

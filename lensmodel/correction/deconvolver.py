@@ -89,6 +89,22 @@ class Restored:
     steps: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Planes that were restored together.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, H, W), float32
+        The latent planes inside the frame.
+    unexplained : Planes or None
+        The light that a prior took of the data; None for a method without one.
+    """
+
+    planes: Planes
+    unexplained: Planes | None = None
+
+
 class Deconvolver(Protocol):
     """Non-blind deconvolution of one plane: step 3 of Hirsch and Schölkopf (ICCV 2015, section 7)."""
 
@@ -127,7 +143,7 @@ class ColourDeconvolver(Protocol):
 
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
-    ) -> Planes:
+    ) -> Solution:
         """Estimate the latent planes inside the frame.
 
         Parameters
@@ -141,7 +157,7 @@ class ColourDeconvolver(Protocol):
 
         Returns
         -------
-        Planes, shape (3, H, W), float32
+        Solution
         """
 
 
@@ -173,7 +189,7 @@ class WarpableMethod(Protocol):
 
 def restore_planes(
     method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
-) -> Planes:
+) -> Solution:
     """Restore planes: together if the method can, else one by one.
 
     Parameters
@@ -188,7 +204,7 @@ def restore_planes(
 
     Returns
     -------
-    Planes, shape (3, H, W), float32
+    Solution
     """
     if isinstance(method, ColourDeconvolver):
         return method.deconvolve_planes(blurred, blurs, sensors)
@@ -196,7 +212,7 @@ def restore_planes(
         method.deconvolve(plane, blur, sensor=sensor).plane
         for plane, blur, sensor in zip(blurred, blurs, sensors, strict=True)
     ]
-    return np.stack(restored)
+    return Solution(np.stack(restored))
 
 
 def uniform(blur: BlurOperator, method: str) -> UniformBlur:

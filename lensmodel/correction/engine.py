@@ -1,18 +1,13 @@
-"""Which engine runs the inner loops: compiled where available, else NumPy and SciPy."""
+"""What the compiled loops need of the process: a word when they are compiled, and memory that is kept."""
 
 from __future__ import annotations
 
-import importlib
 import logging
 from functools import cache
-from types import ModuleType
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-
-from lensmodel.core import loops
-
-Engine = Literal["auto", "numpy"]
+from numba.core import event
 
 COMPILE_S: Final = 30
 """Seconds that compiling takes on a usual machine (chosen: it is only said, lest the silence look like a
@@ -25,43 +20,23 @@ first_use = logging.getLogger(f"{__name__}.first_use")
 """Says when loops are compiled, during which nothing else happens that a user could see."""
 
 
-def compiled(engine: Engine) -> ModuleType | None:
-    """Return the loops of the correction, or None where NumPy is wanted or Numba is not installed."""
-    return _loops(engine, "lensmodel.correction.compiled")
-
-
-def compiled_checks(engine: Engine) -> ModuleType | None:
-    """Return the loops of the audit, or None as `compiled` does."""
-    return _loops(engine, "lensmodel.correction.audit.compiled")
-
-
-def _loops(engine: Engine, name: str) -> ModuleType | None:
-    if engine == "numpy":
-        return None
-    module = loops.compiled(name, "rocket_fft")
-    if module is not None:
-        tell_of_compiling()
-    return module
-
-
 @cache
 def tell_of_compiling() -> None:
     """Log once when Numba compiles; loading from its cache does not count."""
-    event = importlib.import_module("numba.core.event")
 
-    class CompilationLog(event.Listener):  # type: ignore[misc, name-defined] # Numba has no types
+    class CompilationLog(event.Listener):
         logged = False
 
-        def on_start(self, event: object) -> None:
-            del event
+        def on_start(self, started: object) -> None:
+            del started
             if not self.logged:
                 self.logged = True
                 first_use.info("compiling the inner loops, once on this machine: about %d s", COMPILE_S)
 
-        def on_end(self, event: object) -> None:
+        def on_end(self, ended: object) -> None:
             """The progress display shows the end."""
 
-    event.register("numba:compile", CompilationLog())
+    event.register("numba:compile", CompilationLog())  # type: ignore[no-untyped-call] # Numba has no types
 
 
 def keep_freed_memory() -> None:

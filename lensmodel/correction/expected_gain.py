@@ -15,6 +15,7 @@ from scipy import fft
 
 from lensmodel.core.belief import GRID, WIDEST, Belief
 from lensmodel.core.geometry import zone_of
+from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
 from lensmodel.core.types import ZONES, EdgeGain, Plane, Planes, Zone
 from lensmodel.correction.audit import AuditReport
@@ -127,7 +128,7 @@ def plan(
 
     With the scene's power S, the noise n, the mean K and the variance D of the transfer function, the share s
     of the kernel (the rest is a point), and the part t of the unexplained residual that is added back
-    (`texture`)::
+    (in `cell`)::
 
         K_s = s K + (1 - s),    W = K_s* S / (|K_s|² S + n),    G = W + t (1 - K_s W)
         before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
@@ -149,20 +150,41 @@ def plan(
         n = float(sensor.noise.variance(plane[::_EVERY, ::_EVERY]).mean())
         S = scene_power(plane, power + D, n)
         before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
-        remaining = []
-        for share in _SHARES:
-            mixed = share * K + (1.0 - share) * point
-            W = np.conj(mixed) * S / np.maximum(S * (mixed.real**2 + mixed.imag**2) + n, _LEAST)
-            G = W + returned * (1.0 - mixed * W)
-            kept, missed = G.real**2 + G.imag**2, 1.0 - G * K
-            remaining.append(
-                float((times * (S * (missed.real**2 + missed.imag**2 + kept * D) + kept * n)).sum())
-            )
+        remaining = np.empty(len(_SHARES))
+        _remaining(K, point, S, D, times, n, np.array(_SHARES), returned, remaining)
         best = int(np.argmin(remaining))
         shares.append(_SHARES[best])
-        after += remaining[best]
+        after += float(remaining[best])
     error = float(np.mean([belief.error for belief in beliefs]))
     return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
+
+
+@jit
+def _remaining(
+    K: NDArray[np.complex64],
+    point: NDArray[np.complex64],
+    S: NDArray[np.float64],
+    D: NDArray[np.float32],
+    times: NDArray[np.float32],
+    noise: float,
+    shares: NDArray[np.float64],
+    returned: float,
+    out: NDArray[np.float64],
+) -> None:
+    """Expected squared error that each share of a kernel leaves; see `plan`."""
+    for number in range(shares.size):
+        share, total = shares[number], 0.0
+        for i in range(K.shape[0]):
+            for j in range(K.shape[1]):
+                k, s = complex(K[i, j]), S[i, j]
+                mixed = share * k + (1.0 - share) * complex(point[i, j])
+                W = mixed.conjugate() * s / max(s * (mixed.real**2 + mixed.imag**2) + noise, _LEAST)
+                G = W + returned * (1.0 - mixed * W)
+                missed = 1.0 - G * k
+                kept = G.real**2 + G.imag**2
+                error = s * (missed.real**2 + missed.imag**2 + kept * D[i, j]) + kept * noise
+                total += times[i, j] * error
+        out[number] = total
 
 
 def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -> NDArray[np.float64]:
@@ -197,21 +219,24 @@ def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -
 
 def _ring_power(plane: Plane) -> NDArray[np.float64]:
     """Mean power of a plane in each ring, of blocks of the grid's shape; 1 for white noise of variance 1."""
-    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in _GRID)).astype(np.float32)
-    window /= np.sqrt(np.mean(window**2))
-    total, blocks = np.zeros((_GRID[0], _GRID[1] // 2 + 1)), 0
-    rows, cols = (max(n // side, 1) for n, side in zip(plane.shape, _GRID, strict=True))
-    for top in np.linspace(0, max(plane.shape[0] - _GRID[0], 0), min(rows, _BLOCKS)).astype(int):
-        for left in np.linspace(0, max(plane.shape[1] - _GRID[1], 0), min(cols, _BLOCKS)).astype(int):
-            block = plane[top : top + _GRID[0], left : left + _GRID[1]]
-            if block.shape != _GRID:
-                block = np.pad(
-                    block, [(0, g - n) for g, n in zip(_GRID, block.shape, strict=True)], "reflect"
-                )
-            spectrum = fft.rfft2((block - block.mean()) * window)
-            total += spectrum.real**2 + spectrum.imag**2
-            blocks += 1
-    return _ring_means(total) / (blocks * _GRID[0] * _GRID[1])
+    missing = [max(g - n, 0) for g, n in zip(_GRID, plane.shape, strict=True)]
+    if any(missing):
+        plane = np.pad(plane, [(0, m) for m in missing], "reflect")
+    rows, cols = (
+        np.linspace(0, n - g, min(max(n // g, 1), _BLOCKS)).astype(int)
+        for n, g in zip(plane.shape, _GRID, strict=True)
+    )
+    blocks = np.stack([plane[t : t + _GRID[0], l : l + _GRID[1]] for t in rows for l in cols])
+    blocks = (blocks - blocks.mean(axis=(1, 2), keepdims=True)) * _window()
+    spectra = fft.rfft2(blocks)
+    power = (spectra.real**2 + spectra.imag**2).sum(axis=0, dtype=np.float64)
+    return _ring_means(power) / (len(blocks) * _GRID[0] * _GRID[1])
+
+
+@lru_cache(maxsize=1)
+def _window() -> NDArray[np.float32]:
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in _GRID))
+    return np.asarray(window / np.sqrt(np.mean(window**2)), dtype=np.float32)
 
 
 def _ring_means(values: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -28,12 +28,13 @@ from lensmodel.core.types import (
 from lensmodel.correction.audit import AuditReport, pooled
 from lensmodel.correction.blur import crop_to_support
 from lensmodel.correction.cell import CorrectionJob, LateralColourShift, RestoredCell, restore_cell
+from lensmodel.correction.compiled.tile import add
 from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver
-from lensmodel.correction.engine import compiled, keep_freed_memory
+from lensmodel.correction.engine import keep_freed_memory, tell_of_compiling
 from lensmodel.correction.expected_gain import ZoneReport, zone_reports
-from lensmodel.correction.limits.bounds import Bounds
-from lensmodel.correction.limits.chroma import StoredColour
+from lensmodel.correction.limit import Bounds
 from lensmodel.correction.methods.catalogue import deconvolvers
+from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.lattice import Cell, Roi, cells, usual_pitch
 
 PsfError = Callable[[FieldPosition, Channel], float] | float
@@ -197,6 +198,7 @@ def correct_planes(
     )
     window = Roi.of(frame, roi)
     keep_freed_memory()
+    tell_of_compiling()
     shape = (len(CHANNELS), window.height, window.width)
     out, layer_planes = _zeroed(out, shape), tuple(_zeroed(None, shape) for _ in layers)
     if pitch is None:
@@ -277,8 +279,4 @@ def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
         slice(top - window.top, bottom - window.top),
         slice(left - window.left, right - window.left),
     )
-    loops = compiled("auto")
-    if loops is None:
-        out[target] += np.outer(cell.rise[rows], cell.run[cols]) * restored[:, rows, cols]
-    else:
-        loops.add(np.asarray(out[target]), cell.rise[rows], cell.run[cols], restored[:, rows, cols])
+    add(np.asarray(out[target]), cell.rise[rows], cell.run[cols], restored[:, rows, cols])

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, Planes, StepHook, ignore_step
-from lensmodel.correction.audit import Evidence, PhotoAudit, audit_photo
-from lensmodel.correction.audit.whole_photo import Window
+from lensmodel.correction.audit import Evidence, PhotoAudit, Window, audit_photo
 from lensmodel.correction.blur import UniformBlur, crop_to_support
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto

@@ -29,4 +29,4 @@ def test_each_constant_has_a_row_that_says_where_it_comes_from(room: str) -> Non
 
 
 def test_the_rooms_that_have_fitted_constants_are_found() -> None:
-    assert {"correction", "blind"} <= set(ROOMS)
+    assert {"blind"} <= set(ROOMS)

@@ -12,6 +12,8 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel, otf
 from lensmodel.core.types import Kernel, Plane
+from lensmodel.correction.blur.operator import support_radius
+from lensmodel.correction.compiled.common import through, transfer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +99,16 @@ class UniformBlur:
         beyond = max(abs(self.offset[0]), abs(self.offset[1]))
         return int(self.kernel.shape[0] // 2) + math.ceil(beyond) + (beyond != math.floor(beyond))
 
+    @property
+    def spread(self) -> int:
+        """Radius in pixels that holds 98 percent of the kernel's light and its shift, and a pixel more."""
+        return max(support_radius(self.kernel, 0.98), 1) + math.ceil(max(map(abs, self.offset))) + 1
+
+    @property
+    def line_peak(self) -> float:
+        """Share of its contrast that a line of one pixel keeps at least, along rows or columns."""
+        return float(min(self.kernel.sum(axis=0).max(), self.kernel.sum(axis=1).max()))
+
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
         """Transfer function on the `rfft2` grid of `shape`, cached.
 
@@ -110,7 +122,12 @@ class UniformBlur:
         ndarray of complex64, shape (rows, cols // 2 + 1)
         """
         if shape not in self._spectra:
-            self._spectra[shape] = self.transfer(shape).astype(np.complex64)
+            if self.offset == (0.0, 0.0):
+                K = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
+                transfer(self.kernel.astype(np.float32), K, shape[1])
+            else:
+                K = self.transfer(shape).astype(np.complex64)
+            self._spectra[shape] = K
         return self._spectra[shape]
 
     def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
@@ -139,14 +156,15 @@ class UniformBlur:
         -------
         Plane, float32
         """
-        if min(latent.shape) <= 2 * self.reach:
+        cut, (height, width) = self.reach, latent.shape
+        if min(latent.shape) <= 2 * cut:
             raise InvalidInputError(
-                f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {self.reach}"
+                f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {cut}"
             )
-        shape = fast_shape(latent.shape)
-        spectrum = fft.rfft2(latent, shape) * self.spectrum(shape)
-        blurred = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
-        return np.ascontiguousarray(self.frame(blurred), dtype=np.float32)
+        work, scratch, K = self._canvas(latent.shape)
+        work[:height, :width] = latent
+        through(work, scratch, K, forward=True, first=0, last=height, begin=cut, end=height - cut)
+        return np.ascontiguousarray(work[cut : height - cut, cut : width - cut])
 
     def adjoint(self, blurred: Plane) -> Plane:
         """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`.
@@ -159,11 +177,20 @@ class UniformBlur:
         -------
         Plane, float32
         """
-        latent = np.pad(blurred, self.reach)
-        shape = fast_shape(latent.shape)
-        spectrum = fft.rfft2(latent, shape) * np.conj(self.spectrum(shape))
-        back = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
-        return np.ascontiguousarray(back, dtype=np.float32)
+        cut = self.reach
+        height, width = (extent + 2 * cut for extent in blurred.shape)
+        work, scratch, K = self._canvas((height, width))
+        work[cut : height - cut, cut : width - cut] = blurred
+        through(work, scratch, K, forward=False, first=cut, last=height - cut, begin=0, end=height)
+        return np.ascontiguousarray(work[:height, :width])
+
+    def _canvas(
+        self, shape: tuple[int, ...]
+    ) -> tuple[NDArray[np.float32], NDArray[np.complex64], NDArray[np.complex64]]:
+        """An empty plane that is quick to transform, room for its spectrum, the transfer function."""
+        grid = fast_shape(shape)
+        K = self.spectrum(grid)
+        return np.zeros(grid, dtype=np.float32), np.empty_like(K), K
 
     def covered(self, shape: tuple[int, ...]) -> Plane:
         """Share of the light of each latent point that falls into a frame of `shape`: F^T 1.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Real, to_plane, to_spectrum
+from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
 
 _REACH: Final = np.float32(1.0 / 24.0)  # one over the largest argument of `methods.shrinkage`
 
@@ -38,8 +38,8 @@ def _shrink_row(
     scale: Real,
     factors: Real,
     rotation: Real,
-    edge: float,
-    steepness: float,
+    edge: Number,
+    steepness: Number,
     terms: Real,
     kept: Real,
 ) -> None:
@@ -64,8 +64,8 @@ def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
     scale: Real,
     factors: Real,
     rotation: Real,
-    edge: float,
-    steepness: float,
+    edge: Number,
+    steepness: Number,
     terms: Real,
     pull: Real,
 ) -> None:
@@ -104,8 +104,8 @@ def _wiener(
     decay: Real,
     prior_power: Real,
     size: int,
-    noise: float,
-    variance: float,
+    noise: Number,
+    variance: Number,
     P: Complex,
 ) -> None:
     """Spectrum of the Wiener estimate; see `wiener.wiener_spectrum`."""
@@ -162,15 +162,17 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     down: Real,
     across: Real,
     rotation: Real,
-    edge: float,
-    steepness: float,
+    edge: Number,
+    steepness: Number,
     terms: Real,
+    left: Real,
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
 
     `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
     `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
     the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
+    `left` receives what the result does not explain of the data, 0 where there are none.
     """
     channels, height, width = x.shape
     half = width // 2 + 1
@@ -225,3 +227,15 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                         P[i, j] = (data + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
                 X[c] = P
             to_plane(P, x[c])
+    for c in range(channels):
+        if whole:
+            to_spectrum(x[c], X[c])
+        for i in range(height):
+            for j in range(half):
+                P[i, j] = K[c, i, j] * X[c, i, j]
+        if drift.shape[0] > 0:
+            P += E[c]
+        to_plane(P, work)
+        for i in range(height):
+            for j in range(width):
+                left[c, i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO

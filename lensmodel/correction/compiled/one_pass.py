@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Real, to_plane, to_spectrum
+from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
 
 
 @jit
@@ -16,8 +16,8 @@ def _restored(
     j: int,
     gain: tuple[np.float32, np.float32, np.float32],
     rhs: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32],
-    luma: np.float32,
-    chroma: np.float32,
+    luma: Number,
+    chroma: Number,
 ) -> None:
     """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = rhs at one frequency (Sherman, Morrison).
 
@@ -44,7 +44,7 @@ def one_pass(  # noqa: C901 - one pass over memory for both contrasts
     fine: Real,
     levels: NDArray[np.float64],
     busy: Real,
-    floor: float,
+    floor: Number,
 ) -> None:
     """Filter three planes for two contrasts, `levels` of (luma, chroma), and mix by `busy` into `x`."""
     height, width = busy.shape

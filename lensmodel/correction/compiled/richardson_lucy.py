@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import rocket_fft
 
 from lensmodel.core.jit import jit
 from lensmodel.correction.compiled.common import (
@@ -14,7 +13,9 @@ from lensmodel.correction.compiled.common import (
     ONE,
     ZERO,
     Complex,
+    Number,
     Real,
+    through,
 )
 from lensmodel.correction.deconvolver import LEAST_PREDICTED
 
@@ -52,7 +53,7 @@ def _blur_marks(hard: Real, soft: Real) -> None:
 
 @jit
 def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
-    latent: Real, level: np.float32, reach: int, clean: Real, soft: Real
+    latent: Real, level: Number, reach: int, clean: Real, soft: Real
 ) -> bool:
     """Find bright sharp pixels: mark what they reach as unclean, and their own places softly.
 
@@ -95,35 +96,9 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
 
 
 @jit
-def through(
-    work: Real, P: Complex, K: Complex, forward: bool, first: int, last: int, begin: int, end: int
+def _errors(
+    light: Real, data: Real, base: Number, clip: Number, bend: Real, first: Number, last: Number
 ) -> None:
-    """Blur a plane on its canvas, or what is adjoint to that, in place.
-
-    Light is in rows `first` to `last` only, and only rows `begin` to `end` are computed; the others hold
-    anything. Rows that are empty or not needed are left out of the transforms along rows.
-    """
-    height, half = K.shape
-    down, across = np.array([0]), np.array([1])
-    norm = ONE / np.float32(height * work.shape[1])
-    P[:first] = 0
-    P[last:] = 0
-    rocket_fft.r2c(work[first:last], P[first:last], across, FORWARD, 1.0, 1)
-    rocket_fft.c2c(P, P, down, FORWARD, 1.0, 1)
-    if forward:
-        for i in range(height):
-            for j in range(half):
-                P[i, j] = P[i, j] * (K[i, j] * norm)
-    else:
-        for i in range(height):
-            for j in range(half):
-                P[i, j] = P[i, j] * (np.conj(K[i, j]) * norm)
-    rocket_fft.c2c(P, P, down, BACK, 1.0, 1)
-    rocket_fft.c2r(P[begin:end], work[begin:end], across, BACK, 1.0, 1)
-
-
-@jit
-def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first: float, last: float) -> None:
     """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
 
     `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; below, the sensor
@@ -153,7 +128,7 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
 
 
 @jit
-def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> np.float32:
+def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> Number:
     """Measure alpha of Biggs and Andrews; `change` holds that of the step before, then that of this one."""
     rows, cols = start.shape
     norm = 0.0
@@ -179,11 +154,11 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     data: Real,
     reach: Real,
     K: Complex,
-    base: float,
-    clip: float,
+    base: Number,
+    clip: Number,
     bend: Real,
-    first: float,
-    last: float,
+    first: Number,
+    last: Number,
     alphas: Real,
     adaptive: bool,
     width: int,

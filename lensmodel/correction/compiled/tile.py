@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import rocket_fft
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.compiled.common import FORWARD, ONE, ZERO, Complex, Real
+from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, transfer
 
 Seam = tuple[NDArray[np.intp], NDArray[np.intp], Real]
 
@@ -36,24 +35,7 @@ def fill(planes: Real, gains: Real, margin: int, rows: Seam, cols: Seam, y: Real
 
 
 @jit
-def transfer(taps: Real, out: Complex, width: int) -> None:
-    """Spectrum of a small kernel around the first pixel: only its own rows go through the row transform."""
-    side = taps.shape[0]
-    height, half = out.shape
-    lines = np.zeros((side, width), np.float32)
-    spectra = np.empty((side, half), np.complex64)
-    for i in range(side):
-        for j in range(side):
-            lines[i, (j - side // 2) % width] = taps[i, j]
-    rocket_fft.r2c(lines, spectra, np.array([1]), FORWARD, 1.0, 1)
-    out[:] = 0
-    for i in range(side):
-        out[(i - side // 2) % height] = spectra[i]
-    rocket_fft.c2c(out, out, np.array([0]), FORWARD, 1.0, 1)
-
-
-@jit
-def _limit(K: Complex, rates: Complex, reach: float) -> None:
+def _limit(K: Complex, rates: Complex, reach: Number) -> None:
     """Hold the change of a transfer function within half of it; see `transfers`."""
     for i in range(K.shape[0]):
         for j in range(K.shape[1]):
@@ -69,7 +51,7 @@ def _limit(K: Complex, rates: Complex, reach: float) -> None:
 
 
 @jit
-def spectra_of(taps: Real, reach: float, width: int, K: Complex, rates: Complex) -> None:
+def spectra_of(taps: Real, reach: Number, width: int, K: Complex, rates: Complex) -> None:
     """Transfer functions of kernels `(channel, 1 or 3, k, k)`, and how they change, limited."""
     for c in range(taps.shape[0]):
         transfer(taps[c, 0], K[c], width)

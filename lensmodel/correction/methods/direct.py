@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.core.types import Plane, Planes, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator, UniformBlur
-from lensmodel.correction.deconvolver import Deconvolver, Restored, Sensor, restore_planes, uniform
-from lensmodel.correction.engine import Engine, compiled
-from lensmodel.correction.lights.saturation import Lights
+from lensmodel.correction.clipped import Lights
+from lensmodel.correction.compiled.one_pass import one_pass
+from lensmodel.correction.compiled.tile import fill
+from lensmodel.correction.deconvolver import Deconvolver, Restored, Sensor, Solution, restore_planes, uniform
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
 from lensmodel.correction.methods.wiener import frequency_squared, prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
@@ -65,8 +65,6 @@ class DirectFilter:
         Steps that estimate the light of clipped pixels.
     outside_steps : int
         Steps that estimate the light from beyond the frame.
-    engine : {"auto", "numpy"}
-        "numpy" never uses compiled loops; the numbers are the same.
     """
 
     busy: float = 0.25
@@ -74,7 +72,6 @@ class DirectFilter:
     floor: float = 1e-3
     light_steps: int = 15
     outside_steps: int = 10
-    engine: Engine = "auto"
     mosaic: Deconvolver = field(default_factory=_steps)
 
     cell_factor = 2
@@ -87,53 +84,37 @@ class DirectFilter:
         kernel = uniform(blur, "fast")
         restored = self.deconvolve_planes(np.stack([blurred] * 3), [kernel] * 3, [sensor] * 3)
         on_step(1, 1)
-        return Restored(restored[0], steps=1)
+        return Restored(restored.planes[0], steps=1)
 
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
-    ) -> Planes:
+    ) -> Solution:
         """Restore the colours together; see `ColourDeconvolver`."""
         if any(sensor.measured is not None for sensor in sensors):
             return restore_planes(self.mosaic, blurred, blurs, sensors)
-        lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
+        lights = Lights.of(blurred, blurs, sensors, self.light_steps)
         photo, blurred = blurred, blurred if lights is None else lights.rest
         light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas.around(blurred, blurs, sensors)
-        loops = compiled(self.engine)
-        contrast, colour, noise = _contrasts(BlockMeans.of(blurred, light, loops), light, sensors)
+        contrast, colour, noise = _contrasts(BlockMeans.of(blurred, light), light, sensors)
         mean = float(contrast.mean())
         low, high = np.log(self.calm), np.log(self.busy)
         share = np.clip((np.log(contrast / mean) - low) / (high - low), 0.0, 1.0)
         busy = spread_blocks(share.astype(np.float32), canvas)
-        K, _ = transfers(blurs, canvas.shape, 1.0, loops, drifting=False)
+        K, _ = transfers(blurs, canvas.shape, 1.0, drifting=False)
         levels = np.array(
             [[3.0 * mean * f, max(colour, _LEAST_COLOUR * 3.0 * mean) * f] for f in (self.busy, self.calm)]
         )
-        if loops is None:
-            y = np.stack([canvas.fill(plane / bright) for plane, bright in zip(blurred, light, strict=True)])
-        else:
-            y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
-            rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
-            loops.fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
+        y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
+        rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
+        fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
         if not all(sensor.surrounded for sensor in sensors):
-            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.outside_steps, self.engine)
-        if loops is None:
-            x = _filtered(y, K, noise, levels, busy, self.floor)
-        else:
-            x = np.empty_like(y)
-            loops.one_pass(
-                x,
-                y,
-                K,
-                noise,
-                prior(canvas.shape)[0],
-                _fine(canvas.shape),
-                levels,
-                busy,
-                np.float32(self.floor),
-            )
+            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.outside_steps)
+        x = np.empty_like(y)
+        floor = np.float32(self.floor)
+        one_pass(x, y, K, noise, prior(canvas.shape)[0], _fine(canvas.shape), levels, busy, floor)
         restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
-        return restored if lights is None else lights.put_back(photo, restored)
+        return Solution(restored if lights is None else lights.put_back(photo, restored))
 
 
 def _contrasts(
@@ -160,32 +141,6 @@ def _contrasts(
         detail = float((smoothed(plane * plane) - smoothed(plane) ** 2).mean())
         chroma += max(detail - float(part) / BLOCK**2, 0.0) / 2.0
     return contrast, chroma, noise
-
-
-def _filtered(
-    y: Planes,
-    K: NDArray[np.complex64],
-    noise: NDArray[np.float32],
-    levels: NDArray[np.float64],
-    busy: NDArray[np.float32],
-    floor: float,
-) -> Planes:
-    """The pass in NumPy; `compiled.one_pass` is its twin."""
-    shape = (y.shape[1], y.shape[2])
-    power = np.abs(K) ** 2
-    blurred_prior = float((_fine(shape) * power.sum(axis=0)).sum()) / 3.0
-    Y = fft.rfft2(y)
-    decay = prior(shape)[0] * np.float32(blurred_prior / y[0].size)
-    data = np.conj(K) * Y / noise[:, None, None]
-    filtered = []
-    for luma, chroma in levels:
-        D = (power + np.float32(floor)) / noise[:, None, None] + decay / np.float32(chroma)
-        z = data / D
-        g = decay * np.float32((1.0 / luma - 1.0 / chroma) / 3.0)
-        X = z - (g * z.sum(axis=0) / (1.0 + g * (1.0 / D).sum(axis=0))) / D
-        X[:, 0, 0] = Y[:, 0, 0]  # the mean is kept
-        filtered.append(fft.irfft2(X, shape).astype(np.float32))
-    return np.asarray(filtered[1] + busy * (filtered[0] - filtered[1]), dtype=np.float32)
 
 
 @lru_cache(maxsize=8)

@@ -14,8 +14,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Plane, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator, UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
+from lensmodel.correction.compiled.richardson_lucy import richardson_lucy
 from lensmodel.correction.deconvolver import LEAST_PREDICTED, TINY, Restored, Sensor
-from lensmodel.correction.engine import Engine, compiled
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
@@ -109,8 +109,6 @@ class SaturationAwareRichardsonLucy:
         How to extrapolate, or not at all.
     warped : bool
         Whether lateral colour is to be removed by resampling before: see `WarpableMethod`.
-    engine : {"auto", "numpy"}
-        "numpy" never uses compiled loops; the numbers are the same.
 
     References
     ----------
@@ -124,7 +122,6 @@ class SaturationAwareRichardsonLucy:
     sharpness: float = SHARPNESS
     acceleration: Acceleration = "fixed"
     warped: bool = False
-    engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         _check(self.iterations)
@@ -149,7 +146,6 @@ class SaturationAwareRichardsonLucy:
             sharpness=self.sharpness,
             acceleration=self.acceleration,
             lights=lights,
-            engine=self.engine,
             on_step=on_step,
         )
         return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
@@ -174,7 +170,6 @@ def climbed(
     sharpness: float = SHARPNESS,
     acceleration: Acceleration = "fixed",
     lights: bool = False,
-    engine: Engine = "auto",
     on_step: StepHook = ignore_step,
 ) -> Plane:
     """Take the steps of `SaturationAwareRichardsonLucy`.
@@ -187,7 +182,7 @@ def climbed(
         The data.
     reach : Plane
         Normaliser of each pixel of the latent plane.
-    blur, sensor, steps, sharpness, acceleration, engine, on_step
+    blur, sensor, steps, sharpness, acceleration, on_step
         As in `SaturationAwareRichardsonLucy`.
     lights : bool
         Whether to keep what is poorly known about lights out of the update of all other pixels.
@@ -197,11 +192,10 @@ def climbed(
     count = np.arange(1, steps + 1)
     fixed = np.minimum((count - 1) / (count + 2), ALPHA_MAX) * (acceleration == "fixed")
     alphas, adaptive = fixed.astype(np.float32), acceleration == "adaptive"
-    loops = compiled(engine) if isinstance(blur, UniformBlur) else None
-    if loops is not None and isinstance(blur, UniformBlur):
+    if isinstance(blur, UniformBlur):
         shape = fast_shape(latent.shape)
         latent = np.array(latent, dtype=np.float32, order="C")
-        loops.richardson_lucy(
+        richardson_lucy(
             latent,
             data,
             reach.astype(np.float32),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,13 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS, Plane, Planes, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator, UniformBlur
-from lensmodel.correction.deconvolver import Restored, Sensor, uniform
-from lensmodel.correction.engine import Engine, compiled
-from lensmodel.correction.lights.saturation import Lights
+from lensmodel.correction.clipped import Lights
+from lensmodel.correction.compiled.grain import spread_grain
+from lensmodel.correction.compiled.half_quadratic import half_quadratic
+from lensmodel.correction.compiled.tile import fill
+from lensmodel.correction.deconvolver import Restored, Sensor, Solution, uniform
 from lensmodel.correction.methods.shrinkage import Shrinkage
-from lensmodel.correction.methods.wiener import prior, wiener_spectrum
+from lensmodel.correction.methods.wiener import prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
 from lensmodel.correction.tiles.local_statistics import BlockMeans, signal_variance, smoothed, spread_blocks
@@ -73,8 +74,6 @@ class SparseGradient:
         What a kernel's change within the tile adds is recomputed in the first step and half way.
     light_steps : int
         Steps that estimate the light of clipped pixels, and that from beyond the frame.
-    engine : {"auto", "numpy"}
-        "numpy" never uses compiled loops; the numbers are the same.
 
     References
     ----------
@@ -90,7 +89,6 @@ class SparseGradient:
     coupling: float = 1.5
     growth: float = 3.0
     light_steps: int = 20
-    engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         if not (self.weight > 0.0 and self.chroma > 0.0 and self.coupling > 0.0 and self.growth >= 1.0):
@@ -100,35 +98,60 @@ class SparseGradient:
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        restored = self._solve(blurred[None], [uniform(blur, "standard")], [sensor], on_step)
-        return Restored(restored[0], steps=self.steps)
+        # as three equal colours, each of which adds its datum but not its gradients to the sum
+        alike = replace(
+            self,
+            **{
+                name: getattr(self, name) * len(CHANNELS) ** (1.0 - self.alpha / 2.0)
+                for name in ("weight", "mosaic_weight")
+            },
+        )
+        kernel = uniform(blur, "standard")
+        solved = alike.deconvolve_planes(np.stack([blurred] * 3), [kernel] * 3, [sensor] * 3)
+        on_step(self.steps, self.steps)
+        return Restored(solved.planes[0], steps=self.steps)
 
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
-    ) -> Planes:
+    ) -> Solution:
         """Restore the colours together; see `ColourDeconvolver`."""
-        return self._solve(blurred, blurs, sensors, ignore_step)
-
-    def _solve(
-        self,
-        blurred: Planes,
-        blurs: Sequence[UniformBlur],
-        sensors: Sequence[Sensor],
-        on_step: StepHook,
-    ) -> Planes:
-        lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
+        lights = Lights.of(blurred, blurs, sensors, self.light_steps)
         rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas.around(blurred, blurs, sensors)
-        loops = compiled(self.engine) if len(blurred) == len(CHANNELS) else None
-        problem = self._problem(rest, blurs, sensors, light, canvas, loops, glow)
-        if loops is None:
-            x = _half_quadratic(problem, on_step)
-        else:
-            x = _compiled(problem, loops)
-            on_step(self.steps, self.steps)
-        restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
-        return restored if lights is None else lights.put_back(blurred, restored)
+        problem = self._problem(rest, blurs, sensors, light, canvas, glow)
+        x, left = _solved(problem)
+        inner = (slice(None), *canvas.data)
+        restored = x[inner] * light[:, None, None]
+        unexplained = self._unexplained(blurred, left[inner] * light[:, None, None], sensors, light)
+        return Solution(restored if lights is None else lights.put_back(blurred, restored), unexplained)
+
+    @staticmethod
+    def _unexplained(
+        blurred: Planes, left: Planes, sensors: Sequence[Sensor], light: NDArray[np.float32]
+    ) -> Planes:
+        """What the prior took: the residual of each colour, or, of a mosaic, its grain in light of no colour.
+
+        In a mosaic each pixel measures one colour k. The means S_k of its residual over 5 x 5 pixels are
+        detail of that colour; the rest, within three standard deviations of the noise, counts for all,
+        e_k L_c / L_k, with L their mean light, but never as more than the grain n of a colour, or grain would
+        be coloured and coarse::
+
+            r_c = S_c + L_c min(1, n_c / n_k) ( e_k - S_k ) / L_k
+        """
+        clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
+        clipped = blurred >= clip[:, None, None]
+        left[clipped] = 0.0
+        if all(sensor.measured is None for sensor in sensors):
+            return left
+        known = ~clipped
+        for c, sensor in enumerate(sensors):
+            if sensor.measured is not None:
+                known[c] &= sensor.measured
+        noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
+        out = np.empty_like(blurred)
+        spread_grain(blurred, left, known, clip, noise, light, out)
+        return out
 
     def _problem(
         self,
@@ -137,11 +160,10 @@ class SparseGradient:
         sensors: Sequence[Sensor],
         light: NDArray[np.float32],
         canvas: Canvas,
-        loops: ModuleType | None,
         glow: Planes | None,
     ) -> _SparseProblem:
-        blocks = BlockMeans.of(blurred, light, loops)
-        recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light, loops)
+        blocks = BlockMeans.of(blurred, light)
+        recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light)
         var = np.stack(
             [
                 s.noise.variance(smoothed(b * bright)) / bright**2
@@ -157,7 +179,7 @@ class SparseGradient:
         couplings = self.coupling * self.growth ** np.arange(self.steps)
         known = _known(sensors, canvas)
         drift = blurs[0].drift
-        K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0, loops)
+        K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0)
         variance = (blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32)
         weight, middle = self.weight, len(blurred) // 2
         if any(sensor.measured is not None for sensor in sensors):
@@ -167,21 +189,16 @@ class SparseGradient:
         weights = np.full(len(blurred), weight)
         weights[1:] *= self.chroma
         y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
-        if loops is None:
-            for c, plane in enumerate(blurred):
-                y[c] = canvas.fill(plane / light[c])
-        else:
-            loops.fill(
-                blurred,
-                np.float32(1.0) / light,
-                canvas.margin,
-                seam(canvas.rows, canvas.shape[0]),
-                seam(canvas.cols, canvas.shape[1]),
-                y,
-            )
-
+        fill(
+            blurred,
+            np.float32(1.0) / light,
+            canvas.margin,
+            seam(canvas.rows, canvas.shape[0]),
+            seam(canvas.cols, canvas.shape[1]),
+            y,
+        )
         if not all(sensor.surrounded for sensor in sensors):
-            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.light_steps, self.engine)
+            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.light_steps)
         if any(sensor.measured is not None for sensor in sensors) and len(blurred) == len(CHANNELS):
             refilled(y, K, noise, variance, sensors, canvas)
 
@@ -288,44 +305,11 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _half_quadratic(p: _SparseProblem, on_step: StepHook) -> Planes:
-    """The steps in NumPy; `compiled.half_quadratic` is their twin."""
-    shape = (p.y.shape[1], p.y.shape[2])
-    power = np.abs(p.K) ** 2
-    X = np.stack(
-        [
-            wiener_spectrum(y, K, float(n), float(v))
-            for y, K, n, v in zip(p.y, p.K, p.noise, p.variance, strict=True)
-        ]
-    )
-    x = fft.irfft2(X, shape).astype(np.float32)
-    drifted = np.zeros((0,), dtype=np.complex64)
-    for step, coupling in enumerate(p.couplings):
-        pull = np.zeros_like(x)
-        scales = p.factors[step][:, None, None] * p.scale
-        for axis in (1, 2):
-            slope = np.roll(x, -1, axis=axis) - x
-            shrunk = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
-            shrunk = np.einsum("ji,jrc->irc", p.rotation, shrunk)
-            pull += np.roll(shrunk, 1, axis=axis) - shrunk
-        if p.drift.size and p.turns[step]:
-            drifted = p.drift[:, 0] * fft.rfft2(x * p.down[:, None])
-            drifted += p.drift[:, 1] * fft.rfft2(x * p.across)
-        predicted = p.K * X + drifted if drifted.size else p.K * X
-        residual = p.y - fft.irfft2(predicted, shape)
-        data = power * X + np.conj(p.K) * fft.rfft2(np.where(p.known, residual, np.float32(0.0)))
-        strength = (coupling * p.noise)[:, None, None]
-        X = (data + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
-        x = fft.irfft2(X, shape).astype(np.float32)
-        on_step(step + 1, len(p.couplings))
-    return x
-
-
-def _compiled(p: _SparseProblem, loops: ModuleType) -> Planes:
-    """The same in compiled code."""
+def _solved(p: _SparseProblem) -> tuple[Planes, Planes]:
+    """The planes on the canvas, and what they do not explain of the data."""
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
-    x = np.empty_like(p.y)
-    loops.half_quadratic(
+    x, left = np.empty_like(p.y), np.empty_like(p.y)
+    half_quadratic(
         x,
         p.y,
         p.known,
@@ -347,8 +331,9 @@ def _compiled(p: _SparseProblem, loops: ModuleType) -> Planes:
         np.float32(p.prox.edge),
         np.float32(p.prox.steepness),
         p.prox.terms,
+        left,
     )
-    return x
+    return x, left
 
 
 def _calm(

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.blur.compiled_uniform import CompiledBlur
+from lensmodel.correction.compiled.common import through
+from lensmodel.correction.compiled.tile import fill
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.engine import Engine, compiled
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 from lensmodel.correction.tiles.canvas import Canvas, seam
 
@@ -33,7 +31,6 @@ def fill_outside(
     sensors: Sequence[Sensor],
     canvas: Canvas,
     steps: int,
-    engine: Engine,
 ) -> None:
     """Predict the margin of a canvas along the sides of the frame, in place.
 
@@ -57,14 +54,11 @@ def fill_outside(
     """
     outside = np.ones(canvas.shape, dtype=np.bool_)
     outside[canvas.data] = False
-    loops = compiled(engine)
     for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
         wide = blur.reach
         if wide > 0:
-            latent = _extended(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
-            np.copyto(
-                y[c], _predicted(latent, light[c], K[c], canvas, canvas.margin - wide, loops), where=outside
-            )
+            latent = _extended(plane, blur, sensor, steps)
+            np.copyto(y[c], _predicted(latent, light[c], K[c], canvas, canvas.margin - wide), where=outside)
 
 
 def _predicted(
@@ -73,22 +67,18 @@ def _predicted(
     K: NDArray[np.complex64],
     canvas: Canvas,
     margin: int,
-    loops: ModuleType | None,
 ) -> NDArray[np.float32]:
     """What a larger sensor would have recorded of the latent light, over `light`, on the canvas."""
     rows, cols = canvas.shape
-    if loops is None:
-        wide = Canvas.wrap(Canvas.wrap(latent, margin, rows).T, margin, cols).T
-        return np.asarray(fft.irfft2(K * fft.rfft2(wide / light), canvas.shape), dtype=np.float32)
     predicted = np.empty((1, rows, cols), dtype=np.float32)
     joints = seam(latent.shape[0], rows), seam(latent.shape[1], cols)
-    loops.fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, predicted)
-    loops.through(predicted[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
+    fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, predicted)
+    through(predicted[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
     return np.asarray(predicted[0])
 
 
 def _extended(
-    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int, engine: Engine
+    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int
 ) -> NDArray[np.float32]:
     """The data, extended by the reach; at the sides of the frame they are replaced by the latent light."""
     wide = blur.reach
@@ -99,7 +89,7 @@ def _extended(
     def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
         part = np.ascontiguousarray(part)
         latent, reach = first_guess(part, blur)
-        return climbed(latent, part, reach, blur, plain, steps=steps, engine=engine)
+        return climbed(latent, part, reach, blur, plain, steps=steps)
 
     top, bottom, left, right = sensor.edges
     if left:

@@ -4,30 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from types import ModuleType
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from lensmodel.core.types import Planes
+from lensmodel.correction.compiled.tile import block_means
 from lensmodel.correction.tiles.canvas import Canvas
 
 BLOCK = 4  # pixels: coarser than detail, finer than objects (chosen)
 _UNSURE = np.float32(0.1)
 """Share of the noise that a variance over so few pixels cannot resolve, and that counts as signal (chosen: at
 0, places without detail would be smoothed without limit)."""
-
-
-def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means over blocks of 4 pixels; blocks at the far ends hold what is left.
-
-    Light and contrast change slowly, so a sixteenth of the numbers is enough.
-    """
-    rows, cols = (np.arange(0, extent, BLOCK) for extent in plane.shape)
-    sums = np.add.reduceat(np.add.reduceat(plane, rows, axis=0), cols, axis=1)
-    high, wide = (np.minimum(BLOCK, extent - np.arange(0, extent, BLOCK)) for extent in plane.shape)
-    return np.asarray(sums / (high[:, None] * wide[None, :]), dtype=np.float32)
 
 
 def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -62,17 +51,13 @@ class BlockMeans:
     square: NDArray[np.float32]
 
     @classmethod
-    def of(cls, tile: Planes, light: NDArray[np.float32], loops: ModuleType | None) -> BlockMeans:
+    def of(cls, tile: Planes, light: NDArray[np.float32]) -> BlockMeans:
         """Take the means of a tile whose colours have the mean `light`."""
-        if loops is not None:
-            shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
-            planes = np.empty((len(tile), *shape), dtype=np.float32)
-            luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-            loops.block_means(tile, np.float32(1.0) / light, planes, luma, square)
-            return cls(planes, luma, square)
-        scaled = tile / light[:, None, None]
-        luma = scaled.mean(axis=0)
-        return cls(np.stack([coarse(plane) for plane in scaled]), coarse(luma), coarse(luma * luma))
+        shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
+        planes = np.empty((len(tile), *shape), dtype=np.float32)
+        luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        block_means(tile, np.float32(1.0) / light, planes, luma, square)
+        return cls(planes, luma, square)
 
 
 def signal_variance(blocks: BlockMeans, noise: NDArray[np.float32] | float) -> NDArray[np.float32]:

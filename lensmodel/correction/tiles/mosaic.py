@@ -7,9 +7,12 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
+from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
+from lensmodel.correction.compiled.common import Number, Real
+from lensmodel.correction.compiled.filters import smooth
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.methods.wiener import wiener_spectrum
 from lensmodel.correction.tiles.canvas import Canvas
@@ -24,7 +27,8 @@ _RIDGE: Final = 0.02
 """Share of the squared mean light of a window that is added to the variance of green in it: where green
 is flat, the slope is that of a constant hue (chosen)."""
 
-BETWEEN: Final = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]], dtype=np.float32) / 16.0
+_GAUSSIAN: Final = np.exp(-0.5 * (np.arange(-8, 9) / _WINDOW) ** 2).astype(np.float32)
+_BETWEEN: Final = np.array([0.25, 0.5, 0.25], dtype=np.float32)
 """Bilinear interpolation over every second pixel, once divided by the same filter of the mask."""
 
 
@@ -77,23 +81,43 @@ def refilled(
         guide = K[c] * sharp
         guide /= np.maximum(np.abs(guide) / light, np.float32(1.0))
         p = np.asarray(fft.irfft2(guide, shape), dtype=np.float32)
-        predicted = _lines(y[c], p, known)
+        predicted = np.empty_like(p)
+        lines(y[c], p, known, _GAUSSIAN, np.float32(_RIDGE), predicted)
         residual = known * (y[c] - predicted)
-        share = ndimage.convolve(known, BETWEEN, mode="wrap")
-        predicted += ndimage.convolve(residual, BETWEEN, mode="wrap") / np.maximum(share, np.float32(1e-3))
+        share, between = np.empty_like(p), np.empty_like(p)
+        smooth(known, _BETWEEN, share, wrapped=True)
+        smooth(residual, _BETWEEN, between, wrapped=True)
+        predicted += between / np.maximum(share, np.float32(1e-3))
         np.copyto(y[c][canvas.data], predicted[canvas.data], where=~measured)
 
 
-def _lines(y: NDArray[np.float32], p: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+@jit
+def lines(y: Real, p: Real, known: Real, weights: Real, least: Number, out: Real) -> None:
     """A p + b of each window's least squares over known pixels, its slope pulled to that of one hue."""
-
-    def mean(plane: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(ndimage.gaussian_filter(plane, _WINDOW, mode="wrap") / share, dtype=np.float32)
-
-    share = np.maximum(ndimage.gaussian_filter(known, _WINDOW, mode="wrap"), np.float32(1e-3))
-    mean_p, mean_y = mean(known * p), mean(known * y)
-    covariance = mean(known * p * y) - mean_p * mean_y
-    ridge = np.float32(_RIDGE) * mean_p * mean_p + np.float32(1e-9)
-    hue = np.clip(mean_y / np.maximum(mean_p, np.float32(1e-6)), 0.0, 8.0)
-    slope = (covariance + ridge * hue) / (mean(known * p * p) - mean_p * mean_p + ridge)
-    return np.asarray(mean_y + slope * (p - mean_p), dtype=np.float32)
+    rows, cols = y.shape
+    sums = np.empty((5, rows, cols), np.float32)
+    part = np.empty((rows, cols), np.float32)
+    tiny, small, most = np.float32(1e-9), np.float32(1e-6), np.float32(8.0)
+    for number in range(5):
+        for i in range(rows):
+            for j in range(cols):
+                k, a, b = known[i, j], p[i, j], y[i, j]
+                if number == 1:
+                    k *= a
+                elif number == 2:
+                    k *= b
+                elif number == 3:
+                    k *= a * b
+                elif number == 4:
+                    k *= a * a
+                part[i, j] = k
+        smooth(part, weights, sums[number], wrapped=True)
+    for i in range(rows):
+        for j in range(cols):
+            share = np.float32(1.0) / max(sums[0, i, j], tiny)
+            mean_p, mean_y = sums[1, i, j] * share, sums[2, i, j] * share
+            ridge = least * mean_p * mean_p + tiny
+            hue = min(max(mean_y / max(mean_p, small), np.float32(0.0)), most)
+            covariance = sums[3, i, j] * share - mean_p * mean_y + ridge * hue
+            slope = covariance / (sums[4, i, j] * share - mean_p * mean_p + ridge)
+            out[i, j] = mean_y + slope * (p[i, j] - mean_p)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.compiled.tile import spectra_of
 
 Transfers = tuple[NDArray[np.complex64], NDArray[np.complex64]]
 
@@ -17,7 +17,6 @@ def transfers(
     blurs: Sequence[UniformBlur],
     shape: tuple[int, int],
     reach: float,
-    loops: ModuleType | None,
     *,
     drifting: bool = True,
 ) -> Transfers:
@@ -27,7 +26,7 @@ def transfers(
     alone and takes the change to the other side, as data. That converges only where the change is
     smaller than K, so it is limited to half of K at `reach` pixels from the middle.
     """
-    if loops is None or any(blur.offset != (0.0, 0.0) for blur in blurs):
+    if any(blur.offset != (0.0, 0.0) for blur in blurs):
         steady = np.zeros((0, 2, 0, 0), dtype=np.complex64)
         spectra = np.stack([blur.spectrum(shape) for blur in blurs])
         return spectra, _rates(blurs, shape, reach) if drifting else steady
@@ -35,7 +34,7 @@ def transfers(
     half = shape[1] // 2 + 1
     K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
     rates = np.empty((len(taps) if taps.shape[1] > 1 else 0, 2, shape[0], half), dtype=np.complex64)
-    loops.spectra_of(taps, np.float32(reach), shape[1], K, rates)
+    spectra_of(taps, np.float32(reach), shape[1], K, rates)
     return K, rates
 
 

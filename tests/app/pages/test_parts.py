@@ -88,9 +88,9 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
     run = store.corrections.start(made["id"])
     assert run is not None
     audit = {
-        "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"grain": 0.1}}},
+        "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},
         "worst": [
-            {"check": "grain", "row": 10, "col": 90, "zone": "center", "severity": 2.0, "held_back": 0.4}
+            {"check": "re-blur", "row": 10, "col": 90, "zone": "center", "severity": 2.0, "held_back": 0.4}
         ],
         "tiles": [{"row": 0, "col": 64, "held_back": 0.4}],
         "tile_side": 64,
@@ -176,7 +176,7 @@ def test_a_corrected_dng_is_looked_at_and_its_audit_told(
     assert 'id="viewer"' in page
     assert "Nothing to correct here." in page
     assert "10% of the correction was held back over the whole photo." in page
-    assert "grain beyond that of the photo: 10.0%" in page
+    assert "detail that does not match the photo: 10.0%" in page
     assert '{"held": 0.4, "x": 64, "y": 0}' in page
     assert "open it in your RAW developer" in page
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 
+import numba
 import pytest
 
 from lensmodel.correction import engine
 
 
 def test_compiling_is_told_once_and_loading_is_not(caplog: pytest.LogCaptureFixture) -> None:
-    numba = pytest.importorskip("numba", reason="Numba is not installed")
     numba.njit(lambda x: x - 1)(1)  # what listens already has told its line now
     caplog.set_level(logging.INFO, engine.first_use.name)
     caplog.clear()

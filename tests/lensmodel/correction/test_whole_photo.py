@@ -15,10 +15,8 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
 from lensmodel.correction import Bounds, Corrected, Roi, correct_planes
-from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.engine import compiled
+from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import plan
-from lensmodel.correction.limits.bounds import allowance, limited
 from lensmodel.correction.tiles.lattice import cells
 
 FRAME = Frame(152, 208)  # two cells by two
@@ -288,27 +286,6 @@ def test_kernels_that_are_off_leave_no_dark_lines_beside_edges() -> None:
     assert line(misled(0.6)) < 0.5 * line(unbound)
 
 
-def test_range_is_wider_the_surer_the_kernel() -> None:
-    shares = [allowance(error) for error in (0.0, 0.1, 0.16, 0.5)]
-
-    assert shares[0] == np.inf
-    assert shares == sorted(shares, reverse=True)
-    assert shares[2] == pytest.approx(1.0)
-
-
-def test_compiled_limiter_gives_the_numbers_of_scipy() -> None:
-    pytest.importorskip("numba")
-    pytest.importorskip("rocket_fft")
-    rng = np.random.default_rng(0)
-    seen, made = rng.random((3, 44, 54), dtype=np.float32), rng.random((3, 40, 50), dtype=np.float32)
-    made = 3 * made - 1
-
-    quick = limited(seen, made, (0.1, 0.5, np.inf), compiled("auto"))
-
-    np.testing.assert_allclose(quick, limited(seen, made, (0.1, 0.5, np.inf)), atol=1e-6)
-    np.testing.assert_array_equal(quick[2], made[2])
-
-
 @pytest.mark.parametrize("mosaic", [False, True])
 def test_flat_areas_keep_their_grain_unless_it_is_to_be_taken_away(mosaic: bool) -> None:
     rng = np.random.default_rng(1)
@@ -557,9 +534,9 @@ def test_a_cell_of_which_next_to_nothing_is_left_to_correct_stays_as_it_was(
         np.float32
     )
 
-    def hardly(method: object, tile: np.ndarray, *rest: object) -> np.ndarray:
+    def hardly(method: object, tile: np.ndarray, *rest: object) -> Solution:
         del method, rest
-        return tile + np.float32(1e-4) * rng.standard_normal(tile.shape, dtype=np.float32)
+        return Solution(tile + np.float32(1e-4) * rng.standard_normal(tile.shape, dtype=np.float32))
 
     monkeypatch.setattr("lensmodel.correction.cell.restore_planes", hardly)
 

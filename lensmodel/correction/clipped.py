@@ -1,4 +1,4 @@
-"""Light beyond saturation: how much there is, and the photo as it would be without it."""
+"""Clipped light: how much of it there was, and the photo as it would be without it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from scipy import ndimage
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.blur.compiled_uniform import CompiledBlur
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.engine import Engine, compiled
-from lensmodel.correction.lights.clipped import ClippedRegion, regions, span_around
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
+
+Real = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Window = tuple[slice, slice]
 
 _LEAST_SEEN: Final = 0.02
 """Least share of a point's light that counts as measured (chosen: a step divides by it, so that with less a
@@ -30,19 +31,17 @@ _SIGMAS: Final = np.float32(3.0)
 pixel of 700; with less, chance would dim the lights; with more, their glow would leave holes)."""
 _ABSURD: Final = np.float32(2.0)
 """Times that bound beyond which the glow is no answer (chosen: steps that converge leave less)."""
-_ENERGY: Final = 0.98
-"""Share of a kernel's light within its reach: of a light at saturation, a fiftieth falls further out and is
-hardly seen (chosen)."""
+
+
 _DARKEST: Final = 0.9
 """Least share of the darkest light nearby that remains, times what a kernel spreads (chosen: 1 would allow no
 dark detail in a glow at all, much less the dark ring that it is there to prevent)."""
 _DUBIOUS: Final = np.float32(0.25)
 """Share of the glow that may be scene light instead (chosen: 0 lets an error of the glow make a black ring, 1
 would leave all glow in place)."""
-_GLARE: Final = np.float32(0.5)
+_GLARE, _NO_GLARE = np.float32(0.5), np.float32(0.02)
 """Share of glow in the photo's light at and above which the bound holds in full (chosen: from there on more
-of a pixel is subtracted than is left)."""
-_NO_GLARE: Final = np.float32(0.02)  # of `_GLARE`: less is rounding errors of transforms
+of a pixel is subtracted than is left), and share of that below which it is rounding errors of transforms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +63,7 @@ class Lights:
     rest: Planes
     beyond: Planes
     glow: Planes
-    spread: NDArray[np.float32]
+    spread: Real
 
     @classmethod
     def of(
@@ -73,7 +72,6 @@ class Lights:
         blurs: Sequence[UniformBlur],
         sensors: Sequence[Sensor],
         steps: int,
-        engine: Engine,
     ) -> Lights | None:
         """Find the light above the clipping level of each colour; None where nothing is clipped.
 
@@ -85,21 +83,19 @@ class Lights:
 
         Divided by F^T 1 instead, lights of which little was measured take several times the steps; those of
         which nothing was measured do use F^T 1, or they would grow without end. This is done only for lights
-        that the lens may have spread (`compact`), around clipped pixels near measured ones
-        (`lensmodel.correction.lights.clipped.regions`). Broad clipped areas count as light at saturation.
-        Positive and unregularised, x is a poor picture, so only what lies above t is taken from it.
+        that the lens may have spread (`compact`); broad clipped areas count as light at saturation. Positive
+        and unregularised, x is a poor picture, so only what lies above t is taken from it.
         """
         if not any(
             plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
         ):
             return None
         rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
-        loops = compiled(engine)
         for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
-            clipped = blown(plane, sensor)
-            quick = CompiledBlur.of(positive(blur), loops)
-            for region in regions(compact(clipped, far(blur)), blur.reach):
-                _estimate(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
+            clipped = np.asarray(plane >= np.float32(sensor.clip))
+            spread = positive(blur)
+            for window, own in regions(compact(clipped, blur.spread), spread.reach):
+                _estimate(window, own, plane, clipped, spread, sensor, steps, (rest[c], beyond[c], glow[c]))
             rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
         return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
 
@@ -110,30 +106,41 @@ class Lights:
         the more the lens spreads, the more of it comes back as a dark ring. So there the result stays above
         a share of the darkest light nearby.
         """
-        result = restored + self.beyond
-        shining: NDArray[np.bool_] = np.asarray(self.glow.any(axis=0))
-        if not shining.any():
-            return np.asarray(result, dtype=np.float32)
-        # No more of the tile than the filters of 5 pixels need.
-        rows, cols = (span_around(shining, axis, 4) for axis in (0, 1))
-        box = (slice(None), rows, cols)
-        glow = self.glow[box]
-        near = ndimage.maximum_filter(glow, (1, 5, 5), mode="nearest")
-        scene = np.maximum(self.rest[box], np.float32(0.0)) + _DUBIOUS * glow
+        if not self.glow.any():
+            return np.asarray(restored + self.beyond, dtype=np.float32)
+        near = ndimage.maximum_filter(self.glow, (1, 5, 5), mode="nearest")
+        scene = np.maximum(self.rest, np.float32(0.0)) + _DUBIOUS * self.glow
         darkest = ndimage.minimum_filter(scene, (1, 5, 5), mode="nearest")
-        glare = np.minimum(near / (_GLARE * np.maximum(photo[box], np.float32(1e-6))), np.float32(1.0))
+        glare = np.minimum(near / (_GLARE * np.maximum(photo, np.float32(1e-6))), np.float32(1.0))
         depth = (np.float32(_DARKEST) * self.spread)[:, None, None]
-        held = np.maximum(restored[box], depth * glare * darkest)
-        result[box] = np.where(glare > _NO_GLARE, held, restored[box]) + self.beyond[box]
-        return np.asarray(result, dtype=np.float32)
+        held = np.where(glare > _NO_GLARE, np.maximum(restored, depth * glare * darkest), restored)
+        return np.asarray(held + self.beyond, dtype=np.float32)
 
 
-def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
-    """Pixels of which only a lower bound is known."""
-    return np.asarray(plane >= np.float32(sensor.clip))
+def regions(lights: Mask, reach: int) -> list[tuple[Window, Mask]]:
+    """Windows of a tile in which lights are estimated together.
+
+    Returns
+    -------
+    list of (window, own)
+        The data to use, and the light that only this window estimates, `reach` wider on each side than it.
+    """
+    if not lights.any():
+        return []
+    near = ndimage.maximum_filter(np.pad(lights, reach), 2 * reach + 1)
+    labels, count = ndimage.label(near)
+    found = []
+    for number, box in enumerate(ndimage.find_objects(labels, count), start=1):
+        window = tuple(
+            slice(max(part.start - 2 * reach, 0), min(part.stop, extent))
+            for part, extent in zip(box, lights.shape, strict=True)
+        )
+        wide = tuple(slice(part.start, part.stop + 2 * reach) for part in window)
+        found.append(((window[0], window[1]), np.asarray(labels[wide] == number)))
+    return found
 
 
-def compact(clipped: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+def compact(clipped: Mask, reach: int) -> Mask:
     """Clipped pixels of areas that a lamp may have made through a kernel of this reach.
 
     An area with a clipped pixel further than the reach from all measured ones is broad: nothing shows how
@@ -141,28 +148,13 @@ def compact(clipped: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     """
     if not clipped.any():
         return clipped
-    known = clipped
-    clipped = closed(clipped)
-    depth = ndimage.distance_transform_cdt(np.pad(clipped, 1), "chessboard")[1:-1, 1:-1]
-    labels, count = ndimage.label(clipped, structure=np.ones((3, 3), dtype=np.int8))
-    deepest = ndimage.maximum(depth, labels, np.arange(count + 1))
-    broad = np.asarray(deepest) > reach
+    # demosaicing leaves pixels between clipped ones hardly below saturation
+    closed = ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped
+    depth = ndimage.distance_transform_cdt(np.pad(closed, 1), "chessboard")[1:-1, 1:-1]
+    labels, count = ndimage.label(closed, structure=np.ones((3, 3), dtype=np.int8))
+    broad = np.asarray(ndimage.maximum(depth, labels, np.arange(count + 1))) > reach
     broad[0] = True
-    return np.asarray(known & ~broad[labels])
-
-
-def closed(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Clipped pixels and those between them, which demosaicing left hardly below saturation."""
-    return np.asarray(ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped)
-
-
-def far(blur: UniformBlur) -> int:
-    """Radius in pixels that holds nearly all light of a kernel and its shift, and a pixel more."""
-    half = blur.kernel.shape[0] // 2
-    rows, cols = np.mgrid[-half : half + 1, -half : half + 1]
-    light = np.bincount(np.maximum(np.abs(rows), np.abs(cols)).ravel(), blur.kernel.ravel()).cumsum()
-    inner = int(np.searchsorted(light, _ENERGY * light[-1]))
-    return max(inner, 1) + int(np.ceil(max(abs(blur.offset[0]), abs(blur.offset[1])))) + 1
+    return np.asarray(clipped & ~broad[labels])
 
 
 def positive(blur: UniformBlur) -> UniformBlur:
@@ -186,58 +178,46 @@ def _spread(blur: UniformBlur) -> float:
 
 
 def _estimate(
-    region: ClippedRegion,
-    plane: NDArray[np.float32],
-    clipped: NDArray[np.bool_],
+    window: Window,
+    own: Mask,
+    plane: Real,
+    clipped: Mask,
     blur: UniformBlur,
     sensor: Sensor,
     steps: int,
-    engine: Engine,
-    into: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    into: tuple[Real, Real, Real],
 ) -> None:
     """Estimate the light of one region of one colour; update `into`: rest, light beyond saturation, glow."""
     rest, beyond, glow = into
-    window = region.data
-    data, lost = plane[window], clipped[window]
+    data, lost = np.ascontiguousarray(plane[window]), clipped[window]
     latent, reach = first_guess(data, blur)
     measured = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
     full = float(reach.max())
     measured = np.where(
         measured < _UNSEEN * full, reach, np.maximum(measured, np.float32(_LEAST_SEEN * full))
     )
-    latent = climbed(latent, data, measured, blur, sensor, steps=steps, engine=engine)
-    clip = np.float32(sensor.clip)
-    below_clip = np.minimum(latent, clip)
-    # Light too far off to reach a clipped pixel, or nearer to those of another region, is ignored.
-    excess = np.zeros_like(latent)
-    excess[region.own] = (latent - below_clip)[region.own]
+    latent = climbed(latent, data, measured, blur, sensor, steps=steps)
+    below = np.minimum(latent, np.float32(sensor.clip))
+    excess = np.where(own, latent - below, np.float32(0.0))
     bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
-    excess, region_glow = _believable(excess, np.where(lost, np.float32(np.inf), bound), blur)
-    glow[window] += region_glow
+    excess, spread = _believable(excess, np.where(lost, np.float32(np.inf), bound), blur)
+    glow[window] += spread
     beyond[window] += blur.frame(excess)
-    own_clipped = np.zeros_like(lost)
-    own_clipped[region.answers] = lost[region.answers]
-    rest[window][own_clipped] = np.maximum(blur.forward(below_clip), np.float32(0.0))[own_clipped]
+    answered = lost & np.asarray(blur.frame(own.astype(np.float32)), dtype=np.bool_)
+    rest[window][answered] = np.maximum(blur.forward(below), np.float32(0.0))[answered]
 
 
-def _believable(
-    excess: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the estimated light and its glow, dimmed where the glow far exceeds a bound.
+def _believable(excess: Real, bound: Real, blur: UniformBlur) -> tuple[Real, Real]:
+    """Return the estimated light and its glow, dimmed where the glow far exceeds a bound; none if that fails.
 
-    If it still does then, both are zero. Steps may run away: just below clipping the response
-    hardly rises, and the transfer function of next to no blur, moved by a part of a pixel, belongs to no
-    positive kernel.
+    Steps may run away: just below clipping the response hardly rises.
     """
-
-    def absurd(glow: NDArray[np.float32]) -> NDArray[np.bool_]:
-        return np.asarray(~(np.abs(glow) <= _ABSURD * bound))
-
     glow = blur.forward(excess)
-    too_much = absurd(glow)
-    if not too_much.any():
-        return excess, glow
-    share = np.where(too_much, bound / np.where(too_much, np.abs(glow), np.float32(1.0)), np.float32(1.0))
-    excess = excess * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
-    glow = blur.forward(excess)
-    return (np.zeros_like(excess), np.zeros_like(glow)) if absurd(glow).any() else (excess, glow)
+    absurd = ~(np.abs(glow) <= _ABSURD * bound)
+    if absurd.any():
+        share = np.where(absurd, bound / np.where(absurd, np.abs(glow), np.float32(1.0)), np.float32(1.0))
+        excess = excess * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
+        glow = blur.forward(excess)
+        if not (np.abs(glow) <= _ABSURD * bound).all():
+            return np.zeros_like(excess), np.zeros_like(glow)
+    return excess, glow

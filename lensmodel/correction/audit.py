@@ -1,0 +1,653 @@
+"""The one audit of a correction: three figures that need no truth; what fails is mixed back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.jit import jit
+from lensmodel.core.types import (
+    CHANNELS,
+    ZONES,
+    FieldPosition,
+    NoiseModel,
+    Plane,
+    Planes,
+    StepHook,
+    Zone,
+    ignore_step,
+)
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.blur.uniform import fast_shape
+
+Real = NDArray[np.float32]
+Window: TypeAlias = tuple[slice, slice]
+
+REBLUR, SPECTRUM, ISOLATED = "re-blur", "spectrum", "isolated pixels"
+
+LIMITS: Final[Mapping[str, float]] = {REBLUR: 2.0, SPECTRUM: 2.0, ISOLATED: 1.5}
+"""Figure of each check, in the unit of its own equation, from which a correction is held back (chosen: above
+what sound corrections of photographs reach)."""
+
+CHECKS: Final = tuple(LIMITS)
+"""Every check by name."""
+
+MODEL_ERROR: Final = 0.3
+"""Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and prior
+and limit give way at edges (chosen)."""
+_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below it (chosen)
+_GLOW: Final = 0.005
+"""Share of the light of a clipped pixel; a pixel that receives more of it does not count: of a lamp the file
+holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""
+_COARSE: Final = 4
+"""Distance of the second differences whose power lenses leave alone, pixels: 8 pixels a period (chosen)."""
+_NOISE: Final = 4.0  # times the power of the noise below which no detail is seen (chosen)
+_SPIKE: Final = 12.0
+"""Standard deviations of noise by which a pixel may stand out in any case (chosen: of a million pixels some
+sixty stand out by 4; a correction amplifies noise three times before one is a fault)."""
+_ROOM: Final = 1.25  # factor for points that lie a part of a pixel beside the middle of theirs (chosen)
+_USUAL_GAIN: Final = 8.0  # of a point behind a PSF of one pixel, and the largest gain to assume
+
+SIDE: Final = 8  # pixels of a block: that of a JPEG (ITU-T T.81)
+_WEIGHTS: Final = np.array([1, 2, 3, 4, 5, 4, 3, 2, 1], dtype=np.float32)
+"""Weights of the blocks around one, along rows and columns: a window that fades out (chosen). A wrong kernel
+is wrong all around; patches of different sharpness would show, and fewer pixels say less."""
+_GROWN, _SOFTNESS = 5, 1.0
+"""Side of the square over which the least share kept spreads, and standard deviation of the Gaussian that
+smooths it then, pixels (chosen: nothing of a faulty pixel comes back, and no edge shows)."""
+
+HELD: Final = 0.1
+"""Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth is only
+just seen, a half only what is spoilt)."""
+MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
+PLACES: Final = 12  # worst places to name (chosen: as many as a person looks at)
+TILE, HALO = 192, 48
+"""Side of a tile of `audit_photo` and the margin seen around it, pixels: multiples of `SIDE`, so that
+neighbouring tiles see the same blocks and no seam shows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What is known of a tile apart from its pixels.
+
+    Parameters
+    ----------
+    noise : sequence of NoiseModel
+        One per channel; that of the measured pixels if `measured` is given, else of every pixel.
+    clip : sequence of float
+        Level per channel at and above which a value of the photo is only a lower bound.
+    blurs : sequence of UniformBlur or None
+        PSF of each channel, lateral shift included; None if unknown, and nothing is re-blurred.
+    psf_errors : sequence of float
+        Expected relative L2 error of each PSF.
+    measured : sequence of (ndarray of bool or None)
+        Per channel where the sensor measured it, `(rows, cols)`; None for everywhere.
+    """
+
+    noise: Sequence[NoiseModel]
+    clip: Sequence[float] = (1.0, 1.0, 1.0)
+    blurs: Sequence[UniformBlur] | None = None
+    psf_errors: Sequence[float] = (0.0, 0.0, 0.0)
+    measured: Sequence[NDArray[np.bool_] | None] = (None, None, None)
+
+    def __post_init__(self) -> None:
+        counts = [len(self.noise), len(self.clip), len(self.psf_errors), len(self.measured)]
+        if self.blurs is not None:
+            counts.append(len(self.blurs))
+        if any(count != len(CHANNELS) for count in counts):
+            raise InvalidInputError(f"every kind of evidence needs one entry per channel, got {counts}")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one check held back of a tile.
+
+    Parameters
+    ----------
+    check : str
+        Name of the check.
+    held_back : float
+        Mean share of the correction that it alone would hold back, 0 to 1.
+    worst : float
+        The largest multiple of the limit.
+    at : tuple of int
+        Pixel `(row, col)` of the tile where that is.
+    """
+
+    check: str
+    held_back: float
+    worst: float
+    at: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileAudit:
+    """Verdict on one tile.
+
+    Parameters
+    ----------
+    keep : Plane, shape (rows, cols)
+        Share of the correction that is kept, 0 to 1; 1 everywhere on a sound tile.
+    findings : tuple of Finding
+        One for each check.
+    held_back : float
+        Mean share of the correction that is held back.
+    """
+
+    keep: Plane
+    findings: tuple[Finding, ...]
+    held_back: float
+
+    def without_map(self) -> TileAudit:
+        """Return the figures alone: the maps of all tiles are as large as a photo's plane."""
+        return replace(self, keep=np.zeros((0, 0), dtype=np.float32))
+
+
+def audit_tile(
+    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Window | None = None
+) -> TileAudit:
+    r"""Audit the correction of a tile.
+
+    With y the photo, x the result, sigma the noise, k the PSF and e its relative error, three figures around
+    each place; D_s is the mean power of second differences along rows and columns at a distance of s pixels,
+    in units in which white noise has its variance::
+
+        re-blur          r = (y - k * x) / sqrt( sigma² + e² (x - k * x)² ), its root mean square, where the
+                         photo was measured and did not clip; where half of that of y - k * y exceeds 1, the
+                         share of r in it: a limited result explains less, but no less than the photo itself
+        spectrum         sqrt( max D_s(x) / ( max D_s(y) + 4 sigma² ) ) of the mean of the colours, s of x 1
+                         or 2, of y 1, 2 or 4: scenes have no more contrast in a fine octave than in a coarse
+        isolated pixels  how far x stands out of its 8 neighbours, over 12 sigma and what a point that makes
+                         the photo's bump there would
+
+    Of a correction within the limits all is kept, from twice the limit on nothing, and a share between.
+
+    Parameters
+    ----------
+    original, corrected : Planes, shape (3, rows, cols)
+        Linear light, saturation 1, with surrounding pixels if there are any.
+    evidence : Evidence
+        What else is known.
+    inner : tuple of slice or None
+        The part that is judged; the rest is context. None for all.
+
+    Returns
+    -------
+    TileAudit
+        Of the inner part.
+
+    Raises
+    ------
+    InvalidInputError
+        If the planes have different sizes.
+    """
+    if original.shape != corrected.shape or original.ndim != 3 or original.shape[0] != len(CHANNELS):
+        raise InvalidInputError(
+            f"original and correction must be (3, rows, cols) of one size, got {original.shape} and "
+            f"{corrected.shape}"
+        )
+    y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (original, corrected))
+    shape = (y.shape[1], y.shape[2])
+    inner = inner or (slice(0, shape[0]), slice(0, shape[1]))
+    noise = np.array([[n.shot, n.read] for n in evidence.noise], dtype=np.float32)
+    spikes = np.empty(shape, dtype=np.float32)
+    powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
+    clip = np.asarray(np.minimum(evidence.clip, 1e9), dtype=np.float32)
+    _figures(y, x, noise, clip, _point_gains(evidence), spikes, powers)
+    wide = around(powers)
+    known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
+    beyond = wide[:2].max(axis=0) / known
+    severities = {ISOLATED: spikes, SPECTRUM: np.sqrt(beyond)}
+    if evidence.blurs is not None:
+        severities[REBLUR] = _misfit(y, x, evidence)
+    keep, findings = np.ones(shape, dtype=np.float32), []
+    for check, severity in severities.items():
+        share = np.clip(
+            np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
+        )
+        by_block = severity.shape != shape
+        if share.min() < 1.0:
+            np.minimum(keep, to_pixels(share, shape) if by_block else share, out=keep)
+        findings.append(_finding(check, severity, share, inner, by_block=by_block))
+    if keep.min() < 1.0:
+        grown = ndimage.minimum_filter(keep, _GROWN, mode="nearest")
+        keep = np.clip(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), 0.0, 1.0)
+    keep = keep[inner]
+    return TileAudit(keep, tuple(findings), float(1.0 - keep.mean(dtype=np.float64)))
+
+
+def held_back(
+    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Window | None = None
+) -> tuple[Planes, TileAudit]:
+    """Audit the correction of a tile and mix it back towards the original as far as it fails.
+
+    Parameters and errors as `audit_tile`.
+
+    Returns
+    -------
+    planes : Planes, shape (3, rows, cols) of the inner part
+        original + keep (corrected - original); where all is kept, exactly the correction.
+    audit : TileAudit
+        Why.
+    """
+    audit = audit_tile(original, corrected, evidence, inner=inner)
+    part = (slice(None), *(inner or (slice(None), slice(None))))
+    before, after = original[part], corrected[part]
+    if audit.keep.min(initial=1.0) == 1.0:
+        return after, audit
+    return np.asarray(before + audit.keep * (after - before), dtype=np.float32), audit
+
+
+def _finding(check: str, severity: Real, share: Real, inner: Window, *, by_block: bool) -> Finding:
+    """Sum up one check in the inner part, before it is smoothed."""
+    step = SIDE if by_block else 1
+    part = tuple(
+        slice((s.start or 0) // step, max(-(-(s.stop if s.stop is not None else n * step) // step), 1))
+        for s, n in zip(inner, severity.shape, strict=True)
+    )
+    values = severity[part]
+    row, col = np.unravel_index(int(values.argmax()), values.shape)
+    at = [
+        max((int(k) + p.start) * step + step // 2 - (s.start or 0), 0)
+        for k, p, s in zip((row, col), part, inner, strict=True)
+    ]
+    held = float(1.0 - share[part].mean(dtype=np.float64))
+    return Finding(check, held, float(values[row, col]) / LIMITS[check], (at[0], at[1]))
+
+
+def _point_gains(evidence: Evidence) -> Real:
+    """How much more a point stands out of its surroundings than its image does, by colour."""
+    if evidence.blurs is None:
+        return np.full(len(CHANNELS), _USUAL_GAIN, dtype=np.float32)
+    gains = []
+    for blur in evidence.blurs:
+        middle = blur.kernel.shape[0] // 2
+        low = max(middle - 2, 0)
+        mean = float(blur.kernel[low : middle + 3, low : middle + 3].sum() / 25.0)
+        gains.append(np.clip(_ROOM / max(blur.kernel[middle, middle] - mean, 1e-6), 1.0, _USUAL_GAIN))
+    return np.array(gains, dtype=np.float32)
+
+
+@jit
+def _figures(  # noqa: C901, PLR0912 - one pass over the tile
+    y: Real, x: Real, noise: Real, clip: Real, gains: Real, spikes: Real, powers: Real
+) -> None:
+    """How far each pixel stands out, and sums over blocks: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
+    rows, cols = spikes.shape
+    zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
+    luma = np.empty((2, rows, cols), np.float32)
+    spikes[:] = zero
+    for i in range(rows):
+        for j in range(cols):
+            luma[0, i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
+            luma[1, i, j] = third * (
+                min(x[0, i, j], clip[0]) + min(x[1, i, j], clip[1]) + min(x[2, i, j], clip[2])
+            )
+            total = zero
+            for c in range(3):
+                total += noise[c, 0] * max(y[c, i, j], zero) + noise[c, 1]
+            powers[5, i // 8, j // 8] += total * np.float32(1.0 / 9.0)
+    shown = np.empty((rows, cols), np.float32)
+    for c in range(3):
+        for i in range(rows):
+            for j in range(cols):
+                shown[i, j] = min(x[c, i, j], clip[c])
+        for i in range(1, rows - 1):
+            for j in range(1, cols - 1):
+                top = max(shown[i - 1, j], shown[i + 1, j], shown[i, j - 1], shown[i, j + 1])
+                low = min(shown[i - 1, j], shown[i + 1, j], shown[i, j - 1], shown[i, j + 1])
+                now = shown[i, j]
+                if low <= now <= top:
+                    continue
+                for a in (i - 1, i + 1):
+                    for b in (j - 1, j + 1):
+                        top = max(top, shown[a, b])
+                        low = min(low, shown[a, b])
+                out = max(now - top, low - now)
+                if out <= zero:
+                    continue
+                mean, number = zero, 0
+                for a in range(max(i - 2, 0), min(i + 3, rows)):
+                    for b in range(max(j - 2, 0), min(j + 3, cols)):
+                        mean += y[c, a, b]
+                        number += 1
+                bump = abs(y[c, i, j] - mean / np.float32(number))
+                grain = np.sqrt(max(noise[c, 0] * max(y[c, i, j], zero) + noise[c, 1], np.float32(1e-12)))
+                spikes[i, j] = max(spikes[i, j], out / (gains[c] * bump + np.float32(_SPIKE) * grain))
+    share = np.float32(1.0 / 12.0)
+    for kind in range(5):
+        plane = luma[1] if kind < 2 else luma[0]
+        s = 1 if kind % 2 == 0 and kind < 4 else (2 if kind < 4 else _COARSE)
+        for i in range(rows):
+            above, below = max(i - s, 0), min(i + s, rows - 1)
+            for j in range(cols):
+                two = np.float32(2.0) * plane[i, j]
+                down = plane[above, j] + plane[below, j] - two
+                across = plane[i, max(j - s, 0)] + plane[i, min(j + s, cols - 1)] - two
+                powers[kind, i // 8, j // 8] += share * (down * down + across * across)
+
+
+def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
+    """Root mean square of the residual around each block, the most of all colours."""
+    assert evidence.blurs is not None
+    shape = (y.shape[1], y.shape[2])
+    grid = fast_shape(tuple(max(n, b.kernel.shape[0]) for n in shape for b in evidence.blurs[:1]))
+    worst = np.zeros(_blocks(shape), dtype=np.float32)
+    for c, blur in enumerate(evidence.blurs):
+        transfer = blur.spectrum(grid)
+        blurred, again = (
+            fft.irfft2(fft.rfft2(plane, grid) * transfer, grid)[: shape[0], : shape[1]]
+            for plane in (x[c], y[c])
+        )
+        rim = min(blur.reach, (min(shape) - 1) // 2)
+        counted = np.zeros(shape, dtype=np.float32)
+        counted[rim : shape[0] - rim, rim : shape[1] - rim] = 1.0
+        measured = evidence.measured[c]
+        if measured is not None:
+            counted *= measured
+        clipped = y[c] >= np.float32(_CLIPPED * evidence.clip[c])
+        if clipped.any():
+            light = fft.irfft2(fft.rfft2(clipped.astype(np.float32), grid) * transfer, grid)
+            counted *= light[: shape[0], : shape[1]] < _GLOW
+        sums = np.zeros((3, *worst.shape), dtype=np.float32)
+        noise, error = evidence.noise[c], max(evidence.psf_errors[c], MODEL_ERROR)
+        _residual(
+            y[c],
+            x[c],
+            blurred.astype(np.float32, copy=False),
+            again.astype(np.float32, copy=False),
+            counted,
+            noise.shot,
+            noise.read,
+            error**2,
+            sums,
+        )
+        square, own, number = around(sums)
+        number = np.maximum(number, np.float32(1.0))
+        figure = np.sqrt(square / np.maximum(number, own / np.float32(LIMITS[REBLUR] ** 2)))
+        np.maximum(worst, figure, out=worst)
+    return worst
+
+
+@jit
+def _residual(
+    y: Real,
+    x: Real,
+    blurred: Real,
+    again: Real,
+    counted: Real,
+    shot: float,
+    read: float,
+    error: float,
+    sums: Real,
+) -> None:
+    """Sums over blocks of the squared residuals of x and of y over what they may be, and of what counts."""
+    rows, cols = y.shape
+    for i in range(rows):
+        for j in range(cols):
+            left, change = y[i, j] - blurred[i, j], x[i, j] - blurred[i, j]
+            allowed = shot * max(y[i, j], np.float32(0.0)) + read + error * change * change
+            weight, own = counted[i, j] / np.float32(max(allowed, 1e-12)), y[i, j] - again[i, j]
+            sums[0, i // 8, j // 8] += weight * left * left
+            sums[1, i // 8, j // 8] += weight * own * own
+            sums[2, i // 8, j // 8] += counted[i, j]
+
+
+def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
+    return -(-shape[0] // SIDE), -(-shape[1] // SIDE)
+
+
+def around(totals: Real) -> Real:
+    """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
+    for axis in (-2, -1):
+        totals = ndimage.correlate1d(totals, _WEIGHTS, axis=axis, mode="constant")
+    return totals
+
+
+def to_pixels(figures: Real, shape: tuple[int, int]) -> Plane:
+    """Bilinear interpolation of figures of blocks; beyond the middles of the outer ones it is constant."""
+    down, across = (_between(extent, count) for extent, count in zip(shape, figures.shape, strict=True))
+    return np.asarray(down @ figures @ across.T, dtype=np.float32)
+
+
+@lru_cache(maxsize=64)
+def _between(extent: int, count: int) -> Real:
+    """Weight of each block for each pixel, `(pixels, blocks)`."""
+    at = np.clip((np.arange(extent) - (SIDE - 1) / 2.0) / SIDE, 0.0, count - 1)
+    return np.maximum(1.0 - np.abs(at[:, None] - np.arange(count)[None, :]), 0.0).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place where a check objects.
+
+    Parameters
+    ----------
+    check : str
+        Name of the check.
+    row, col : int
+        Pixel of the photo, in sensor orientation.
+    zone : {"center", "mid", "corner"}
+        Zone of the tile.
+    severity : float
+        Multiple of the limit, above 1.
+    held_back : float
+        Mean share of the correction that the check alone holds back in its tile.
+    """
+
+    check: str
+    row: int
+    col: int
+    zone: Zone
+    severity: float
+    held_back: float
+
+
+@dataclass(frozen=True, slots=True)
+class HeldTile:
+    """A tile of the photo, by its first pixel, and the share of its correction that was held back."""
+
+    row: int
+    col: int
+    held_back: float
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneAudit:
+    """What was held back in one zone.
+
+    Parameters
+    ----------
+    tiles : int
+        How many were audited.
+    tiles_held : int
+        Those of which more than a tenth was held back.
+    held_back : float
+        Mean share of the correction that was held back, 0 to 1.
+    checks : Mapping[str, float]
+        The same by check, each as if alone; those that held nothing back are left out.
+    """
+
+    tiles: int
+    tiles_held: int
+    held_back: float
+    checks: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport:
+    """What the audit of a photo held back, why, and where most.
+
+    Parameters
+    ----------
+    zones : Mapping[Zone, ZoneAudit]
+        Zones without a tile are left out.
+    worst : tuple of Place
+        The worst first, at most one of a check in a tile.
+    tiles : tuple of HeldTile
+        The map: those of which at least a hundredth was held back.
+    tile_side : int
+        Side of the square in pixels that a tile stands for; 0 where it is not known.
+    """
+
+    zones: Mapping[Zone, ZoneAudit]
+    worst: tuple[Place, ...]
+    tiles: tuple[HeldTile, ...] = ()
+    tile_side: int = 0
+
+    @property
+    def held_back(self) -> float:
+        """Mean share of the correction that was held back, all tiles together."""
+        tiles = sum(zone.tiles for zone in self.zones.values())
+        return sum(zone.tiles * zone.held_back for zone in self.zones.values()) / tiles if tiles else 0.0
+
+
+def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side: int = 0) -> AuditReport:
+    """Pool the audits of tiles.
+
+    Parameters
+    ----------
+    audits : iterable of (zone, (row, col), TileAudit)
+        Zone of each tile and its first pixel in the photo.
+    tile_side : int
+        Side of the square in pixels that a tile stands for.
+
+    Returns
+    -------
+    AuditReport
+    """
+    listed = list(audits)
+    zones: dict[Zone, ZoneAudit] = {}
+    for zone in ZONES:
+        in_zone = [audit for name, _, audit in listed if name == zone]
+        if in_zone:
+            zones[zone] = _zone(in_zone)
+    places = [
+        Place(f.check, top + f.at[0], left + f.at[1], zone, f.worst, f.held_back)
+        for zone, (top, left), audit in listed
+        for f in audit.findings
+        if f.held_back > 0.0
+    ]
+    places.sort(key=lambda place: (-place.held_back, -place.severity, place.row, place.col))
+    held = tuple(
+        HeldTile(top, left, audit.held_back) for _, (top, left), audit in listed if audit.held_back >= MAPPED
+    )
+    return AuditReport(zones, tuple(places[:PLACES]), held, tile_side)
+
+
+def _zone(audits: list[TileAudit]) -> ZoneAudit:
+    shares = [audit.held_back for audit in audits]
+    checks: dict[str, float] = {}
+    for audit in audits:
+        for finding in audit.findings:
+            checks[finding.check] = checks.get(finding.check, 0.0) + finding.held_back / len(audits)
+    return ZoneAudit(
+        len(audits),
+        sum(share > HELD for share in shares),
+        float(np.mean(shares)),
+        {name: share for name, share in checks.items() if share > 0.0},
+    )
+
+
+EvidenceAt: TypeAlias = Callable[[FieldPosition, Window], Evidence]
+"""What is known at a place of the field, for a window of the photo."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoAudit:
+    """Verdict on a photo.
+
+    Parameters
+    ----------
+    keep : Plane, shape (rows, cols)
+        Share of the correction that should be kept.
+    report : AuditReport
+        Why and where.
+    """
+
+    keep: Plane
+    report: AuditReport
+
+    def mixed(self, original: Planes, corrected: Planes) -> Planes:
+        """Mix a correction back towards its original as far as it fails.
+
+        Parameters
+        ----------
+        original, corrected : Planes, shape (3, rows, cols), float32
+            The photo and its correction.
+
+        Returns
+        -------
+        Planes, shape (3, rows, cols), float32
+        """
+        return np.asarray(original + self.keep * (corrected - original), dtype=np.float32)
+
+
+def audit_photo(
+    original: Planes, corrected: Planes, evidence: EvidenceAt, *, on_step: StepHook = ignore_step
+) -> PhotoAudit:
+    """Audit any program's correction of a photo.
+
+    Parameters
+    ----------
+    original, corrected : Planes, shape (3, rows, cols)
+        Linear light, saturation 1, pixel for pixel the same scene.
+    evidence : callable
+        What is known at a place: noise, clip levels, PSFs if any, where the sensor measured.
+    on_step : StepHook
+        Called after each tile; may raise to stop.
+
+    Returns
+    -------
+    PhotoAudit
+
+    Raises
+    ------
+    InvalidInputError
+        If the planes have different sizes.
+    """
+    if original.shape != corrected.shape:
+        raise InvalidInputError(
+            f"original and correction must have one size, got {original.shape} and {corrected.shape}"
+        )
+    frame = Frame(original.shape[1], original.shape[2])
+    keep = np.ones((frame.height, frame.width), dtype=np.float32)
+    tiles = list(_tiles(frame))
+    verdicts = []
+    for done, (part, around) in enumerate(tiles, start=1):
+        (top, bottom), (left, right) = ((s.start, s.stop) for s in part)
+        place = frame.position((top + bottom - 1) / 2.0, (left + right - 1) / 2.0)
+        inner = tuple(slice(p.start - a.start, p.stop - a.start) for p, a in zip(part, around, strict=True))
+        window = (slice(None), *around)
+        verdict = audit_tile(
+            np.asarray(original[window], dtype=np.float32),
+            np.asarray(corrected[window], dtype=np.float32),
+            evidence(place, around),
+            inner=(inner[0], inner[1]),
+        )
+        keep[part] = verdict.keep
+        verdicts.append((zone_of(place.r), (top, left), verdict.without_map()))
+        on_step(done, len(tiles))
+    return PhotoAudit(keep, pooled(verdicts))
+
+
+def _tiles(frame: Frame) -> Iterator[tuple[Window, Window]]:
+    """Parts of the frame, and each with its halo."""
+    for top in range(0, frame.height, TILE):
+        for left in range(0, frame.width, TILE):
+            bottom, right = min(top + TILE, frame.height), min(left + TILE, frame.width)
+            yield (
+                (slice(top, bottom), slice(left, right)),
+                (
+                    slice(max(top - HALO, 0), min(bottom + HALO, frame.height)),
+                    slice(max(left - HALO, 0), min(right + HALO, frame.width)),
+                ),
+            )

@@ -1,1 +1,0 @@
-"""Clipped light: how much of it there was, and what it does to its surroundings."""

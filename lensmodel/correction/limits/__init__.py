@@ -1,1 +1,0 @@
-"""Bounds on what a correction may do."""

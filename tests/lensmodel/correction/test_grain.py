@@ -1,0 +1,79 @@
+"""What the prior takes of a mosaic comes back as detail of its colour and as grain of none."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.compiled.grain import spread_grain
+
+LIGHT = np.array([0.3, 0.4, 0.2], dtype=np.float32)
+NOISE = np.array([[1e-4, 1e-6]] * 3, dtype=np.float32)
+CLIP = np.ones(3, dtype=np.float32)
+
+
+def sites(shape: tuple[int, int]) -> np.ndarray:
+    """Where each colour of a mosaic was measured, `(3, rows, cols)`."""
+    colours = np.tile(((0, 1), (1, 2)), (shape[0] // 2, shape[1] // 2))
+    return np.stack([colours == c for c in range(3)])
+
+
+def returned(left: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    known, out = sites(photo.shape[1:]), np.empty_like(photo)
+    spread_grain(photo, np.where(known, left, 0.0).astype(np.float32), known, CLIP, NOISE, LIGHT, out)
+    return out
+
+
+def flat(shape: tuple[int, int] = (64, 80)) -> np.ndarray:
+    return np.ascontiguousarray(np.broadcast_to(LIGHT[:, None, None], (3, *shape)), dtype=np.float32)
+
+
+def test_fine_grain_has_no_colour_and_its_own_strength() -> None:
+    photo = flat()
+    sigma = np.sqrt(NOISE[:, 0] * LIGHT + NOISE[:, 1])[:, None, None]
+    left = sigma * np.random.default_rng(0).standard_normal(photo.shape)
+
+    out = returned(left, photo)
+
+    fine = out - np.stack([ndimage.gaussian_filter(plane, 2.0) for plane in out])
+    relative = (fine / LIGHT[:, None, None]).reshape(3, -1)
+    assert np.corrcoef(relative).min() > 0.6
+    assert 0.5 < out[1].var() / sigma[1, 0, 0] ** 2 < 1.3
+
+
+def test_detail_of_one_colour_stays_in_it() -> None:
+    left = np.zeros((3, 64, 80))
+    left[2, 20:44, 20:60] = 0.01
+
+    out = returned(left, flat())
+
+    assert out[2, 26:38, 26:54].mean() > 0.009
+    assert np.abs(out[:2]).max() < 0.004  # at its edges
+
+
+def test_what_no_noise_explains_is_not_spread_to_other_colours() -> None:
+    left = np.zeros((3, 64, 80))
+    left[0, 32, 40] = 0.5  # an error of the kernel beside an edge
+
+    assert np.abs(returned(left, flat())[1:]).max() < 0.03
+
+
+def test_nothing_is_added_where_the_photo_is_clipped() -> None:
+    photo = flat()
+    photo[:, 10:20, 10:20] = 1.0
+    left = 0.01 * np.random.default_rng(1).standard_normal(photo.shape)
+
+    assert not returned(left, photo)[:, 10:20, 10:20].any()
+
+
+def test_filters_are_those_of_scipy() -> None:
+    plane = np.random.default_rng(2).random((30, 41), dtype=np.float32)
+    weights = np.array([0.1, 0.2, 0.4, 0.2, 0.1], dtype=np.float32)
+    for wrapped, mode in ((True, "wrap"), (False, "constant")):
+        out = np.empty_like(plane)
+        smooth(plane, weights, out, wrapped=wrapped)
+        expected = ndimage.correlate1d(
+            ndimage.correlate1d(plane, weights, axis=0, mode=mode), weights, axis=1, mode=mode
+        )
+        np.testing.assert_allclose(out, expected, atol=1e-6)

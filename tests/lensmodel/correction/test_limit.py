@@ -1,0 +1,203 @@
+"""The limit: light within the photo's range, widened by what blur hides; colours from nearby."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import NoiseModel, Planes
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.limit import extremes, limited, widening
+
+BLUR = UniformBlur(gaussian(15, np.eye(2) * 1.5**2))
+SENSOR = Sensor(NoiseModel(1e-6, 1e-8), clip=1.0)
+SURE, UNSURE = 0.05, 0.3
+
+
+def held(photo: Planes, made: Planes, error: float, halo: float | None = None) -> Planes:
+    return limited(photo, made, [BLUR] * 3, [SENSOR] * 3, [error] * 3, halo)
+
+
+def grey(plane: np.ndarray) -> Planes:
+    return np.stack([plane] * 3).astype(np.float32)
+
+
+def blurred(plane: np.ndarray) -> Planes:
+    return grey(ndimage.gaussian_filter(plane, 1.5, mode="nearest"))
+
+
+def step() -> np.ndarray:
+    plane = np.full((48, 64), 0.1)
+    plane[:, 32:] = 0.6
+    return plane
+
+
+def as_seen(light: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum(light, 0.0) ** (1 / 2.2))
+
+
+def overshoot(made: Planes) -> float:
+    """How far a plane leaves the levels of `step`, as a share of it as seen."""
+    low, high = as_seen(np.array([0.1, 0.6]))
+    shown = as_seen(made[1, 12:-12, 12:-12])
+    return float(max(shown.max() - high, low - shown.min()) / (high - low))
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**16))
+def test_a_photo_that_was_not_changed_stays_as_it_is(seed: int) -> None:
+    photo = np.random.default_rng(seed).uniform(0.0, 1.2, (3, 20, 23)).astype(np.float32)
+
+    np.testing.assert_allclose(held(photo, photo, UNSURE), photo, atol=1e-6)
+
+
+def test_what_was_made_is_not_changed_in_place() -> None:
+    photo = blurred(step())
+    made = photo + np.float32(3.0) * (photo - ndimage.gaussian_filter(photo, (0, 2, 2)))
+    before = made.copy()
+
+    assert not np.array_equal(held(photo, made, UNSURE), made)
+    np.testing.assert_array_equal(made, before)
+
+
+@pytest.mark.parametrize("error", [0.1, UNSURE])
+def test_an_edge_behind_an_unsure_kernel_gets_no_halo(error: float) -> None:
+    photo = blurred(step())
+    made = photo + np.float32(2.0) * (photo - ndimage.gaussian_filter(photo, (0, 2, 2)))
+
+    assert overshoot(made) > 0.25
+    assert overshoot(held(photo, made, error)) < 0.09
+
+
+def test_the_edge_itself_gets_as_steep_as_it_was_made() -> None:
+    photo, made = blurred(step()), grey(step())
+
+    np.testing.assert_allclose(held(photo, made, UNSURE), made, atol=0.01)
+
+
+@pytest.mark.parametrize("bright", [0.5, 0.02])
+def test_a_line_that_blur_made_faint_comes_back_where_the_kernel_is_sure(bright: float) -> None:
+    plane = np.full((48, 64), 0.15)
+    plane[:, 32] = bright
+    photo, made = blurred(plane), grey(plane)
+
+    result = held(photo, made, SURE)
+
+    assert abs(result[1, 24, 32] - 0.15) > 0.7 * abs(bright - 0.15)
+    assert abs(held(photo, made, 0.5)[1, 24, 32] - 0.15) < 0.7 * abs(bright - 0.15)
+
+
+def test_beside_clipped_light_nothing_leaves_the_range_nearby() -> None:
+    plane = np.full((48, 64), 0.2)
+    plane[20:26, 30:36] = 6.0
+    photo = np.minimum(blurred(plane), 1.0)
+    made = photo + np.random.default_rng(0).normal(0.0, 0.1, photo.shape).astype(np.float32)
+    made[:, 23, 40] = (0.9, 0.0, 0.9)
+
+    result = held(photo, made, UNSURE)
+
+    near = ndimage.binary_dilation(photo[0] >= 1.0, iterations=3)
+    window = (1, 5, 5)
+    low, high = ndimage.minimum_filter(photo, window), ndimage.maximum_filter(photo, window)
+    assert (result >= low - 1e-5)[:, near].all()
+    assert (result <= high + 1e-5)[:, near & (photo[0] < 1.0)].all()
+
+
+@pytest.mark.parametrize("halo", [0.0, 0.5])
+def test_a_halo_that_was_chosen_bounds_every_colour(halo: float) -> None:
+    rng = np.random.default_rng(1)
+    photo, made = (rng.uniform(low, high, (3, 30, 40)).astype(np.float32) for low, high in ((0, 1), (-1, 2)))
+    window = (1, 5, 5)
+    low, high = (f(photo, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+
+    result = held(photo, made, SURE, halo)
+
+    assert (result >= low - halo * (high - low) - 1e-6).all()
+    assert (result <= high + halo * (high - low) + 1e-6).all()
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), purity=st.floats(0.0, 0.5))
+def test_no_hue_leaves_those_nearby_and_the_light_stays(seed: int, purity: float) -> None:
+    rng = np.random.default_rng(seed)
+    level = rng.uniform(0.2, 0.6, (1, 20, 24)).repeat(3, axis=0)
+    photo = (level * (1.0 + purity * rng.uniform(-1.0, 1.0, level.shape))).astype(np.float32)
+    made = (photo * rng.uniform(0.3, 2.0, photo.shape)).astype(np.float32)
+
+    result = held(photo, made, SURE, np.inf)
+
+    np.testing.assert_allclose(result.sum(axis=0), made.sum(axis=0), rtol=1e-4)
+
+    def shares(planes: Planes, floor: np.ndarray) -> Planes:
+        return np.asarray((planes + floor / 3) / (planes.sum(axis=0) + floor))
+
+    floor = np.maximum(0.05 * ndimage.maximum_filter(photo.sum(axis=0), 7, mode="nearest"), 1e-6)
+    before, after = shares(photo, floor), shares(result, floor)
+    window = (1, 7, 7)
+    low, high = (f(before, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    assert (after >= low - 0.032).all()
+    assert (after <= high + 0.032).all()
+
+
+def test_a_dark_speck_lends_no_colour_to_the_light_beside_it() -> None:
+    photo = np.full((3, 16, 16), 0.3, dtype=np.float32)
+    photo[:, 8, 10] = (0.001, 0.001, 0.008)
+    made = photo.copy()
+    made[:, 8, 8] = (0.15, 0.15, 0.6)
+
+    result = held(photo, made, SURE, np.inf)[:, 8, 8]
+
+    np.testing.assert_allclose(result / result.sum(), 1.0 / 3.0, atol=0.12)  # the speck's is .8
+    assert result.sum() == pytest.approx(0.9, rel=1e-3)
+
+
+def test_two_hues_of_the_surroundings_do_not_allow_a_third() -> None:
+    """Brown beside grey: each colour's share of purple is within the range of theirs, purple is not."""
+    photo = np.empty((3, 16, 16), dtype=np.float32)
+    photo[:, :, :8] = np.array([0.33, 0.20, 0.09], dtype=np.float32)[:, None, None]
+    photo[:, :, 8:] = 0.4
+    made = photo.copy()
+    made[:, 8, 8] = (0.5, 0.25, 0.45)
+
+    r, g, b = held(photo, made, SURE, np.inf)[:, 8, 8]
+
+    assert g > min(r, b) - 0.05 * (r + g + b)
+
+
+def test_white_that_is_no_longer_clipped_takes_the_hue_around_it() -> None:
+    photo = np.empty((3, 20, 20), dtype=np.float32)
+    photo[:] = np.array([0.5, 0.3, 0.1], dtype=np.float32)[:, None, None]
+    photo[:, 9:11, 9:11] = 1.0
+    made = photo.copy()
+    made[:, 9, 9] = (0.5, 0.6, 0.9)
+
+    r, g, b = held(photo, made, SURE)[:, 9, 9]
+
+    assert r > g > b
+
+
+def test_room_is_the_less_the_less_sure_the_kernel() -> None:
+    rooms = np.array([widening([BLUR], error) for error in (0.05, 0.1, 0.25, 0.5)])
+
+    assert (np.diff(rooms, axis=0) <= 0.0).all()
+    assert rooms[2][1] == pytest.approx(1.0)
+    assert rooms[-1][2] == pytest.approx(0.06)
+    assert widening([UniformBlur(np.ones((1, 1)))], 0.05)[0] == pytest.approx(0.0)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**16), reach=st.integers(1, 7))
+def test_extremes_are_those_of_rank_filters(seed: int, reach: int) -> None:
+    plane = np.random.default_rng(seed).random((31, 26), dtype=np.float32)
+    low, high = np.empty_like(plane), np.empty_like(plane)
+
+    extremes(plane, plane, reach, low, high)
+
+    side = 2 * reach + 1
+    np.testing.assert_array_equal(low, ndimage.minimum_filter(plane, side, mode="nearest"))
+    np.testing.assert_array_equal(high, ndimage.maximum_filter(plane, side, mode="nearest"))

@@ -82,9 +82,6 @@ class Commands(OnDemand):
             "Copy all rows and blobs of an installation into a folder, even while it runs.",
             panel="Administration",
         ),
-        "restore": CommandEntry(
-            "app.commands.upkeep:restore", "Fill an empty installation from a backup.", panel="Administration"
-        ),
         "demo": CommandEntry(
             "lab.demo.command:demo",
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",

@@ -406,7 +406,7 @@ class Lens:
         Returns
         -------
         matplotlib.figure.Figure
-            Shown by a notebook as it is; `.savefig(...)` writes it.
+            A notebook shows it after `%matplotlib inline`; `.savefig(...)` writes it.
         """
         from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 

@@ -1,4 +1,6 @@
-"""The lens test against the truth: T and S of a traced lens by its chart, by its photos, by a correction.
+"""The lens test against the truth: T and S of a traced lens by its chart.
+
+    python -m lab.lens_test GRID.npz
 
 A chart of dark squares that lean is photographed through a lens whose kernels are known. Nothing of what is
 tested takes part in making it: squares are drawn by their exact areas in pixels, the pixel's own box is
@@ -7,17 +9,26 @@ taken out again, and the truth is the transfer function of the lens's own kernel
 
 from __future__ import annotations
 
+import argparse
 import math
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from lab.traced.grid import GridLens
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
-from lensmodel.simulate import CameraLens
+from lensmodel.measured.edges import SlantedEdges
+from lensmodel.measured.measurer import MeasuredPsf
+from lensmodel.photo import develop
+from lensmodel.quality import tangential_sagittal_mtf50
+from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
 from lensmodel.simulate.charts import edge_area
 
 MARGIN: Final = 40  # pixels of scene beyond the frame
@@ -114,3 +125,42 @@ def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: 
     mtf = np.abs(np.exp(-2j * np.pi * np.outer(frequencies, along.ravel())) @ kernel.ravel())
     below = np.flatnonzero(mtf < 0.5 * mtf[0])
     return float(frequencies[below[0]]) if below.size else 1.0
+
+
+def main() -> None:
+    """Photograph the chart through a traced lens, measure it, and print T and S beside the truth."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("grid", type=Path, help="of a traced lens, as `python -m lab.traced make` writes it")
+    asked = parser.parse_args()
+    lens = GridLens.read(asked.grid)
+    camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grids[0].pitch_um)
+    scene, squares = squares_chart(camera.frame)
+    shot = photograph(scene, lens, LensSettings(aperture=lens.widest()), camera, np.random.default_rng(0))
+    with tempfile.TemporaryDirectory() as folder:
+        write_photo(Path(folder) / "chart.dng", shot)
+        photo = develop(Path(folder) / "chart.dng")
+    psfs = SlantedEdges().measure([photo], size=31, channels=("g",))
+    print(f"{lens.model}: {len(psfs)} places of {len(squares)} squares")
+    print("\n".join(_table(lens, psfs, camera.pitch_um)))
+
+
+def _table(lens: CameraLens, psfs: Sequence[MeasuredPsf], pitch_um: float) -> list[str]:
+    """A line for each place, by radius, and how far from the truth half and nine in ten of them are."""
+    lines, errors = [], []
+    for psf in sorted(psfs, key=lambda psf: psf.position.r):
+        place = psf.position
+        seen = [min(value, 0.5) for value in tangential_sagittal_mtf50(psf.kernel, place.phi)]
+        true = [min(true_mtf50(lens, place, place.phi + turn, pitch_um), 0.5) for turn in (0.0, math.pi / 2)]
+        errors.append(np.abs(np.divide(seen, true) - 1.0))
+        lines.append(
+            f"r {place.r:.2f} phi {math.degrees(place.phi):4.0f}: "
+            f"T {seen[0]:.3f} truth {true[0]:.3f}, S {seen[1]:.3f} truth {true[1]:.3f}"
+        )
+    for share in (0.5, 0.9):
+        t, s = np.quantile(errors, share, axis=0)
+        lines.append(f"{share:.0%} of the places are within {t:.0%} (T) and {s:.0%} (S)")
+    return lines
+
+
+if __name__ == "__main__":
+    main()

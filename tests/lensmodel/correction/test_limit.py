@@ -108,6 +108,35 @@ def test_beside_clipped_light_nothing_leaves_the_range_nearby() -> None:
     assert (result <= high + 1e-5)[:, near & (photo[0] < 1.0)].all()
 
 
+def white_sun(colours: tuple[float, float, float]) -> Planes:
+    """A disc deeper than the blur, so many times as bright as saturation, on dim ground, as recorded."""
+    rows, cols = np.indices((96, 96))
+    disc = (np.hypot(rows - 48, cols - 48) < 22).astype(np.float64)
+    light = np.stack([0.05 + level * disc for level in colours])
+    return np.minimum(ndimage.gaussian_filter(light, (0, 1.5, 1.5)), 1.0).astype(np.float32)
+
+
+def test_around_a_white_area_the_photo_stays_where_the_kernel_is_unsure() -> None:
+    photo = white_sun((8.0, 8.0, 8.0))
+    ring = (photo[1] < 1.0) & (photo[1] > 0.5)
+    made = np.where(ring, np.float32(0.2), photo).astype(np.float32)
+
+    np.testing.assert_allclose(held(photo, made, UNSURE)[:, ring], photo[:, ring], atol=1e-5)
+    assert held(photo, made, 0.0)[:, ring].mean() < 0.95 * photo[:, ring].mean()
+
+
+def test_paint_of_which_one_colour_clips_may_get_darker_lines_than_white_may() -> None:
+    made = []
+    for colours in ((1.5, 0.6, 0.6), (1.5, 1.5, 1.5)):
+        photo = white_sun(colours)
+        line = np.zeros(photo.shape[1:], dtype=bool)
+        line[48, 73:76] = True  # next to the disc, where light falls off
+        change = np.where(line, np.float32(0.0), photo).astype(np.float32)
+        made.append(float((held(photo, change, SURE)[1, line] / photo[1, line]).mean()))
+
+    assert made[0] < made[1]
+
+
 @pytest.mark.parametrize("halo", [0.0, 0.5])
 def test_a_halo_that_was_chosen_bounds_every_colour(halo: float) -> None:
     rng = np.random.default_rng(1)

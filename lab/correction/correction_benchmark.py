@@ -34,15 +34,9 @@ _KERNEL = 25  # pixels: of a blur of 2 px (chosen)
 
 @dataclass(frozen=True, slots=True)
 class SoftCorners:
-    """A lens for timing: a Gaussian whose width grows from the centre to the corner.
+    """A lens for timing: a Gaussian whose width grows from the centre to the corner."""
 
-    Parameters
-    ----------
-    center_px, corner_px : float
-        Standard deviation in pixels.
-    """
-
-    center_px: float = 0.7
+    center_px: float = 0.7  # standard deviation in pixels
     corner_px: float = 1.8
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:

@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.correction.quality import FRAME, FrameWindow, view
+from lab.correction.frame_window import FRAME, FrameWindow, view
 from lab.gallery import figures
 from lab.gallery.rendering import Rendered, rendered
 from lab.images import psnr

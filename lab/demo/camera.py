@@ -31,21 +31,11 @@ CHART = "chart"
 
 @dataclass(frozen=True, slots=True)
 class DemoShot:
-    """One photo that the demo took.
+    """One photo that the demo took."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the scene.
-    path : Path
-        The DNG file.
-    truth : Path
-        The light that a perfect lens would have put on the sensor, npy `(3, row, col)` float32.
-    """
-
-    name: str
-    path: Path
-    truth: Path
+    name: str  # name of the scene
+    path: Path  # the DNG file
+    truth: Path  # the light that a perfect lens would have put on the sensor, npy `(3, row, col)` float32
 
     def sharp(self) -> Planes:
         """Load the truth: camera colours, not white-balanced, saturation 1."""

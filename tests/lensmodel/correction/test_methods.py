@@ -8,8 +8,8 @@ from scipy import ndimage
 from skimage import restoration
 
 from lab.correction.filter_flow import EfficientFilterFlow
+from lab.correction.frame_window import Constant
 from lab.correction.methods import compared
-from lab.correction.quality import Constant
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta, gaussian

@@ -109,7 +109,7 @@ class Selected(Answer):
 
 
 class ZoneGain(Answer):
-    """What a correction is expected to have done in one zone; `measured` at edges of a chart, by direction."""
+    """What a correction is expected to have done in one zone; `measured`, at the edges of a chart."""
 
     cells: Count = 0
     expected_gain_db: float | None = None

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.core.belief import Belief
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, delta
@@ -30,6 +29,7 @@ from lensmodel.correction.blur import Drift, UniformBlur
 from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
 from lensmodel.correction.limit import Bounds, limited
+from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.canvas import fitted_halo
 from lensmodel.correction.tiles.lattice import Cell
@@ -59,7 +59,7 @@ class CorrectionJob:
     """Everything that a cell needs; shared by the threads and never changed."""
 
     planes: Planes
-    beliefs: Callable[[FieldPosition, Channel], Belief]
+    posteriors: Callable[[FieldPosition, Channel], PsfPosterior]
     lateral: LateralColourShift | None
     frame: Frame
     method: Deconvolver
@@ -104,7 +104,7 @@ class CorrectionJob:
         """Kernel of one channel in a cell, and its change within it, on a tile that begins at `corner`."""
 
         def blur_at(position: FieldPosition) -> UniformBlur:
-            kernel = self.beliefs(position, channel).kernel
+            kernel = self.posteriors(position, channel).kernel
             return UniformBlur(_mixed(kernel, share), self.offset(position, channel))
 
         middle = blur_at(cell.position)
@@ -120,7 +120,7 @@ class CorrectionJob:
 
     def reach(self, position: FieldPosition, channel: Channel) -> int:
         """How far the blur of a place reaches, in pixels."""
-        return UniformBlur(self.beliefs(position, channel).kernel, self.offset(position, channel)).reach
+        return UniformBlur(self.posteriors(position, channel).kernel, self.offset(position, channel)).reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +145,7 @@ class _CellTile:
     corner: tuple[int, int]
     photo: Planes
     inner: tuple[slice, slice, slice]
-    beliefs: Sequence[Belief]
+    posteriors: Sequence[PsfPosterior]
     sensors: Sequence[Sensor]
 
     @classmethod
@@ -175,8 +175,8 @@ class _CellTile:
             slice(cell.top - top, cell.bottom - top),
             slice(cell.left - left, cell.right - left),
         )
-        beliefs = [job.beliefs(cell.position, channel) for channel in CHANNELS]
-        return cls(cell, (top, left), tile, inner, beliefs, sensors)
+        posteriors = [job.posteriors(cell.position, channel) for channel in CHANNELS]
+        return cls(cell, (top, left), tile, inner, posteriors, sensors)
 
     @property
     def cell_pixels(self) -> Planes:
@@ -210,7 +210,7 @@ def _within(
     """Restore a tile within bounds, checked; cut its halo off."""
     cell, sensors = tile.cell, tile.sensors
     offsets = [job.offset(cell.position, channel) for channel in CHANNELS]
-    plans = plan(cell, tile.photo, tile.beliefs, offsets, sensors, SHARE * bounds.texture)
+    plans = plan(cell, tile.photo, tile.posteriors, offsets, sensors, SHARE * bounds.texture)
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.plain):
@@ -234,7 +234,7 @@ def _checked(
     solution: Solution,
 ) -> tuple[Planes, TileAudit | None]:
     """Add back what the prior took, limit, audit; the cell without its halo."""
-    photo, sensors, errors = tile.photo, tile.sensors, [belief.error for belief in tile.beliefs]
+    photo, sensors, errors = tile.photo, tile.sensors, [posterior.error for posterior in tile.posteriors]
     restored = solution.planes
     if solution.unexplained is not None and bounds.texture > 0.0:
         share = np.float32(SHARE * bounds.texture) * texture_share(

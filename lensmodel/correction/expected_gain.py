@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.belief import GRID, WIDEST, Belief
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
@@ -22,6 +21,7 @@ from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.methods.wiener import frequency_counts, frequency_squared
+from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
 from lensmodel.correction.tiles.lattice import Cell
 
 WORTH_DB: Final = 0.1
@@ -119,7 +119,7 @@ class Plan:
 def plan(
     cell: Cell,
     tile: Planes,
-    beliefs: Sequence[Belief],
+    posteriors: Sequence[PsfPosterior],
     offsets: Sequence[tuple[float, float]],
     sensors: Sequence[Sensor],
     returned: float = 0.0,
@@ -143,10 +143,14 @@ def plan(
     before = after = 0.0
     shares: list[float] = []
     times = frequency_counts(_GRID)
-    for plane, belief, offset, sensor in zip(tile, beliefs, offsets, sensors, strict=True):
+    for plane, posterior, offset, sensor in zip(tile, posteriors, offsets, sensors, strict=True):
         point = UniformBlur(delta(1), offset).spectrum(_GRID)
-        K = point if belief.kernel.shape[0] > WIDEST else UniformBlur(belief.kernel, offset).spectrum(_GRID)
-        power, D = np.maximum(K.real**2 + K.imag**2, _LEAST), belief.variance
+        K = (
+            point
+            if posterior.kernel.shape[0] > WIDEST
+            else UniformBlur(posterior.kernel, offset).spectrum(_GRID)
+        )
+        power, D = np.maximum(K.real**2 + K.imag**2, _LEAST), posterior.variance
         n = float(sensor.noise.variance(plane[::_EVERY, ::_EVERY]).mean())
         S = scene_power(plane, power + D, n)
         before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
@@ -155,7 +159,7 @@ def plan(
         best = int(np.argmin(remaining))
         shares.append(_SHARES[best])
         after += float(remaining[best])
-    error = float(np.mean([belief.error for belief in beliefs]))
+    error = float(np.mean([posterior.error for posterior in posteriors]))
     return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
 
 

@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from lensmodel.core.belief import Belief
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField
@@ -34,6 +33,7 @@ from lensmodel.correction.engine import keep_freed_memory, tell_of_compiling
 from lensmodel.correction.expected_gain import ZoneReport, zone_reports
 from lensmodel.correction.limit import Bounds
 from lensmodel.correction.methods.catalogue import deconvolvers
+from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.lattice import Cell, Roi, cells, usual_pitch
 
@@ -180,7 +180,7 @@ def correct_planes(
     solver = deconvolvers.create(method) if isinstance(method, str) else method
     job = CorrectionJob(
         planes,
-        _beliefs_of(field, psf_error),
+        _posteriors_of(field, psf_error),
         lateral,
         frame,
         solver,
@@ -229,18 +229,22 @@ def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
     return out
 
 
-def _beliefs_of(field: PsfField, psf_error: PsfError | None) -> Callable[[FieldPosition, Channel], Belief]:
-    """The belief about the PSF of one channel at one place, cached.
+def _posteriors_of(
+    field: PsfField, psf_error: PsfError | None
+) -> Callable[[FieldPosition, Channel], PsfPosterior]:
+    """The posterior of the PSF of one channel at one place, cached.
 
     Each serves its own cell and its neighbours; the cache holds three rows of cells of 100 megapixels.
     """
 
     @lru_cache(maxsize=640)
-    def belief(position: FieldPosition, channel: Channel) -> Belief:
+    def posterior(position: FieldPosition, channel: Channel) -> PsfPosterior:
         error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
-        return Belief.of_error(crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error))
+        return PsfPosterior.of_error(
+            crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error)
+        )
 
-    return belief
+    return posterior
 
 
 def _restored(

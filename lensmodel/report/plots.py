@@ -59,6 +59,7 @@ _UNITS: Final[dict[Unit, str]] = {
     "lp/mm": "line pairs per mm",
 }
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
+_LETTERS: Final = 80  # of a legend beside each other (chosen: they fit below a chart)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
 _LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none (chosen)
@@ -343,7 +344,7 @@ def over_apertures(ax: Axes, report: LensReport, unit: Unit = "c/px") -> None:
     ax.set_xticks(list(stops), [one.at for one in known])
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel(f"MTF50, {_UNITS[unit]}")
-    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=4)  # seen also where the right is cut off
+    _legend(ax)
 
 
 def lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
@@ -382,10 +383,17 @@ def difference(ax: Axes, comparison: Comparison) -> None:
     ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper; a dot: within the error")
 
 
+def _legend(ax: Axes) -> None:
+    """Draw the legend below, where it is seen also where the right is cut off, as wide as it may be."""
+    longest = max(len(label) for label in ax.get_legend_handles_labels()[1])
+    columns = max(1, min(4, _LETTERS // (longest + 6)))  # six for the line before each
+    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=columns)
+
+
 def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
     ax.set(xlim=(0.0, 1.0), ylim=(low, top), ylabel=words)
     ax.set_xlabel("0 centre, 1 corner", loc="right")
-    ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=4)  # seen also where the right is cut off
+    _legend(ax)
 
 
 # --- pages ------------------------------------------------------------------------------------

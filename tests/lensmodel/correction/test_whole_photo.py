@@ -9,7 +9,6 @@ import pytest
 from scipy import ndimage
 
 from lab.correction.filter_flow import EfficientFilterFlow
-from lensmodel.core.belief import Belief
 from lensmodel.core.errors import CancelledError, InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import gaussian
@@ -17,6 +16,7 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, Noise
 from lensmodel.correction import Bounds, Corrected, Roi, correct_planes
 from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import plan
+from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.correction.tiles.lattice import cells
 
 FRAME = Frame(152, 208)  # two cells by two
@@ -319,7 +319,13 @@ def test_forecast_of_a_blur_turns_with_it() -> None:
     cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.01))] * 3
 
     lying, standing = (
-        plan(cell, plane, [Belief.of_error(gaussian(15, np.diag(width)), 0.2)] * 3, [(0.0, 0.0)] * 3, sensors)
+        plan(
+            cell,
+            plane,
+            [PsfPosterior.of_error(gaussian(15, np.diag(width)), 0.2)] * 3,
+            [(0.0, 0.0)] * 3,
+            sensors,
+        )
         for width in ((0.1, 6.0), (6.0, 0.1))
     )
 
@@ -334,7 +340,7 @@ def test_less_of_a_kernel_is_used_the_less_sure_it_is() -> None:
     kernel = gaussian(15, 1.4**2 * np.eye(2))
 
     plans = [
-        plan(cell, plane, [Belief.of_error(kernel, error)] * 3, [(0.0, 0.0)] * 3, sensors)
+        plan(cell, plane, [PsfPosterior.of_error(kernel, error)] * 3, [(0.0, 0.0)] * 3, sensors)
         for error in (0.0, 0.3, 0.6, 1.0)
     ]
 

@@ -242,6 +242,9 @@ def test_two_copies_are_compared_with_their_error(soft: LensReport) -> None:
     assert f"{sharp.samples} blur samples" in page
     assert page.count("<img") == 3
     assert to_pdf([comparison_page(found)]).startswith(b"%PDF-")
+    # a name as long as makers give leaves room for the chart: matplotlib would warn
+    long = compare(*[Side("Simulated Optics Simulated Astigmatism 85mm f/2", soft.tested[0])] * 2)
+    assert to_pdf([comparison_page(long)]).startswith(b"%PDF-")
 
 
 def test_apertures_are_tested_each_and_the_best_is_named() -> None:

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from lensmodel.core.belief import GRID, Belief
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian, otf
+from lensmodel.correction.posterior import GRID, PsfPosterior
 
 SIDE = 31
 WIDE = gaussian(SIDE, 2.0**2 * np.eye(2))
@@ -24,14 +24,14 @@ def times() -> np.ndarray:
 
 @pytest.mark.parametrize("error", [0.1, 0.5])
 def test_variance_of_a_known_error_has_its_size_and_spares_what_has_no_blur(error: float) -> None:
-    belief = Belief.of_error(WIDE, error)
+    posterior = PsfPosterior.of_error(WIDE, error)
     power = np.abs(otf(WIDE, GRID)) ** 2
 
-    assert (times() * belief.variance).sum() == pytest.approx(error**2 * (times() * power).sum(), rel=1e-4)
-    assert belief.variance[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert (times() * posterior.variance).sum() == pytest.approx(error**2 * (times() * power).sum(), rel=1e-4)
+    assert posterior.variance[0, 0] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
 def test_impossible_errors_are_refused(bad: float) -> None:
     with pytest.raises(InvalidInputError, match="psf_error"):
-        Belief.of_error(WIDE, bad)
+        PsfPosterior.of_error(WIDE, bad)

@@ -1,4 +1,4 @@
-"""What is thought of the PSF at one place: its mean, and how far the true one may lie from that.
+"""Posterior of the PSF at one place: its mean, and how far the true one may lie from that.
 
 A kernel that is known only roughly is not to be undone as if it were exact. With H the transfer function of
 the true kernel, a random quantity to whoever does not know it, the linear filter of least expected error
@@ -32,7 +32,7 @@ _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Belief:
+class PsfPosterior:
     """Mean and uncertainty of a PSF."""
 
     kernel: Kernel  # (k, k), the mean
@@ -40,7 +40,7 @@ class Belief:
     error: float  # expected relative L2 distance of the true kernel from the mean
 
     @classmethod
-    def of_error(cls, kernel: Kernel, error: float) -> Belief:
+    def of_error(cls, kernel: Kernel, error: float) -> PsfPosterior:
         """A kernel of which only the relative L2 error e is known: most likely its width is wrong.
 
         Var[H] = e² |H|² ln²|H| sum |H|² / sum |H|² ln²|H|, as an error of the width makes.

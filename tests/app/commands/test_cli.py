@@ -556,8 +556,7 @@ def test_unknown_options_and_settings_are_wrong_usage(here: Here, monkeypatch: p
 def test_the_settings_are_told_with_what_they_mean_and_without_passwords(
     here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("DATABASE", "JOBS"):
-        monkeypatch.setenv(f"LENS_{name}_URL", "postgresql+psycopg://lens:a[b@c/d@db:5432/lens")
+    monkeypatch.setenv("LENS_DATABASE_URL", "postgresql+psycopg://lens:a[b@c/d@db:5432/lens")
     monkeypatch.setenv("LENS_STORAGE_URL", "s3://lensmodel")
     lines = here("config").stdout.splitlines()
 

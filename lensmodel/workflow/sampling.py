@@ -8,6 +8,7 @@ same code. `Preset` says which parts are taken where nobody asks for others, `Co
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -170,8 +171,14 @@ def save_developed(developed: LinearPhoto, folder: Path) -> None:
         f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
     }
     (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
-    with (folder / "planes.npy").open("wb") as file:
-        save_array(file, developed.planes)
+    path = folder / "planes.npy"
+    try:
+        with path.open("wb") as file:
+            save_array(file, developed.planes)
+    except OSError:  # a full disk: what there is of it is in the way of others
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise
 
 
 def load_developed(folder: Path) -> LinearPhoto:

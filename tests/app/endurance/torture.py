@@ -350,16 +350,18 @@ def check(settings: Settings, store: Store, storage: Storage, plan: Plan) -> Non
     assert not [finding for finding in findings if finding.check != "work"], findings
     with store.database.reading() as session:
         samples = session.scalar(select(func.count()).select_from(SampleRow))
+        photos = session.scalar(select(func.count()).select_from(PhotoRow))
         lenses = session.execute(
             select(OwnerRow.name, LensRow.version, LensRow.photo_count, LensRow.sample_count)
             .join(LensRow, LensRow.owner_id == OwnerRow.id)
             .order_by(OwnerRow.name)
         ).all()
     each = plan.photos // len(OWNERS)
-    assert samples == plan.photos * CELLS * CHANNELS
-    assert [tuple(lens) for lens in lenses] == [
-        (owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS
-    ]
+    found = [tuple(lens) for lens in lenses]
+    said = f"{samples} samples, {photos} photos, lenses {found}"
+    assert photos == plan.photos, said
+    assert samples == plan.photos * CELLS * CHANNELS, said
+    assert found == [(owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS], said
 
 
 def main() -> int:

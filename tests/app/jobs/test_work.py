@@ -298,6 +298,24 @@ def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estima
     assert [(s.sample.estimator, s.sample.error) for s in samples] == [("measured-target/1", 0.04)] * 2
 
 
+def test_a_file_is_not_lost_whose_disk_went_away_for_a_moment(
+    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
+) -> None:
+    folder = context.storage.folder
+    assert folder is not None
+    aside = folder.with_name("aside")
+
+    with pytest.raises(OSError, match="was away"), context.original(photo) as path:  # noqa: PT012
+        folder.rename(aside)
+        try:
+            path.read_bytes()
+        finally:
+            aside.rename(folder)
+
+    work.photo(photo.public_id, 1)
+    assert steps.fresh(photo).state == "counted"
+
+
 def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
     work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:

@@ -26,7 +26,7 @@ from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.database import Database, new_id
 from app.store.migrate import downgrade, upgrade
 from app.store.owners import ANY_OWNER
-from app.store.tables import PhotoRow
+from app.store.tables import PROFILE_FILE, PhotoRow
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
@@ -244,7 +244,9 @@ def reading(settings: Settings, store: Store) -> Iterator[None]:
     def read() -> None:
         while not ended.wait(0.02):
             for photo_id, epoch, _ in store.photos.to_do():
-                work.photo(photo_id, epoch)
+                row = store.photos.get(photo_id, ANY_OWNER)
+                if row is not None and row.kind == PROFILE_FILE:  # photos are the test's own
+                    work.photo(photo_id, epoch)
 
     thread = threading.Thread(target=read)
     thread.start()

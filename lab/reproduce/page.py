@@ -454,7 +454,8 @@ def _fig2(page: Page, fig: Mapping[str, Any] | None) -> None:
     )
     places = "; ".join(f"r = {r:g}, phi = {phi:g}" for r, phi in fig["places"])
     page.picture(
-        fig["picture"], f"Rows: {', '.join(fig['rows'])}. Columns: {places}. {fig['lens']}, gamma 0.5"
+        PICTURES + fig["picture"],
+        f"Rows: {', '.join(fig['rows'])}. Columns: {places}. {fig['lens']}, gamma 0.5",
     )
 
 

@@ -39,10 +39,12 @@ from app.store.tables import KeyRow
 from lab import targets
 from lensmodel.cli.main import app, main
 from lensmodel.cli.on_demand import OnDemand
+from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.measured.page import TargetPage
 from lensmodel.model import LensModel, LensProfile, save_profile
+from lensmodel.simulate import edge_chart
 
 HERE = Path(__file__).parents[1]
 PATIENCE_S = 240.0
@@ -128,14 +130,16 @@ def marked(lines: Iterable[str]) -> list[Any]:
 
 
 def write_what_measures(folder: Path) -> None:
-    """Write a photo of a printed page, and one scene at two apertures."""
+    """Write a photo of a printed page and of a chart of edges, and one scene at two apertures."""
     page = 0.8 * targets.target_scene(TargetPage(1000), (360, 510), targets.Setup(fill=0.97))[1]
+    chart = edge_chart(Frame(720, 960), margin=0).scene[1]
     noise = 0.4 + 0.12 * np.random.default_rng(7).standard_normal((720, 960))
     noise = np.clip(ndimage.gaussian_filter(noise, 0.5), 0.05, 0.9)
     for name, light, sigma, aperture in (
         ("page", page, 1.0, 2.8),
         ("open", noise, 1.3, 2.8),
         ("closed", noise, 0.4, 8.0),
+        ("chart", chart, 1.0, 2.8),
     ):
         write_light(folder / f"{name}.dng", ndimage.gaussian_filter(light, sigma), 6, aperture=aperture)
 

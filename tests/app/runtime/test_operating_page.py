@@ -58,4 +58,3 @@ def test_each_command_of_the_pages_does_what_it_says(tmp_path: Path) -> None:
     assert shell.returncode == 0, said
     assert "lensmodel_queue_jobs" in said
     assert (tmp_path / "my-backup").is_dir()
-    assert (tmp_path / "elsewhere.db").is_file()

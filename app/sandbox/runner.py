@@ -73,7 +73,7 @@ class _Watched:
             on_progress(_number(message.get("done")), _number(message.get("total")))
         return message is not None
 
-    def hear(self) -> bool:
+    def receive(self) -> bool:
         """Log what the task printed, whole lines of it; False once it has closed its end."""
         data = os.read(self.said.fileno(), MAX_SAID)
         self.logged += len(data)
@@ -234,7 +234,7 @@ class Sandbox:
                     status = 0 if cut else self._exit_status(process)
                 finally:
                     self._end(process)
-                while said.poll() and watched.hear():  # not until all ends are closed: one may live on
+                while said.poll() and watched.receive():  # not until all ends are closed: one may live on
                     pass
                 _leave_plain_files(folder)
                 return cut or outcome_of(watched.ended, status, folder, limits)
@@ -292,7 +292,7 @@ class Sandbox:
             ready = wait(waiting, timeout=POLL_S)
             if watched.line in ready and not watched.listen(on_progress):
                 waiting.remove(watched.line)
-            if watched.said in ready and not watched.hear():
+            if watched.said in ready and not watched.receive():
                 waiting.remove(watched.said)
             if ready == [watched.process.sentinel]:  # and all messages are read
                 return None

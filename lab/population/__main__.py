@@ -117,7 +117,7 @@ def _publish(asked: argparse.Namespace) -> None:
         errors_raised=round(shift, 4),
     )
     write_atomically(WEIGHTS, published)
-    print(f"errors that were told on lenses of training are raised by {np.exp(shift):.2f}")
+    print(f"told errors are raised by {np.exp(shift):.2f}, the median on lenses held out")
     print(f"{WEIGHTS}: {len(published) / 2**20:.1f} MiB, {FieldNetwork.from_bytes(published).name}")
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
 

@@ -1,17 +1,16 @@
-"""The parts of an open page that change, which it asks for every two seconds."""
+"""The part of an open page that changes, which htmx asks for every two seconds while there is something to wait for."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
-from typing import Final, Literal, TypeAlias
+from typing import Any, Final, Literal
 
 from fastapi import APIRouter, Response
 
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.pages import batch, shown
+from app.pages import batch, shown, words
 from app.pages.rendering import fragment
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
@@ -21,8 +20,6 @@ from app.routes.common import matches_tag
 router = APIRouter(include_in_schema=False)
 
 Page = Literal["home", "photo", "correction", "batch", "lens"]
-Fragments: TypeAlias = Mapping[str, str]
-"""HTML by the id of the element that it replaces."""
 
 
 @router.get("/ui/parts")
@@ -31,51 +28,54 @@ def parts(
     page: Page = "home",
     id: batch.Ids = "",  # noqa: A002
 ) -> Response:
-    """Return the parts of a page as they are now; 304 where the browser has them."""
-    body = json.dumps(_DRAWERS[page](call, id)).encode()
+    """Return the part of a page as it is now; 304 where the browser has it. The whole page anew once work is done."""
+    template, values, settled = _PARTS[page](call, id)
+    body = fragment(template, **values).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if matches_tag(call, tag):
+    if settled:
+        headers["HX-Refresh"] = "true"
+    elif matches_tag(call, tag):
         return Response(status_code=304, headers=headers)
-    return Response(body, media_type="application/json", headers=headers)
+    return Response(body, media_type="text/html", headers=headers)
 
 
-def _home(call: Call, _: str) -> Fragments:
+Part = tuple[str, Mapping[str, Any], bool]
+"""Template, what it shows, and whether the page has to be made anew."""
+
+
+def home(call: Call, _: str = "") -> Part:
+    """Return what is shown of all photos and lenses."""
     photos, more = shown.photos(call)
     lenses = shown.lenses_with_photos(call)
-    return {
-        "waiting": fragment("_waiting.html", groups=shown.waiting(call), lenses=lenses),
-        "lenses": fragment("_lenses.html", lenses=lenses),
-        "photos": fragment("_photos.html", photos=photos, more=more),
-    }
+    values = {"photos": photos, "more": more, "lenses": lenses, "groups": shown.waiting(call)}
+    return "_home.html", values, False
 
 
-def _photo(call: Call, photo_id: str) -> Fragments:
+def _photo(call: Call, photo_id: str) -> Part:
     photo = photo_routes.described_photo(call, photo_routes.find_photo(call, photo_id))
-    return {"photo-state": fragment("_photo_state.html", photo=photo)}
+    return "_photo_state.html", {"photo": photo}, not words.active(photo)
 
 
-def _correction(call: Call, correction_id: str) -> Fragments:
+def _correction(call: Call, correction_id: str) -> Part:
     plan = correction_routes.find_plan(call, correction_id)
-    return {
-        "correction-state": fragment(
-            "_correction_state.html", correction=views.correction_out(plan), job=views.correction_job(plan)
-        )
-    }
+    correction, job = views.correction_out(plan), views.correction_job(plan)
+    values = {"correction": correction, "job": job}
+    return "_correction_state.html", values, job.state not in {"queued", "running"}
 
 
-def _batch(call: Call, ids: str) -> Fragments:
-    return {"batch-state": fragment("_batch.html", **batch.state(call, ids))}
+def _batch(call: Call, ids: str) -> Part:
+    return "_batch.html", batch.state(call, ids), False
 
 
-def _lens(call: Call, lens_id: str) -> Fragments:
-    lens = lens_routes.read_lens(lens_id, call)
-    state = fragment("_lens_state.html", lens=lens, counting=shown.counting(call, lens_id))
-    return {"lens-state": state}
+def _lens(call: Call, lens_id: str) -> Part:
+    counting = shown.counting(call, lens_id)
+    values = {"lens": lens_routes.read_lens(lens_id, call), "counting": counting}
+    return "_lens_state.html", values, not counting
 
 
-_DRAWERS: Final[Mapping[Page, Callable[[Call, str], Fragments]]] = {
-    "home": _home,
+_PARTS: Final[Mapping[Page, Callable[[Call, str], Part]]] = {
+    "home": home,
     "photo": _photo,
     "correction": _correction,
     "batch": _batch,

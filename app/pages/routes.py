@@ -16,7 +16,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.http.dependencies import CallDep, call_of
-from app.pages import batch, lens_pages, parts, photo_pages, pictures, shown, words
+from app.pages import batch, lens_pages, parts, photo_pages, pictures, words
 from app.pages.rendering import page
 from lensmodel.core.errors import LensModelError
 
@@ -52,11 +52,17 @@ Handler: TypeAlias = Callable[[Request, Any], Any]
 
 
 def _for_people(answer: Handler) -> Handler:
-    """Turn the response of an exception handler into a page where a browser requested one."""
+    """Turn the response of an exception handler into a page where a browser requested one.
+
+    An open page whose session has ended goes to the sign-in; one whose subject is gone, to the first page.
+    """
 
     async def handle(request: Request, error: Exception) -> Response:
         waited = answer(request, error)
         plain: Response = await waited if isinstance(waited, Awaitable) else waited
+        if plain.status_code in {401, 404} and "hx-request" in request.headers:
+            shown = quote(request.headers.get("hx-current-url", "/"), safe="/")
+            plain.headers["HX-Redirect"] = f"/sign-in?next={shown}" if plain.status_code == 401 else "/"
         if plain.status_code == 401 and _wants_page(request):
             path = quote(request.url.path, safe="/")
             return RedirectResponse(f"/sign-in?next={path}", 303)
@@ -78,14 +84,7 @@ def _wants_page(request: Request) -> bool:
 @router.get("/")
 def home(call: CallDep) -> HTMLResponse:
     """Show where photos are given and what became of them."""
-    photos, more = shown.photos(call)
-    return page(
-        "home.html",
-        photos=photos,
-        more=more,
-        lenses=shown.lenses_with_photos(call),
-        groups=shown.waiting(call),
-    )
+    return page("home.html", **parts.home(call)[1])
 
 
 @router.get("/docs")

@@ -1,13 +1,13 @@
 // Behaviour of the pages. Each part looks for its own element and does nothing where there is none.
 
 import { setUpBatch } from "./batch.js";
-import { setUpActions, setUpForms, setUpGroups, setUpSettling } from "./forms.js";
-import { setUpCharts, setUpField, setUpHistory, setUpLensActions, setUpNewLens, setUpVersions } from "./lens.js";
+import { setUpForms, setUpGroups } from "./forms.js";
+import { setUpCharts, setUpField, setUpHistory, setUpLensActions } from "./lens.js";
+import { keepFocus, setUpLive } from "./live.js";
 import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
 import { setUpSignIn, setUpSignOut } from "./session.js";
-import { setUpPolling } from "./poll.js";
 import { setUpUpload } from "./upload.js";
 import { setUpViewer } from "./view_tools.js";
 
@@ -15,20 +15,18 @@ const parts = [
   setUpUpload,
   setUpForms,
   setUpGroups,
-  setUpActions,
   setUpBatch,
   setUpField,
   setUpCharts,
   setUpLensActions,
-  setUpNewLens,
-  setUpVersions,
   setUpHistory,
   setUpPhoto,
   setUpMeasure,
   setUpSignIn,
   setUpSignOut,
   () => setUpPreview(setUpViewer()),
-  () => setUpPolling(setUpSettling()),
+  setUpLive,
+  keepFocus,
 ];
 for (const setUp of parts) {
   try {

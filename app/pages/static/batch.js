@@ -1,11 +1,11 @@
 // Photos that are chosen in a list and corrected together.
 
-import { byId, send } from "./common.js";
+import { acting, byId, send } from "./common.js";
 
 export function setUpBatch() {
   const form = byId("batch");
   if (!form) return;
-  const [every, go, alert] = [form.querySelector("[data-every]"), form.querySelector("button:not([data-every])"), form.querySelector(".alert")];
+  const [every, go] = [form.querySelector("[data-every]"), form.querySelector("button:not([data-every])")];
   const boxes = () => [...form.querySelectorAll("[name=photo]")];
   const chosen = () => boxes().filter(({ checked }) => checked);
   const show = () => {
@@ -16,15 +16,13 @@ export function setUpBatch() {
     go.textContent = count === 1 ? "Correct 1 photo" : `Correct ${count} photos`;
   };
   form.addEventListener("change", show);
-  if (byId("photos")) new MutationObserver(show).observe(byId("photos"), { childList: true, subtree: true }); // it grows
+  document.addEventListener("htmx:after:swap", show); // the list grows
   every.addEventListener("click", () => {
     const all = every.textContent === "Choose all";
     for (const box of boxes()) box.checked = all;
     show();
   });
-  form.addEventListener("submit", async (event) => {
-    event.preventDefault();
-    go.disabled = true;
+  acting(form, async () => {
     const [made, refused] = [[], []];
     for (const { value, ariaLabel } of chosen()) {
       const name = ariaLabel.replace("Choose ", "");
@@ -33,16 +31,14 @@ export function setUpBatch() {
         (reason) => refused.push(`${name}: ${reason.message}`),
       );
     }
-    go.disabled = false;
-    alert.textContent = refused.join(" ");
-    alert.hidden = !refused.length;
-    if (made.length && !refused.length) location.assign(`/batch?ids=${made.join(",")}`);
-    else if (made.length) {
-      const link = document.createElement("a");
-      link.href = `/batch?ids=${made.join(",")}`;
-      link.textContent = " The others are being corrected.";
-      alert.append(link);
-    }
+    const address = `/batch?ids=${made.join(",")}`;
+    if (!refused.length) return address;
+    if (!made.length) throw new Error(refused.join(" "));
+    const link = Object.assign(document.createElement("a"), { href: address, textContent: "The others are being corrected." });
+    const alert = form.querySelector(".alert");
+    alert.replaceChildren(`${refused.join(" ")} `, link);
+    alert.hidden = false;
+    return "";
   });
   show();
 }

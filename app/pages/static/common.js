@@ -10,31 +10,23 @@ const PLAIN = {
   decompression_bomb: "This file would unpack to far more than a photo holds.",
 };
 
-export async function problemText(response) {
+// An answer that something was refused, as an error: a sentence for people, and its code for those who know what to do.
+export function failure(answered, status) {
   try {
-    const problem = await response.json();
-    if (PLAIN[problem.code]) return PLAIN[problem.code];
-    const first = problem.errors?.[0]?.message;
-    return first && !problem.detail.includes(first) ? `${problem.detail}: ${first}` : problem.detail;
+    const { code, detail, errors } = JSON.parse(answered);
+    const first = errors?.[0]?.message;
+    const text = first && !detail.includes(first) ? `${detail}: ${first}` : detail;
+    return Object.assign(new Error(PLAIN[code] ?? text[0].toUpperCase() + text.slice(1)), { code });
   } catch {
-    return `The service answered ${response.status}. Try again in a moment.`;
+    return new Error(`The service answered ${status}. Try again in a moment.`);
   }
 }
 
-// The answer to a refused upload as a sentence for people; the service's own words where we have none.
-export function refusalText(answered, status) {
-  try {
-    const { code, detail } = JSON.parse(answered);
-    return PLAIN[code] ?? detail[0].toUpperCase() + detail.slice(1);
-  } catch {
-    return `The service answered ${status}. Try again in a moment.`;
-  }
-}
-
-// The answer that something was refused, as an error: its text, and its code for those who know what to do.
-export async function failure(response) {
-  const problem = await response.clone().json().catch(() => ({}));
-  return Object.assign(new Error(await problemText(response)), { code: problem.code });
+// Ask the service: its answer, or an error with what it said.
+export async function ask(url, options) {
+  const response = await fetch(url, options);
+  if (!response.ok) throw failure(await response.text(), response.status);
+  return response;
 }
 
 // Do what may meet another lens than the one that is named: where it does, ask, and do it all the same.
@@ -44,18 +36,39 @@ export async function withItsLens(act) {
   } catch (reason) {
     if (reason.code !== "other_lens") throw reason;
     const [why] = reason.message.split("; choose its own lens");
-    return (await confirmed(`${why[0].toUpperCase()}${why.slice(1)}.`, "It is the same lens")) ? act(true) : null;
+    return (await confirmed(`${why}.`, "It is the same lens")) ? act(true) : null;
   }
 }
 
 export async function send(method, url, body) {
-  const response = await fetch(url, {
-    method,
-    headers: { "Content-Type": "application/json" },
-    body: body === undefined ? undefined : JSON.stringify(body),
-  });
-  if (!response.ok) throw await failure(response);
+  const headers = { "Content-Type": "application/json" };
+  const response = await ask(url, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
   return response.status === 204 ? null : response.json();
+}
+
+// Let a form act. `act` gives the address to go on at, true for this page anew, or nothing; its errors are said in the
+// form. Until it answers the form takes no second wish.
+export function acting(form, act, alert = form?.querySelector(".alert")) {
+  if (!form) return;
+  for (const button of form.querySelectorAll("button")) button.disabled = false; // until now a click would have gone nowhere
+  const free = () => form.removeAttribute("aria-busy");
+  window.addEventListener("pageshow", free); // back from where it went on
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (form.matches("[aria-busy]")) return;
+    if (alert) alert.hidden = true;
+    form.setAttribute("aria-busy", "true");
+    try {
+      const onward = await act(new FormData(form), form, event.submitter);
+      if (onward === true) location.reload();
+      else if (onward) location.assign(onward);
+      else free();
+    } catch (reason) {
+      alert.textContent = reason.message;
+      alert.hidden = false;
+      free();
+    }
+  });
 }
 
 // Ask before what cannot be undone: whether the answer is yes.

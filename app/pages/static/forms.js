@@ -1,53 +1,27 @@
-// Forms and buttons that talk to the API, and pages that wait for work to end.
+// Forms that talk to the API.
 
-import { byId, confirmed, send, withItsLens } from "./common.js";
-import { refreshed, removing } from "./poll.js";
-
-function setUpForm(id, act) {
-  const form = byId(id);
-  if (!form?.querySelector("button")) return; // a photo without any lens has nothing to send
-  const error = form.querySelector(".alert");
-  const button = form.querySelector("button");
-  button.disabled = false; // until now a click would have gone nowhere
-  form.addEventListener("submit", async (event) => {
-    event.preventDefault();
-    error.hidden = true;
-    button.disabled = true;
-    try {
-      button.disabled = (await act(new FormData(form), form.dataset.photo)) !== false;
-    } catch (reason) {
-      error.textContent = reason.message;
-      error.hidden = false;
-      button.disabled = false;
-    }
-  });
-}
+import { acting, byId, confirmed, send, withItsLens } from "./common.js";
+import { refresh } from "./live.js";
 
 export function setUpForms() {
-  setUpForm("name-lens", async (fields, photo) => {
+  acting(byId("name-lens"), async (fields, { dataset }) => {
     const known = !fields.has("label"); // the lens: only its aperture is asked for
     const change = { ...namedLens(fields), ...givenAperture(fields) };
     if (known && !change.aperture) throw new Error("Give the aperture, a number such as 2.8.");
     if (!known && !change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
-    await send("PATCH", `/v1/photos/${photo}`, change);
-    location.reload();
+    await send("PATCH", `/v1/photos/${dataset.photo}`, change);
+    return true;
   });
-  setUpForm("correct", async (fields, photo) => {
-    const wish = {
-      photo_id: photo,
-      method: fields.get("method"),
-      strength: Number(fields.get("strength")),
-      texture: Number(fields.get("texture")),
-      denoise: Number(fields.get("denoise")),
-      output: { format: fields.get("format") },
-    };
+  const form = byId("correct");
+  acting(form, async (fields, { dataset }) => {
+    const wish = { photo_id: dataset.photo, method: fields.get("method"), output: { format: fields.get("format") } };
+    for (const name of ["strength", "texture", "denoise"]) wish[name] = Number(fields.get(name));
     if (fields.get("lens_id")) wish.lens_id = fields.get("lens_id");
     const made = await withItsLens((any) => send("POST", "/v1/corrections", any ? { ...wish, any_lens: true } : wish));
-    if (made) location.assign(`/corrections/${made.id}`);
-    return Boolean(made);
+    return made && `/corrections/${made.id}`;
   });
-  for (const output of document.querySelectorAll("#correct output")) {
-    const slider = byId("correct").elements[output.dataset.for];
+  for (const output of form?.querySelectorAll("output") ?? []) {
+    const slider = form.elements[output.dataset.for];
     const say = () => {
       output.textContent = `${Math.round(slider.value * 100)} %`;
       slider.setAttribute("aria-valuetext", output.textContent);
@@ -55,65 +29,23 @@ export function setUpForms() {
     slider.addEventListener("input", say);
     say();
   }
-  const stop = byId("stop-correction");
-  if (stop) {
-    stop.disabled = false;
-    stop.addEventListener("click", async () => {
-      stop.disabled = true;
-      await send("POST", `/v1/jobs/${stop.dataset.id}/cancel`).catch(() => {}); // it may be done already
-    });
-  }
-}
-
-export function setUpActions() {
-  const holder = byId("photo-actions");
-  if (!holder) return;
-  const photo = holder.dataset.photo;
-  const error = holder.querySelector(".alert");
-  const acts = {
-    cancel: () => send("POST", `/v1/jobs/${photo}/cancel`),
-    retry: () => send("POST", `/v1/jobs/${photo}/retry`),
-    exclude: () => send("PATCH", `/v1/photos/${photo}`, { excluded: true }),
-    learn: () => send("PATCH", `/v1/photos/${photo}`, { calibrate: true }),
-    include: () => send("PATCH", `/v1/photos/${photo}`, { excluded: false }),
-    delete: async () => {
-      const question = "Delete this photo, its corrections, and what was learned from it?";
-      if (await confirmed(question, "Delete the photo")) await removing("/", () => send("DELETE", `/v1/photos/${photo}`));
-    },
-  };
-  for (const button of holder.querySelectorAll("button")) {
-    button.disabled = false;
-    button.addEventListener("click", async () => {
-      error.hidden = true;
-      try {
-        await acts[button.dataset.act]();
-        if (button.dataset.act !== "delete") location.reload();
-      } catch (reason) {
-        error.textContent = reason.message;
-        error.hidden = false;
-      }
-    });
-  }
-}
-
-// Whether somebody is asked, types, or waits for what a form does: then nothing may take the page away.
-const occupied = () =>
-  document.querySelector("dialog[open], form[aria-busy=true]") || document.activeElement?.matches("input:not([type=checkbox]), select");
-
-function reloadWhenFree() {
-  if (occupied()) setTimeout(reloadWhenFree, 1000);
-  else location.reload();
-}
-
-// A page whose work has come to its end shows the result.
-export function setUpSettling() {
-  const open = [...document.querySelectorAll("[id$='-state']")].filter((part) => !part.querySelector("[data-settled]"));
-  return (name) => {
-    const part = byId(name);
-    if (!open.includes(part) || !part.querySelector("[data-settled]")) return;
-    open.splice(open.indexOf(part), 1);
-    reloadWhenFree();
-  };
+  acting(byId("stop-correction"), async (_, { dataset }) => {
+    await send("POST", `/v1/jobs/${dataset.id}/cancel`).catch(() => {}); // it may be done already
+    return true;
+  });
+  acting(byId("photo-actions"), async (_, { dataset }, button) => {
+    const [photo, job] = [`/v1/photos/${dataset.photo}`, `/v1/jobs/${dataset.photo}`];
+    const acts = {
+      cancel: () => send("POST", `${job}/cancel`),
+      retry: () => send("POST", `${job}/retry`),
+      learn: () => send("PATCH", photo, { calibrate: true }),
+      exclude: () => send("PATCH", photo, { excluded: true }),
+      include: () => send("PATCH", photo, { excluded: false }),
+    };
+    if (acts[button.value]) return acts[button.value]().then(() => true);
+    const question = "Delete this photo, its corrections, and what was learned from it?";
+    return (await confirmed(question, "Delete the photo")) && send("DELETE", photo).then(() => "/");
+  });
 }
 
 // Photos that do not say their lens, group by group. The form is made anew at any moment, so that listeners stand
@@ -127,8 +59,7 @@ export function setUpGroups() {
     underWay = true;
     await act().catch((reason) => complain(byId("waiting-form"), reason));
     underWay = false;
-    await refreshed();
-    if (!holder.contains(document.activeElement)) (holder.querySelector("[data-leave]") ?? byId("photos-title")).focus();
+    refresh();
   };
   holder.addEventListener("submit", (event) => {
     event.preventDefault();

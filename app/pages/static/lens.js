@@ -1,7 +1,6 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
-import { byId, confirmed, failure, problemText, send, withItsLens } from "./common.js";
-import { removing } from "./poll.js";
+import { acting, ask, byId, confirmed, send, withItsLens } from "./common.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
 const ZONES = [
@@ -80,11 +79,9 @@ export function setUpField() {
     const mine = asked;
     let [answer, failed] = [null, null];
     try {
-      const response = await fetch(`${lens}/psf.json?${query}`);
-      if (response.ok) answer = await response.json();
-      else failed = await problemText(response);
-    } catch {
-      failed = "The service does not answer. Try again in a moment.";
+      answer = await (await ask(`${lens}/psf.json?${query}`)).json();
+    } catch (reason) {
+      failed = reason.message;
     }
     if (mine !== asked) return; // the point has moved on meanwhile
     const where = r < 0.02 ? "In the centre" : `${Math.round(r * 100)} % of the way to the corner`;
@@ -172,9 +169,7 @@ export function setUpCharts() {
   controls.addEventListener("change", async () => {
     holder.classList.add("loading");
     try {
-      const response = await fetch(`/ui/lenses/${controls.dataset.lens}/charts?${new URLSearchParams(new FormData(controls))}`);
-      if (!response.ok) throw new Error(response.status === 409 ? "There are no charts for that lens yet." : await problemText(response));
-      holder.innerHTML = await response.text();
+      holder.innerHTML = await (await ask(`/ui/lenses/${controls.dataset.lens}/charts?${new URLSearchParams(new FormData(controls))}`)).text();
     } catch (reason) {
       holder.innerHTML = '<p class="alert" role="alert"></p>';
       holder.firstChild.textContent = reason.message;
@@ -183,44 +178,25 @@ export function setUpCharts() {
   });
 }
 
-// Let a form act, and show beside it why it could not.
-function acting(form, error, act) {
-  for (const button of form.querySelectorAll("button")) button.disabled = false;
-  form.addEventListener("submit", async (event) => {
-    event.preventDefault();
-    error.hidden = true;
-    form.setAttribute("aria-busy", "true");
-    try {
-      await act(new FormData(form));
-    } catch (reason) {
-      error.textContent = reason.message;
-      error.hidden = false;
-    }
-    form.removeAttribute("aria-busy");
-  });
-}
-
 async function putProfile(lens, file, any = false) {
   const headers = { "Content-Type": "application/zip" };
-  const response = await fetch(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
-  if (!response.ok) throw await failure(response);
+  const response = await ask(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
   if (response.status !== 202) return true;
   for (;;) { // a worker has yet to read it
-    const answer = await fetch(`${response.headers.get("Location")}?wait=20`);
-    if (!answer.ok) throw await failure(answer);
-    const { state, error } = await answer.json();
+    const { state, error } = await (await ask(`${response.headers.get("Location")}?wait=20`)).json();
     if (state === "succeeded") return true;
     if (error) throw Object.assign(new Error(error.detail), { code: error.code });
   }
 }
 
-// A lens whose profile somebody gave away.
-export function setUpNewLens() {
-  const form = byId("add-profile");
-  if (!form) return;
-  acting(form, form.querySelector(".alert"), async (fields) => {
-    const file = fields.get("profile");
-    if (!file?.size) throw new Error("Choose a profile first.");
+// What is done with a lens as a whole, and a lens whose profile somebody gave away.
+export function setUpLensActions() {
+  const chosen = (fields) => {
+    if (!fields.get("profile")?.size) throw new Error("Choose a profile first.");
+    return fields.get("profile");
+  };
+  acting(byId("add-profile"), async (fields) => {
+    const file = chosen(fields);
     const { id } = await send("POST", "/v1/lenses", { label: file.name.replace(/\.lensprofile$/i, "") });
     try {
       await putProfile(`/v1/lenses/${id}`, file);
@@ -228,49 +204,31 @@ export function setUpNewLens() {
       await send("DELETE", `/v1/lenses/${id}`).catch(() => {}); // it may be gone with its profile
       throw reason;
     }
-    location.assign(`/lenses/${id}`);
+    return `/lenses/${id}`;
   });
-}
-
-// What is done with a lens as a whole.
-export function setUpLensActions() {
   const holder = byId("lens-actions");
-  if (!holder) return;
-  const lens = `/v1/lenses/${holder.dataset.lens}`;
+  const lens = `/v1/lenses/${holder?.dataset.lens}`;
   const acts = {
-    rename: async (fields) => {
-      await send("PATCH", lens, { label: fields.get("label").trim() || null });
-      location.reload();
-    },
+    rename: (fields) => send("PATCH", lens, { label: fields.get("label").trim() || null }).then(() => true),
     merge: async (fields) => {
       const into = fields.get("lens");
       if (!into) throw new Error("Choose the lens that this one is to be merged into.");
-      if (!(await confirmed("All photos of this lens will count for the other one. This cannot be undone.", "Merge"))) return;
-      await removing(`/lenses/${into}`, () => send("PATCH", lens, { merge_into: into }));
+      if (!(await confirmed("All photos of this lens will count for the other one. This cannot be undone.", "Merge"))) return "";
+      return send("PATCH", lens, { merge_into: into }).then(() => `/lenses/${into}`);
     },
-    upload: async (fields) => {
-      const file = fields.get("profile");
-      if (!file?.size) throw new Error("Choose a profile first.");
-      if (await withItsLens((any) => putProfile(lens, file, any))) location.reload();
-    },
+    upload: (fields) => withItsLens((any) => putProfile(lens, chosen(fields), any)),
     delete: async () => {
       const question = "Delete this lens and everything learned from its photos? The photos themselves are kept.";
-      if (await confirmed(question, "Delete the lens")) await removing("/", () => send("DELETE", lens));
+      return (await confirmed(question, "Delete the lens")) && send("DELETE", lens).then(() => "/");
     },
   };
-  for (const form of holder.querySelectorAll("form")) acting(form, holder.querySelector(".alert"), acts[form.dataset.act]);
-}
-
-// Its earlier versions.
-export function setUpVersions() {
+  for (const form of holder?.querySelectorAll("form") ?? []) acting(form, acts[form.dataset.act], holder.querySelector(".alert"));
   for (const back of document.querySelectorAll("[data-back]"))
-    acting(back, byId("back-alert"), async () => {
+    acting(back, async () => {
       const version = Number(back.dataset.back);
       const question = `Go back to version ${version}? Photos that joined later are left out; they stay and can be counted again.`;
-      if (!(await confirmed(question, "Go back"))) return;
-      await send("PATCH", `/v1/lenses/${back.dataset.lens}`, { back_to: version });
-      location.reload();
-    });
+      return (await confirmed(question, "Go back")) && send("PATCH", `/v1/lenses/${back.dataset.lens}`, { back_to: version }).then(() => true);
+    }, byId("back-alert"));
 }
 
 function plot(holder, events) {

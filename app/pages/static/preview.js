@@ -1,6 +1,6 @@
 // What a correction would do to the part of the photo that is seen: computed once for a place, mixed at once by the sliders.
 
-import { byId, problemText, send } from "./common.js";
+import { byId, failure, send } from "./common.js";
 
 const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
 const PAUSE_MS = 500;
@@ -165,7 +165,7 @@ async function settled(id, heard) {
   let [tag, job] = ["", { state: "queued" }];
   for (;;) {
     const response = await fetch(`/v1/jobs/${id}?wait=20`, { headers: tag ? { "If-None-Match": tag } : {} });
-    if (response.status !== 304 && !response.ok) throw new Error(await problemText(response));
+    if (response.status !== 304 && !response.ok) throw failure(await response.text(), response.status);
     if (response.status !== 304) {
       tag = response.headers.get("ETag") ?? "";
       job = await response.json();

@@ -1,6 +1,6 @@
 // Signing in and out. The key goes to the service once; afterwards a cookie that scripts cannot read stands for it.
 
-import { byId, send } from "./common.js";
+import { acting, byId, send } from "./common.js";
 
 // Where to go on: a page of this service, whatever the address says.
 function onward() {
@@ -22,17 +22,13 @@ export async function setUpSignIn() {
   const form = byId("sign-in");
   if (!form) return;
   byId("unsafe").hidden = window.isSecureContext;
-  form.addEventListener("submit", async (event) => {
-    event.preventDefault();
-    byId("sign-in-error").textContent = "";
-    try {
-      await send("POST", "/v1/session", { key: byId("key").value.trim() });
-      location.replace(onward());
-    } catch (error) {
-      byId("sign-in-error").textContent = error.message;
+  acting(form, async () => {
+    await send("POST", "/v1/session", { key: byId("key").value.trim() }).catch((reason) => {
       byId("key").focus();
-    }
-  });
+      throw reason;
+    });
+    location.replace(onward());
+  }, byId("sign-in-error"));
   // a link on another site comes without the cookie, though the browser has it
   if (await known()) location.replace(onward());
 }

@@ -1,6 +1,6 @@
 // Photos chosen or dropped are sent two at a time; those that were not taken are listed with the reason.
 
-import { byId, refusalText } from "./common.js";
+import { byId, failure } from "./common.js";
 
 const AT_ONCE = 2;
 
@@ -14,7 +14,7 @@ function send(file, calibrate, onProgress) {
     request.onerror = () => resolve("The connection was lost. Choose the photo again; nothing is counted twice.");
     request.onload = () => {
       if (request.status === 200) resolve("Already used: the same photo was sent before.");
-      else resolve(request.status === 202 ? null : refusalText(request.responseText, request.status));
+      else resolve(request.status === 202 ? null : failure(request.responseText, request.status).message);
     };
     request.send(file);
   });

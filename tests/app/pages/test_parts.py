@@ -209,12 +209,12 @@ def test_corrections_are_followed_and_fetched_together(client: TestClient, corre
     waiting = client.post("/v1/corrections", json=wish).json()["id"]
     ids = f"{corrected['id']},{waiting}"
 
-    page, part = client.get(f"/batch?ids={ids}").text, client.get(f"/ui/parts?page=batch&id={ids}").json()
+    page, part = client.get(f"/batch?ids={ids}").text, client.get(f"/ui/parts?page=batch&id={ids}").text
     archive = client.get(f"/batch.zip?ids={ids},{corrected['id']}")
 
     assert "2 corrections" in page
-    assert "1 of 2 done" in part["batch-state"]
-    assert "Nothing to correct: left as it was" in part["batch-state"]
+    assert "1 of 2 done" in part
+    assert "Nothing to correct: left as it was" in part
     with zipfile.ZipFile(io.BytesIO(archive.content)) as files:
         assert {name: files.read(name) for name in files.namelist()} == {"p.dng": b"a"}
     assert client.get(f"/batch.zip?ids={waiting}").status_code == 409
@@ -419,7 +419,8 @@ def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
 ) -> None:
     photo, key = steps.receive(), store.keys.create("local", ["write"])
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        mine = {"Authorization": f"Bearer {key.text}"}
+        stranger = {"HX-Request": "true", "HX-Current-URL": "http://h/?a=b"}
+        mine = {"Authorization": f"Bearer {key.text}", **stranger}
         asked = {"params": {"page": "photo", "id": photo.public_id}, "headers": mine}
         first = client.get("/ui/parts", **asked)
         known = {**mine, "If-None-Match": first.headers["ETag"]}
@@ -429,11 +430,28 @@ def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
         store.photos.delete(photo.public_id, "local")
         gone = client.get("/ui/parts", **asked)
         store.keys.revoke(key.prefix)
-        ended = client.get("/ui/parts", params={"page": "home"})
+        ended = client.get("/ui/parts", params={"page": "home"}, headers=stranger)
 
     assert [a.status_code for a in (first, same, changed, gone, ended)] == [200, 304, 200, 404, 401]
-    assert set(first.json()) == {"photo-state"}
-    assert first.json() != changed.json()
+    assert first.text != changed.text
+    assert gone.headers["HX-Redirect"] == "/"
+    assert ended.headers["HX-Redirect"] == "/sign-in?next=http%3A//h/%3Fa%3Db"
+
+
+def test_a_page_whose_work_has_ended_is_made_anew(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    asked = {"page": "photo", "id": photo.public_id}
+    working = client.get("/ui/parts", params=asked)
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo)
+    steps.store.photos.finish(photo.public_id, 1)
+    done = client.get("/ui/parts", params=asked)
+
+    assert ("HX-Refresh" in working.headers, done.headers.get("HX-Refresh")) == (False, "true")
+    assert ("hx-get" in working.text, "hx-get" in done.text) == (True, False)
+    assert "hx-get" not in client.get(f"/photos/{photo.public_id}").text  # there is nothing to wait for
+    assert "hx-get" in client.get("/").text
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The part of an open page that changes, which htmx asks for every two seconds while there is something to wait for."""
+"""The part of an open page that changes: htmx asks for it while there is work to wait for."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def parts(
     page: Page = "home",
     id: batch.Ids = "",  # noqa: A002
 ) -> Response:
-    """Return the part of a page as it is now; 304 where the browser has it. The whole page anew once work is done."""
+    """Return the part of a page as it is now, 304 where the browser has it; at the end ask for all."""
     template, values, settled = _PARTS[page](call, id)
     body = fragment(template, **values).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'

@@ -1,11 +1,13 @@
 r"""What a photo gains that is corrected by a lens known only from other photos, and whether any of it loses.
 
     LENSMODEL_TEST_DATA=... python -m lab.blind_gain --seeds 1000:1008 --photos 1 2 \
-        [--grids FILE.npz] [--electrons 2500]
+        [--grids FILE.npz] [--electrons 2500] [--hot 60] [--crop 0.66]
 
 Each lens takes Bayer DNG files of 1.2 megapixels of different photographs of the test half (the development
 half for seeds below 1000), is learned from the first n by default settings, and a photo that was not learned
 from is corrected by default settings. Lenses are of third-order theory (`--seeds`) or ray-traced (`--grids`).
+With `--hot`, so many pixels of the sensor shine in every photo, by a tenth to all of the range, and gains
+count from the photo without them. With `--crop`, the corrected photo is the middle of the frame.
 
 Printed are the gains in PSNR of the picture as shown by zone, each block at its best shift
 (`lab.images.gains`), what the correction expected of itself (of linear light), the median error of green PSFs
@@ -50,14 +52,15 @@ class KnownLens:
     lens: SimulatedLens | GridLens
     number: int
     camera: SimulatedCamera
+    hot: int = 0  # pixels of the sensor that shine
 
     @property
     def settings(self) -> LensSettings:
         """Wide open."""
         return LensSettings(aperture=self.lens.widest())
 
-    def shot(self, number: int, path: Path) -> Planes:
-        """Take a photo as a DNG file; return the sharp light behind it."""
+    def shot(self, number: int, path: Path, crop: float = 1.0) -> Planes:
+        """Take a photo as a DNG file, or its middle; return the sharp light behind it."""
         half = "test" if self.number >= 1000 else "dev"
         folder = Path(os.environ["LENSMODEL_TEST_DATA"]) / "sharp"
         files = [file for file in list_photos(folder) if photo_half(file.stem) == half]
@@ -70,8 +73,18 @@ class KnownLens:
         part = np.ascontiguousarray(scene[:, cut[0], cut[1]])
         rng = np.random.default_rng([self.number, number])
         taken = photograph(part, self.lens, self.settings, self.camera, rng)
-        write_photo(path, taken)
-        return taken.sharp
+        taken = replace(taken, mosaic=self._with_hot_pixels(taken.mosaic))
+        middle = middle_of(taken.mosaic.shape, crop)
+        write_photo(path, replace(taken, mosaic=np.ascontiguousarray(taken.mosaic[middle])))
+        return np.ascontiguousarray(taken.sharp[:, *middle])
+
+    def _with_hot_pixels(self, mosaic: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Let the same pixels shine in every photo."""
+        rng, camera = np.random.default_rng([self.number, self.hot]), self.camera
+        at = rng.choice(mosaic.size, self.hot, replace=False)
+        values = mosaic.ravel().astype(np.int64)
+        values[at] += (rng.uniform(0.1, 1.0, self.hot) * (camera.white - camera.black)).astype(np.int64)
+        return np.minimum(values, camera.white).astype(np.uint16).reshape(mosaic.shape)
 
     def shown(self, planes: Planes) -> NDArray[np.float64]:
         """As a picture shows it, `(row, col, 3)`."""
@@ -89,7 +102,14 @@ class KnownLens:
         return float(np.median(true)), float(np.median([answer.predicted_error for answer in answers]))
 
 
-def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[str]]:
+def middle_of(shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
+    """Return the middle of a frame, cut where its mosaic repeats."""
+    margins = [round((1.0 - share) * side / 4.0) * 2 for side in shape]
+    rows, cols = (slice(m, side - m) for m, side in zip(margins, shape, strict=True))
+    return rows, cols
+
+
+def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0) -> Iterator[list[str]]:
     """Learn a lens from some photos and correct another one: a row for each number of photos."""
     samples: list[list[PsfSample]] = []
     for number in range(max(counts)):
@@ -99,7 +119,9 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[
             samples.append(sampling.samples_of_photo(path, sampling.Config(lens.settings), workers=1))
         except NotEnoughEvidenceError:
             samples.append([])
-    truth = lens.shot(max(counts), folder / "last.dng")
+    truth = replace(lens, hot=0).shot(max(counts), folder / "clean.dng", crop)
+    clean = photo.develop(folder / "clean.dng")
+    lens.shot(max(counts), folder / "last.dng", crop)
     developed = photo.develop(folder / "last.dng")
     for count in counts:
         known = [sample for own in samples[:count] for sample in own]
@@ -109,7 +131,7 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path) -> Iterator[list[
         model = LensModel.fit(known)
         lateral = correcting.lateral_of(developed)
         made = correcting.correct_photo(developed, model, lens.settings, lateral=lateral)
-        found = gains(*map(lens.shown, (developed.planes, made.planes, truth)))
+        found = gains(*map(lens.shown, (clean.planes, made.planes, truth)))
         assert found is not None, "a frame of the camera holds many blocks"
         expected = {zone: report.expected_gain_db for zone, report in made.zones.items()}
         error, told = lens.psf_errors(model)
@@ -131,16 +153,21 @@ def main() -> None:
     parser.add_argument("--grids", type=Path, nargs="*", default=[])
     parser.add_argument("--photos", type=int, nargs="+", default=[1])
     parser.add_argument("--electrons", type=float, default=CAMERA.full_well_electrons)
+    parser.add_argument("--hot", type=int, default=0, help="pixels of the sensor that shine in every photo")
+    parser.add_argument("--crop", type=float, default=1.0, help="share of the frame that is corrected")
     wanted = parser.parse_args()
     camera = replace(CAMERA, full_well_electrons=wanted.electrons)
     seeds = range(*map(int, wanted.seeds.split(":"))) if wanted.seeds else ()
-    lenses = [KnownLens(str(seed), draw_lens(seed), seed, camera) for seed in seeds]
-    lenses += [KnownLens(p.stem, GridLens.read(p), 2000 + i, camera) for i, p in enumerate(wanted.grids)]
+    lenses = [KnownLens(str(seed), draw_lens(seed), seed, camera, wanted.hot) for seed in seeds]
+    for number, path in enumerate(wanted.grids):
+        traced = GridLens.read(path)
+        own = replace(camera, pitch_um=traced.grids[0].pitch_um)
+        lenses.append(KnownLens(path.stem, traced, 2000 + number, own, wanted.hot))
     print("| lens | n | gain center / mid / corner, dB | expected | PSF error (expected) | lost | worst |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses:
-            for row in rows(lens, wanted.photos, Path(name)):
+            for row in rows(lens, wanted.photos, Path(name), wanted.crop):
                 print("| " + " | ".join(row) + " |", flush=True)
 
 

@@ -173,6 +173,7 @@ def correct(
     sidecar: bool = False,
     keep_location: bool = False,
     workers: int | None = None,
+    siblings: Iterable[Path | str] = (),
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
@@ -216,6 +217,8 @@ def correct(
         Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
+    siblings : iterable of paths
+        Other photos of the body: a pixel that stands out in two pictures is defective and is replaced.
     on_step : callable
         Called as `on_step(done, total)`; raising `CancelledError` there stops the work.
 
@@ -258,7 +261,7 @@ def correct(
         if isinstance(image, photo.LinearPhoto)
         else photo_from_array(np.asarray(image))
         if source is None
-        else photo.develop(source)
+        else photo.develop(source, siblings=[Path(name) for name in siblings])
     )
     corrected = correct_photo(
         developed,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -80,7 +80,14 @@ def run(
             bars.update(task, description=path.name)
             try:
                 result = correct_one(
-                    path, target, lens, settings, options, display, partial(show_share, bars, task, number)
+                    path,
+                    target,
+                    lens,
+                    settings,
+                    options,
+                    display,
+                    partial(show_share, bars, task, number),
+                    siblings=targets.values(),
                 )
             except (LensModelError, OSError) as error:
                 result = files.failed(error)
@@ -155,6 +162,7 @@ def correct_one(
     options: CorrectionOptions,
     display: Display,
     on_step: StepHook,
+    siblings: Iterable[Path] = (),
 ) -> dict[str, Any]:
     """Correct one photo; return what became of it: `corrected`, `kept` or `left`."""
     if path.stem.endswith(CORRECTED):
@@ -186,6 +194,7 @@ def correct_one(
         sidecar=options.sidecar,
         keep_location=options.keep_location,
         workers=options.workers,
+        siblings=siblings,
         on_step=on_step,
     )
     gain = corrected.expected_gain_db

@@ -1,109 +1,246 @@
-"""Defective pixels of a sensor: found on the mosaic, one by one, and replaced by their neighbours.
+"""Defective pixels of a sensor: found on the mosaic and replaced by their neighbours.
 
-A hot pixel taken for a point of light teaches a kernel as narrow as itself, and a correction makes a ring of
-it. Light comes through a lens: the pixels beside a point of light, which have the other colours, see some of
-it. A pixel that stands alone among its own colour while those beside it see nothing is no picture.
+A hot pixel taken for a point of light teaches a kernel as narrow as itself, and a correction makes a ring
+of it. Light comes through a lens: the pixels beside a point of light get some of it. So a single photo shows
+a defect where one pixel stands out of smooth surroundings that get none. In busy places, and where defects
+touch each other, it takes a second photo of the same body: what stands out at the same pixel in two different
+pictures is in neither of them.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-_SIGMAS: Final = 12.0
-"""Least height above all neighbours of the colour, in standard deviations of the noise (chosen): less does no
-harm, and faint stars stay."""
+_SURE_SIGMAS, _SIGMAS = 25.0, 10.0
+"""Least height above the neighbours of the colour, in standard deviations of the noise, in one photo and in
+each of several (chosen): less does no harm, and faint stars stay."""
 
-_CONTRAST: Final = 1.5
-"""Least height relative to what the neighbours of the colour differ by (chosen): texture stays below."""
+_SURE_CONTRAST, _CONTRAST = 5.0, 1.5
+"""Least height relative to how much the neighbours of the colour differ, in one photo and in each of several
+(chosen): texture stays below."""
 
-_BESIDE: Final = 0.04
-"""Largest share of the height that the pixels beside it may see in the middle, with one standard deviation
-(chosen): of a point of light through the sharpest lenses they see twice that, in the weakest colour."""
-
-_LARGEST_BESIDE: Final = 0.3
-"""The same of the brightest of them (chosen): between two pixels a point of light lies in both."""
+_SURE_BESIDE, _BESIDE = 0.05, 0.25
+"""Largest share of the height by which the pixels beside it may stand out, in one photo and in several
+(chosen): of a point of light through the sharpest lenses they get a fifth, of the weakest colour a tenth."""
 
 _MOST: Final = 2e-3
 """Share of the pixels above which what was found is a picture after all, such as a sky of stars (chosen)."""
 
-_RING: Final = [(row, col) for row in (-2, 0, 2) for col in (-2, 0, 2) if row or col]
-_BESIDE_IT: Final = [(-1, 0), (0, -1), (0, 1), (1, 0)]
-_DIAGONAL: Final = [(-1, -1), (-1, 1), (1, -1), (1, 1)]
-_ACROSS: Final = [(-2, 0), (0, -2), (0, 2), (2, 0)]
+_ALIKE: Final = 0.9
+"""Correlation of two small pictures from which on they are of one scene (chosen): of a burst it is 0.99."""
 
-Places = tuple[NDArray[np.intp], NDArray[np.intp]]
+_NEIGHBOURS: Final = 8  # of the same colour
+_FILLED_FROM: Final = 4  # of them, the nearest (chosen): more lie across edges
+_REACH: Final = 4  # pixels to the farthest of them, in any mosaic that is read
+_NEARLY: Final = 0.8  # of the least height (chosen): above all neighbours but one, not above their median
+_SAMPLES: Final = 60_000  # pixels that tell of the noise (chosen): more would not change it
+_LEVELS: Final = 24  # at which noise is measured (chosen)
+_QUIET: Final = 0.3
+"""Share of the pixels of one level, those most like their neighbours, that tell of the noise: the rest may be
+texture (chosen)."""
+_QUIET_HEIGHT: Final = 0.42
+"""Quantile `_QUIET` of how far white noise of unit variance is from the median of eight neighbours: that of
+|N(0, 1 + pi / 16)|."""
+_SMALL: Final = (24, 36)  # of the pictures by which scenes are told apart (chosen)
 
+Places: TypeAlias = NDArray[np.int64]
+"""Pixels of a mosaic by their number, row by row; sorted."""
 
-def find_defects(values: NDArray[np.uint16], sigma: NDArray[np.floating]) -> Places:
-    """Find pixels of a Bayer mosaic that stand alone, brighter or darker than all around them."""
-    rows, cols = [], []
-    for row in (0, 1):
-        for col in (0, 1):
-            site = values[row::2, col::2].astype(np.int32)
-            ring = np.pad(site, 1, mode="reflect")
-            height, width = site.shape
-            low, high = np.full_like(site, np.iinfo(np.uint16).max), np.zeros_like(site)
-            for down, right in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
-                neighbour = ring[down : down + height, right : right + width]
-                np.minimum(low, neighbour, out=low)
-                np.maximum(high, neighbour, out=high)
-            least = np.maximum(_CONTRAST * (high - low), _SIGMAS * float(sigma[row, col].min()))
-            at = np.nonzero(np.maximum(site - high, low - site) > least)
-            rows.append(2 * at[0] + row)
-            cols.append(2 * at[1] + col)
-    found = _alone(values, (np.concatenate(rows), np.concatenate(cols)), sigma)
-    return found if len(found[0]) <= _MOST * values.size else (found[0][:0], found[1][:0])
+_Offsets: TypeAlias = tuple[tuple[int, int], ...]
 
 
-def replace_defects(values: NDArray[np.uint16], places: Places, colours: NDArray[np.uint8]) -> None:
-    """Write the median of the nearest neighbours of its colour into each place."""
-    rows, cols = places
-    green = np.isin(colours[rows, cols], (1, 3))
-    for chosen, offsets in ((green, _DIAGONAL), (~green, _RING)):
-        at = rows[chosen], cols[chosen]
-        values[at] = np.rint(np.median(_around(values, at, offsets), axis=0)).astype(values.dtype)
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspects:
+    """What one photo tells of the defects of its sensor."""
+
+    sure: Places  # are defects
+    possible: Places  # are defects if they stand out in another picture too; `sure` among them
+    small: NDArray[np.float32]  # the picture, small: tells one scene from another
+    shape: tuple[int, int]
 
 
-def _alone(values: NDArray[np.uint16], at: Places, sigma: NDArray[np.floating]) -> Places:
-    """Those of the candidates that are no light, by their neighbours."""
-    levels = np.linspace(0.0, 65535.0, sigma.shape[2])
-    here, ring = values[at].astype(np.float32), _around(values, at, _RING)
+class Neighbours:
+    """Which pixels of a mosaic are the nearest of the same colour, and which touch.
+
+    Parameters
+    ----------
+    colours : ndarray of uint8, shape (height, width)
+        0 red, 1 and 3 green, 2 blue.
+    period : int
+        Pixels after which they repeat: 2 or 6.
+    """
+
+    def __init__(self, colours: NDArray[np.uint8], period: int) -> None:
+        self.shape, self.period = colours.shape, period
+        self._step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
+        cell = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
+        self.alike: dict[tuple[int, int], _Offsets] = {
+            (row, col): _alike(cell, row, col) for row, col in np.ndindex(period, period)
+        }
+
+    def inside(self, rows: NDArray[np.integer], cols: NDArray[np.integer]) -> tuple[Places, Places]:
+        """Move places beyond the frame into it by whole periods: the colour stays, the pixel is another."""
+        height, width = self.shape
+        return self._moved(rows, height), self._moved(cols, width)
+
+    def _moved(self, index: NDArray[np.integer], length: int) -> Places:
+        return index + self._step * ((index < 0).astype(np.int64) - (index >= length))
+
+    def of(self, places: Places) -> Places:
+        """Nearest pixels of the same colour, shape (8, places), by distance."""
+        rows, cols = np.divmod(places, self.shape[1])
+        offsets = np.array([self.alike[site] for site in np.ndindex(self.period, self.period)])
+        own = offsets[(rows % self.period) * self.period + cols % self.period]  # (places, 8, 2)
+        at = self.inside(rows[:, None] + own[..., 0], cols[:, None] + own[..., 1])
+        return (at[0] * self.shape[1] + at[1]).T
+
+    def touching(self, places: Places) -> Places:
+        """The pixels above, left, right and below, shape (4, places)."""
+        rows, cols = np.divmod(places, self.shape[1])
+        around = np.array([(-1, 0), (0, -1), (0, 1), (1, 0)])
+        # by twice a step where a pixel has no other beside it: of the other colour, as on the other side
+        at = self.inside(rows + around[:, :1], cols + around[:, 1:])
+        return at[0] * self.shape[1] + at[1]
+
+
+def _alike(cell: NDArray[np.integer], row: int, col: int) -> _Offsets:
+    """Offsets of the nearest pixels of the colour of one site, by distance."""
+    period, reach = len(cell), range(-_REACH, _REACH + 1)
+    alike = [
+        (down, right)
+        for down in reach
+        for right in reach
+        if (down or right) and cell[(row + down) % period, (col + right) % period] == cell[row, col]
+    ]
+    return tuple(sorted(alike, key=lambda at: (at[0] ** 2 + at[1] ** 2, at))[:_NEIGHBOURS])
+
+
+def suspects(values: NDArray[np.uint16], near: Neighbours) -> Suspects:
+    """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
+    noise, flat = _Noise.of(values, near), values.ravel()
+    places = _standing_out(values, near, noise)
+    ring = flat[near.of(places)].astype(np.float32)
     middle = np.median(ring, axis=0)
-    sign = np.where(here > middle, 1.0, -1.0).astype(np.float32)
-    height = np.minimum(sign * (here - ring.max(axis=0)), sign * (here - ring.min(axis=0)))
-    noise = np.empty_like(here)
-    for row in (0, 1):
-        for col in (0, 1):
-            site = (at[0] % 2 == row) & (at[1] % 2 == col)
-            noise[site] = np.interp(middle[site], levels, sigma[row, col])
-    kept = (height > _SIGMAS * noise) & (height > _CONTRAST * np.ptp(ring, axis=0))
-    at, height, noise, sign = (at[0][kept], at[1][kept]), height[kept], noise[kept], sign[kept]
-    bumps = []
-    for row, col in _BESIDE_IT:
-        beside = at[0] + row, at[1] + col
-        level = np.median(_around(values, beside, _ACROSS), axis=0)
-        bumps.append(sign * (_around(values, at, [(row, col)])[0] - level))
-    seen = np.reshape(bumps, (len(_BESIDE_IT), -1))
-    alone = (np.median(seen, axis=0) < _BESIDE * height + noise) & (
-        seen.max(axis=0) < _LARGEST_BESIDE * height
+    sign = np.sign(flat[places] - middle)
+    height = np.abs(flat[places] - middle)
+    apart = np.sort(np.abs(ring - middle), axis=0)
+    sigma = np.maximum(noise.at(middle), 1.4826 * apart[_NEIGHBOURS // 2])
+    kept = np.maximum(_SIGMAS * sigma, _CONTRAST * apart[-2]) < height
+    places, sign, height, sigma, apart = (array[kept] for array in (places, sign, height, sigma, apart[-1]))
+    beside = near.touching(places)
+    level = np.median(flat[near.of(beside.ravel())].astype(np.float32), axis=0).reshape(beside.shape)
+    bumps = sign * (flat[beside] - level)
+    possible = np.median(np.abs(bumps), axis=0) < _BESIDE * height + 2.0 * sigma
+    sure = (
+        (np.maximum(_SURE_SIGMAS * sigma, _SURE_CONTRAST * apart) < height)
+        & (bumps.mean(axis=0) < _SURE_BESIDE * height)
+        & (np.abs(bumps).max(axis=0) < _SURE_BESIDE * height + 4.0 * sigma)
     )
-    return at[0][alone], at[1][alone]
+    found = [np.sort(places[chosen]) for chosen in (sure, sure | possible)]
+    if len(found[0]) > _MOST * values.size:
+        found = [places[:0], places[:0]]
+    return Suspects(found[0], found[1], _small(values, near.period), values.shape)
 
 
-def _around(values: NDArray[np.uint16], at: Places, offsets: list[tuple[int, int]]) -> NDArray[np.float32]:
-    """Values at offsets from places, shape (offsets, places); the frame is mirrored, which keeps colours."""
-    height, width = values.shape
-    out = np.empty((len(offsets), len(at[0])), dtype=np.float32)
-    for k, (row, col) in enumerate(offsets):
-        out[k] = values[_mirrored(at[0] + row, height), _mirrored(at[1] + col, width)]
-    return out
+def defects_of(own: Suspects, others: Sequence[Suspects] = ()) -> Places:
+    """The defects of a sensor that a photo shows by itself or together with others of the body."""
+    scenes: list[list[Suspects]] = []
+    for photo in (own, *(other for other in others if other.shape == own.shape)):
+        same = next((scene for scene in scenes if _correlation(scene[0].small, photo.small) > _ALIKE), None)
+        scenes.append([photo]) if same is None else same.append(photo)
+    by_scene = [np.unique(np.concatenate([photo.possible for photo in scene])) for scene in scenes]
+    places, counts = np.unique(np.concatenate(by_scene), return_counts=True)
+    sure = [photo.sure for scene in scenes for photo in scene]
+    return np.unique(np.concatenate([places[counts > 1], *sure]))
 
 
-def _mirrored(index: NDArray[np.intp], length: int) -> NDArray[np.intp]:
-    """Reflect about the first and last index of the same parity: the colour stays, and so do distances."""
-    last = length - 1 - (length - 1 - index) % 2
-    index = np.where(index < 0, 2 * (index % 2) - index, index)
-    return np.where(index >= length, 2 * last - index, index)
+def replace_defects(values: NDArray[np.uint16], places: Places, near: Neighbours) -> int:
+    """Write the median of the nearest sound neighbours of its colour into each place; return how many."""
+    if len(places) == 0:
+        return 0
+    around = near.of(places)
+    ring = values[np.divmod(around, values.shape[1])].astype(np.float32)
+    ring[np.isin(around, places)] = np.nan
+    first = np.argsort(np.isnan(ring), axis=0, kind="stable")[:_FILLED_FROM]
+    ring = np.take_along_axis(ring, first, axis=0)
+    sound = ~np.isnan(ring).all(axis=0)
+    filled = np.rint(np.nanmedian(ring[:, sound], axis=0)).astype(values.dtype)
+    values[np.divmod(places[sound], values.shape[1])] = filled
+    return len(filled)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Noise:
+    """Standard deviation of the noise by level, in the mosaic's numbers."""
+
+    levels: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, values: NDArray[np.uint16], near: Neighbours) -> _Noise:
+        """Measure it on the pixels that are most like their neighbours."""
+        places = np.arange(0, values.size, max(1, values.size // _SAMPLES) | 1)
+        flat = values.ravel()
+        middle = np.median(flat[near.of(places)].astype(np.float32), axis=0)
+        height = np.abs(flat[places] - middle)
+        order = np.argsort(middle, kind="stable")
+        parts = np.array_split(order, _LEVELS)
+        levels = [float(middle[part].mean()) for part in parts]
+        sigma = [float(np.quantile(height[part], _QUIET)) / _QUIET_HEIGHT for part in parts]
+        return cls(np.array(levels), np.maximum(sigma, 0.5))  # no less than what rounding makes
+
+    def at(self, level: NDArray[np.floating]) -> NDArray[np.float64]:
+        """At a level."""
+        return np.interp(level, self.levels, self.sigma)
+
+
+def _standing_out(values: NDArray[np.uint16], near: Neighbours, noise: _Noise) -> Places:
+    """Pixels that differ from all but one of their neighbours of the colour by more than those differ."""
+    index = near.inside(*(np.arange(-_REACH, side + _REACH) for side in values.shape))
+    wide, period = values[np.ix_(*index)], near.period
+    planes = {site: np.ascontiguousarray(wide[site[0] :: period, site[1] :: period]) for site in near.alike}
+    least = (_NEARLY * _SIGMAS * noise.at(np.arange(1 << 16, dtype=np.float64))).astype(np.float32)
+    found = []
+    for (row, col), offsets in near.alike.items():
+        site = values[row::period, col::period]
+        height, width = site.shape
+        high, second = np.zeros((2, *site.shape), np.uint16)
+        low, second_low = np.full((2, *site.shape), np.iinfo(np.uint16).max, np.uint16)
+        for down, right in offsets:
+            (top, odd_row), (left, odd_col) = (
+                divmod(_REACH + at, period) for at in (row + down, col + right)
+            )
+            one = planes[odd_row, odd_col][top : top + height, left : left + width]
+            np.maximum(second, np.minimum(high, one), out=second)
+            np.maximum(high, one, out=high)
+            np.minimum(second_low, np.maximum(low, one), out=second_low)
+            np.minimum(low, one, out=low)
+        spread = (second - np.minimum(second, second_low)).astype(np.float32)
+        need = np.maximum(np.float32(_CONTRAST / 2.0) * spread, least[second])
+        above = site - np.minimum(site, second)
+        below = second_low - np.minimum(second_low, site)
+        rows, cols = np.nonzero(np.maximum(above, below) > need)
+        found.append((rows * period + row) * values.shape[1] + cols * period + col)
+    return np.concatenate(found)
+
+
+def _small(values: NDArray[np.uint16], period: int) -> NDArray[np.float32]:
+    """The picture as logarithms of the means of blocks of whole periods."""
+    rows, cols = (
+        max(side // count // period, 1) * period for side, count in zip(values.shape, _SMALL, strict=True)
+    )
+    down, across = values.shape[0] // rows, values.shape[1] // cols
+    blocks = values[: down * rows, : across * cols].reshape(down, rows, across, cols)
+    return np.log1p(blocks.mean(axis=(1, 3), dtype=np.float32))
+
+
+def _correlation(one: NDArray[np.float32], two: NDArray[np.float32]) -> float:
+    """Correlation of two small pictures; of one without contrast, 1."""
+    if one.shape != two.shape or min(float(one.std()), float(two.std())) < 1e-4:
+        return float(one.shape == two.shape)
+    return float(np.corrcoef(one.ravel(), two.ravel())[0, 1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,14 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
 from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
+from lensmodel.photo.defects import Suspects
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw, opened_raw, stored_levels
+from lensmodel.photo.siblings import suspects_of_siblings
 from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
 from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer, remarks_log
 
@@ -30,6 +32,7 @@ def develop(
     limits: Limits | None = None,
     demosaic: Demosaic = "default",
     on_info: Callable[[PhotoInfo], None] | None = None,
+    siblings: Iterable[Path] = (),
 ) -> LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
@@ -47,6 +50,9 @@ def develop(
         Demosaicing of RAW; "half" makes one pixel of each 2 x 2 cell, without interpolation.
     on_info : callable, optional
         Called with what `inspect` returns before anything is decoded; raising there refuses the photo.
+    siblings : iterable of Path
+        Other photos, which tell of the defective pixels of the sensor: RAW files of the same body are read,
+        others passed over.
 
     Returns
     -------
@@ -75,7 +81,8 @@ def develop(
         if header.kind in {"raw", "dng"}:
             with opened_raw(path) as raw:
                 info = _accepted(info_of(path, header, limits, raw), on_info)
-                developed = _develop_raw(raw, header, info, demosaic)
+                others = suspects_of_siblings(path, info.metadata, siblings, limits)
+                developed = _develop_raw(raw, header, info, demosaic, others)
         else:
             info = _accepted(info_of(path, header, limits), on_info)
             developed = _develop_raster(path, header, info)
@@ -90,8 +97,10 @@ def _accepted(info: PhotoInfo, on_info: Callable[[PhotoInfo], None] | None) -> P
     return info
 
 
-def _develop_raw(file: rawpy.RawPy, header: Header, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
-    raw = develop_raw(file, demosaic, header.white)
+def _develop_raw(
+    file: rawpy.RawPy, header: Header, info: PhotoInfo, demosaic: Demosaic, others: Sequence[Suspects]
+) -> LinearPhoto:
+    raw = develop_raw(file, demosaic, header.white, others)
     _, height, width = raw.planes.shape
     metadata, binned = info.metadata, max(round(info.width / width), 1)
     if metadata.pixel_pitch_um is not None:

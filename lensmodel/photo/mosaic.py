@@ -11,8 +11,8 @@ import rawpy
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
-from lensmodel.core.types import BayerPattern, NoiseModel, Plane
-from lensmodel.photo.defects import find_defects, replace_defects
+from lensmodel.core.types import BayerPattern, Plane
+from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_defects, suspects
 
 _BAND: Final = 16
 """Rows that are judged together by `Mosaic.check`."""
@@ -26,8 +26,6 @@ _STRAYS: Final = 0.02
 _EDGE: Final = 0.02
 """Share of a pile below its lower end: pixels whose full well is the least; 0 would take the darkest stray
 (chosen)."""
-
-_NOISE_LEVELS: Final = 65  # at which noise is tabulated (chosen): it changes slowly
 
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""
@@ -107,18 +105,18 @@ class Mosaic:
             random += deviation > 0.15 * scale and step > 0.9 * deviation
         return random / len(starts)
 
-    def repair(self, noise: tuple[NoiseModel, NoiseModel, NoiseModel], white: int) -> int:
-        """Replace defective pixels in LibRaw's own memory, before it demosaics."""
-        levels = np.linspace(0.0, 65535.0, _NOISE_LEVELS)
-        sigma = np.empty((2, 2, _NOISE_LEVELS))
-        for row, col in np.ndindex(2, 2):
-            colour = int(self.colours[row, col])
-            span = max(white - self.black[colour], 1.0)
-            light = np.clip((levels - self.black[colour]) / span, 0.0, 1.0)
-            sigma[row, col] = span * np.sqrt(noise[1 if colour == 3 else colour].variance(light))
-        places = find_defects(self.values, sigma)
-        replace_defects(self.values, places, self.colours)
-        return len(places[0])
+    def suspects(self) -> Suspects:
+        """Find the pixels that may be defects of the sensor."""
+        return suspects(self.values, self._near())
+
+    def repair(self, others: Sequence[Suspects] = ()) -> int:
+        """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
+        near = self._near()
+        places = defects_of(suspects(self.values, near), others)
+        return replace_defects(self.values, places, near)
+
+    def _near(self) -> Neighbours:
+        return Neighbours(self.colours, 2 if self.is_bayer else 6)
 
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
         """Level at which the sensor clips, and that of each colour relative to it.

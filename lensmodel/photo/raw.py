@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.types import BayerPattern, NoiseModel, Plane, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
+from lensmodel.photo.defects import Suspects
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
@@ -117,13 +118,16 @@ def raw_size(path: Path) -> tuple[int, int]:
 
 
 def develop_raw(
-    raw: rawpy.RawPy, demosaic: Demosaic = "default", linear_white: tuple[int, ...] = ()
+    raw: rawpy.RawPy,
+    demosaic: Demosaic = "default",
+    linear_white: tuple[int, ...] = (),
+    others: Sequence[Suspects] = (),
 ) -> DevelopedRaw:
     """Develop an open RAW file to linear camera RGB.
 
     No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
     1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
-    states, of all channels or of each.
+    states, of all channels or of each; `others` tell what other photos of the body show of its defects.
     """
     method = "ahd" if demosaic == "default" else demosaic
     if method not in _ALGORITHMS:
@@ -136,7 +140,7 @@ def develop_raw(
         mosaic.check()
         white, clip = mosaic.saturation()
     sensor_noise = _sensor_noise(mosaic, white)
-    defects = 0 if mosaic is None or sensor_noise is None else mosaic.repair(sensor_noise, white)
+    defects = 0 if mosaic is None else mosaic.repair(others)
     balance = _white_balance(raw, mosaic)
     spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
     planes = _developed(raw, method, white, balance, spans)

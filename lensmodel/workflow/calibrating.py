@@ -222,6 +222,7 @@ class Calibration:
         on_event : callable
             Learns of each step that is done here; raising `CancelledError` there stops the work.
         """
+        paths = list(paths)
         orders: dict[Path, tuple[str, Identity]] = {}
 
         def sent(path: Path) -> tuple[Any, ...] | None:
@@ -248,7 +249,7 @@ class Calibration:
         for path, job in jobs:
             try:
                 if job is None:
-                    verdict = PhotoVerdict(path, self.add(path, on_event=on_event))
+                    verdict = PhotoVerdict(path, self.add(path, siblings=paths, on_event=on_event))
                 else:
                     verdict = PhotoVerdict(path, self._keep(path, *orders[path], job.result()))
             except CancelledError:  # is of the whole work, not of one photo
@@ -257,8 +258,13 @@ class Calibration:
                 verdict = PhotoVerdict(path, error=error)
             yield verdict
 
-    def add(self, path: Path, *, on_event: EventHook = ignore_event) -> int | None:
-        """Learn from one photo; return how many samples it gave, None where the lens has it already."""
+    def add(
+        self, path: Path, *, siblings: Iterable[Path] = (), on_event: EventHook = ignore_event
+    ) -> int | None:
+        """Learn from one photo; return how many samples it gave, None where the lens has it already.
+
+        `siblings` are other photos, which tell of the defects of the sensor.
+        """
         key = photo_id(path)
         if self._knows(key):
             return None
@@ -271,6 +277,7 @@ class Calibration:
             admit=lambda metadata: identities.append(self._admitted(metadata)),
             executor=self._pool,
             workers=self._workers,
+            siblings=siblings,
             on_event=on_event,
         )
         return self._keep(path, key, identities[0], samples)

@@ -15,7 +15,7 @@ import json
 import logging
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -397,6 +397,7 @@ def samples_of_photo(
     admit: Callable[[PhotoMetadata], None] | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
+    siblings: Iterable[Path] = (),
     on_event: EventHook = ignore_event,
 ) -> list[PsfSample]:
     """Develop one photo, find its patches and estimate a PSF for each patch and channel.
@@ -412,6 +413,8 @@ def samples_of_photo(
     executor : Executor, optional
         Estimates cells; it sees the files of this machine. Without one, `workers` processes do (all cores by
         default), for this photo alone. The result does not depend on it.
+    siblings : iterable of Path
+        As `photo.develop` takes them.
     on_event : callable
     """
     config = config or Config()
@@ -423,7 +426,7 @@ def samples_of_photo(
             admit(info.metadata)
         on_event(CalibrationEvent(path, "developing"))
 
-    developed = photo.develop(path, on_info=admitted)
+    developed = photo.develop(path, on_info=admitted, siblings=siblings)
     on_event(CalibrationEvent(path, "selecting"))
     method = blind.estimators.resolve(config.method)
     selection = find_patches(developed, count=config.patches, selector=config.selector, estimator=method)

@@ -150,7 +150,6 @@ def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, A
     return {
         "charts": charts(test, aperture, unit),
         "table": place_table(test),
-        "error_note": test.error_words,
     }
 
 

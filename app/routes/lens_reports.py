@@ -73,7 +73,7 @@ def read_report(
 ) -> Response:
     """Return the test of a lens, or with `against` or `against_aperture` a comparison.
 
-    The first sentence is for photographers; the rest is what lens testers expect, with its errors.
+    The first sentence is for photographers; the rest is what lens testers expect.
     """
     lens = find_lens(call, lens_id)
     test = stored_report(call, lens)
@@ -136,12 +136,8 @@ def _compared(
         return to_pdf([comparison_page(comparison)])
     if form == "json":
         return json.dumps(_figures(comparison)).encode()
-    rows = ["zone,first_c_px,second_c_px,difference,standard_error"]
-    rows += [
-        f"{c.zone},{c.first:.6g},{c.second:.6g},{c.second - c.first:.6g},"
-        f"{'' if c.error is None else f'{c.error:.6g}'}"
-        for c in comparison.zones
-    ]
+    rows = ["zone,first_c_px,second_c_px,difference"]
+    rows += [f"{c.zone},{c.first:.6g},{c.second:.6g},{c.second - c.first:.6g}" for c in comparison.zones]
     return ("\n".join(rows) + "\n").encode()
 
 

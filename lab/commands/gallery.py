@@ -44,9 +44,9 @@ def gallery(
 ) -> None:
     """A page to look at: each picture calibrated from itself, corrected by default, beside its original.
 
-    Real photos of the test data and simulated frames, with crops at 3:1, what RawTherapee makes of them
-    where it is installed, and figures. Results are kept by the content of the photo and the version of the
-    code: the same command again goes on where it was, and writes the page of the pictures it was asked for.
+    Real photos of the test data and simulated frames, with crops at 3:1 and figures. Results are kept by the
+    content of the photo and the version of the code: the same command again goes on where it was, and writes
+    the page of the pictures it was asked for.
 
     Examples:
 

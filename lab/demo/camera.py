@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
+from lab.scenes import photograph_of
 from lensmodel.core.types import LensSettings, Planes
-from lensmodel.simulate import (
-    ChartEdge,
-    SimulatedCamera,
-    SimulatedLens,
-    demo_scene,
-    draw_lens,
-    edge_chart,
-    photograph,
-    write_photo,
-)
+from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
 
-LENS_SEED = 2024  # chosen: any number, fixed so that the demo is reproducible
-LENS_KIND = "soft-fast"
+LENS: Final = draw_lens(2024, "soft-fast")
+"""The lens of the demo (seed chosen: any number); nothing in the project was tuned on it."""
+
+CAMERA: Final = SimulatedCamera(height=896, width=1456)
+"""1.3 megapixels, base ISO; every scene covers its frame."""
+
+SETTINGS: Final = LensSettings(aperture=LENS.at_focal().f_number, focal_mm=LENS.focal_mm[0])
+"""Of all its photos: wide open."""
+
+_MARGIN: Final = 18  # pixels by which every photograph exceeds the frame
+
 LEARN_FROM = ("city", "lake", "tea-gardens")
 HELD_OUT = "colosseum"
 CHART = "chart"
@@ -35,71 +35,22 @@ class DemoShot:
 
     name: str  # name of the scene
     path: Path  # the DNG file
-    truth: Path  # the light that a perfect lens would have put on the sensor, npy `(3, row, col)` float32
-
-    def sharp(self) -> Planes:
-        """Load the truth: camera colours, not white-balanced, saturation 1."""
-        return np.load(self.truth, allow_pickle=False)
+    sharp: Planes  # light that a perfect lens would have put on the sensor, not white-balanced, saturation 1
 
 
-def demo_lens() -> SimulatedLens:
-    """Return the lens of the demo; nothing in the project was tuned on it."""
-    return draw_lens(LENS_SEED, LENS_KIND)
-
-
-def demo_camera() -> SimulatedCamera:
-    """Return the camera of the demo: 1.3 megapixels, base ISO; every scene covers its frame."""
-    return SimulatedCamera(height=896, width=1456)
-
-
-def demo_settings() -> LensSettings:
-    """Return the settings of all its photos: wide open."""
-    lens = demo_lens()
-    return LensSettings(aperture=lens.at_focal().f_number, focal_mm=lens.focal_mm[0])
-
-
-def chart_edges() -> tuple[ChartEdge, ...]:
-    """Return the edges of the chart that the demo photographs."""
-    return edge_chart(demo_camera().frame).edges
-
-
-def take_photos(
-    folder: Path, *, workers: int, on_photo: Callable[[str, int, int], None], names: Sequence[str] = ()
-) -> dict[str, DemoShot]:
-    """Photograph every scene through the lens, in parallel processes.
-
-    Parameters
-    ----------
-    on_photo : callable
-        Called as `on_photo(name, done, total)` when a photo is finished.
-    """
-    names = tuple(names) or (*LEARN_FROM, HELD_OUT, CHART)
+def take_photos(folder: Path, *, on_photo: Callable[[str], None]) -> dict[str, DemoShot]:
+    """Photograph every scene through the lens; `on_photo` takes the name of each before it is taken."""
     folder.mkdir(parents=True, exist_ok=True)
     shots: dict[str, DemoShot] = {}
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(_take, name, number, folder) for number, name in enumerate(names)]
-        for job in as_completed(jobs):
-            shot = job.result()
-            shots[shot.name] = shot
-            on_photo(shot.name, len(shots), len(names))
+    for number, name in enumerate((*LEARN_FROM, HELD_OUT, CHART)):
+        on_photo(name)
+        scene = edge_chart(CAMERA.frame).scene if name == CHART else _scene(name)
+        photo = photograph(scene, LENS, SETTINGS, CAMERA, np.random.default_rng(number))
+        shots[name] = DemoShot(name, folder / f"{name}.dng", photo.sharp)
+        write_photo(shots[name].path, photo)
     return shots
 
 
-def _take(name: str, number: int, folder: Path) -> DemoShot:
-    lens, camera, settings = demo_lens(), demo_camera(), demo_settings()
-    scene = edge_chart(camera.frame).scene if name == CHART else _framed(demo_scene(name), camera)
-    photo = photograph(scene, lens, settings, camera, np.random.default_rng(number))
-    shot = DemoShot(name, folder / f"{name}.dng", folder / f"{name}-sharp.npy")
-    np.save(shot.truth, photo.sharp, allow_pickle=False)
-    write_photo(shot.path, photo)
-    return shot
-
-
-def _framed(scene: Planes, camera: SimulatedCamera) -> Planes:
-    """Cut the middle of a scene so that it exceeds the frame by an even margin, or equals it."""
-    cut = []
-    for have, want in zip(scene.shape[1:], (camera.height, camera.width), strict=True):
-        spare = (have - want) // 2 * 2
-        start = (have - want - spare) // 2
-        cut.append(slice(start, start + want + spare))
-    return np.ascontiguousarray(scene[:, cut[0], cut[1]])
+def _scene(name: str) -> Planes:
+    """The middle of a photograph."""
+    return photograph_of(name, CAMERA.height + 2 * _MARGIN, CAMERA.width + 2 * _MARGIN)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from pathlib import Path
@@ -16,10 +15,14 @@ from lensmodel.cli.calibrate import Estimator
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Quiet, Verbose
-from lensmodel.core.files import write_atomically
 
-MARKER: Final = ".lensmodel-demo.json"
-"""Lists the files that a demo wrote into its folder, each with its SHA-256."""
+FILES: Final = frozenset(
+    {
+        *("before-after.png", "calibration-history.json", "calibration-history.svg", "corrected.tif"),
+        *("psf-field.png", "report.json", "report.md", "service.log"),
+    }
+)
+"""What a demo leaves in its folder."""
 
 
 def demo(
@@ -51,16 +54,10 @@ def demo(
     _refuse_what_others_wrote(output, force=force)
     from lab.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 
-    before = _digests(output)
     began = time.monotonic()
-    try:
-        improved = run(
-            output,
-            lambda text, left: shown.progress_line(text, time.monotonic() - began, left),
-            estimator=estimator,
-        )
-    finally:
-        _mark(output, before)
+    improved = run(
+        output, lambda text: shown.progress_line(text, time.monotonic() - began), estimator=estimator
+    )
     if json_output:
         shown.document(json.loads((output / "report.json").read_text(encoding="utf-8")))
     else:
@@ -71,46 +68,9 @@ def demo(
 
 
 def _refuse_what_others_wrote(folder: Path, *, force: bool) -> None:
-    """Make sure that nothing is replaced but what an earlier demo wrote and nobody changed since."""
+    """Make sure that the folder holds nothing but what a demo leaves there."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file; give a folder to -o")
-    if force or not folder.is_dir():
-        return
-    ours = _marked(folder)
-    for path in sorted(folder.iterdir()):
-        if path.name != MARKER and (path.is_dir() or ours.get(path.name) != _digest(path)):
-            raise UsageError(
-                f"{path} is not as a demo left it; give a new folder to -o, or --force, which may replace it"
-            )
-
-
-def _mark(folder: Path, before: dict[str, str]) -> None:
-    """Note what is the demo's: what it noted earlier, and what changed since `before`."""
-    if not folder.is_dir():
-        return
-    earlier = _marked(folder)
-    ours = {
-        name: digest
-        for name, digest in _digests(folder).items()
-        if name in earlier or before.get(name) != digest
-    }
-    write_atomically(folder / MARKER, (json.dumps(ours, indent=1) + "\n").encode())
-
-
-def _marked(folder: Path) -> dict[str, str]:
-    try:
-        digests = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return digests if isinstance(digests, dict) else {}
-
-
-def _digests(folder: Path) -> dict[str, str]:
-    if not folder.is_dir():
-        return {}
-    return {p.name: _digest(p) for p in folder.iterdir() if p.is_file() and p.name != MARKER}
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    for path in sorted(folder.glob("*")):
+        if not force and path.name not in FILES:
+            raise UsageError(f"{path} is not of a demo; give a new folder to -o, or --force")

@@ -49,10 +49,6 @@ _FLAT_BLOCKS: Final = 8
 _LEAST_GRAIN: Final = 1e-3
 """Standard deviation below which a place holds rounding to eight bits and no grain."""
 
-_TEXTURE_BLOCK: Final = 16  # pixels of a square (chosen)
-_TEXTURE: Final = (0.006, 0.05)
-"""Standard deviations of lightness that count as low contrast: one and a half to thirteen of 255, chosen."""
-_TEXTURE_PERCENTILE: Final = 5.0  # of the squares (chosen): nearly the worst, not one odd place
 
 _EDGE_GRID: Final = 16  # pixels of a square, of which one edge is taken at most (chosen)
 _REACH: Final = 12  # pixels of a profile to either side; from `_PLATEAU` on it must be even (chosen)
@@ -306,40 +302,6 @@ def grain_ratio(places: NDArray[np.float64]) -> dict[str, float] | None:
     flattest = places[np.argsort(places[:, 0])[:count], 1:]
     old, new = np.median(flattest[:, : len(BANDS)], axis=0), np.median(flattest[:, len(BANDS) :], axis=0)
     return {name: float(n / o) for name, n, o in zip(BANDS, new, old, strict=True)}
-
-
-def textures(before: Shown, after: Shown) -> NDArray[np.float64]:
-    """Local contrast of the corrected picture over the original's, where that is low.
-
-    Standard deviation of lightness in squares of 16 pixels, less their plane; of 1.5 to 13 of 255 in the
-    original. Lawns, slats and grain lie there: far below 1, they were painted over.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-    """
-    contrasts = [_contrasts(luma(picture)) for picture in (before, after)]
-    low = (contrasts[0] >= _TEXTURE[0]) & (contrasts[0] <= _TEXTURE[1])
-    return np.asarray(contrasts[1][low] / contrasts[0][low])
-
-
-def texture_kept(ratios: NDArray[np.float64]) -> float | None:
-    """Fifth percentile of `textures` of a picture; None where it has none."""
-    return float(np.percentile(ratios, _TEXTURE_PERCENTILE)) if len(ratios) >= _LEAST_EDGES else None
-
-
-def _contrasts(plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of each square about its plane of best fit."""
-    side = _TEXTURE_BLOCK
-    down, across = (n // side for n in plane.shape)
-    squares = plane[: down * side, : across * side].reshape(down, side, across, side).transpose(0, 2, 1, 3)
-    squares = squares - squares.mean(axis=(2, 3), keepdims=True)
-    t = np.arange(side) - (side - 1) / 2.0
-    scale = float(np.square(t).sum()) * side
-    explained = (
-        np.square(np.einsum("abij,i->ab", squares, t)) + np.square(np.einsum("abij,j->ab", squares, t))
-    ) / scale
-    return np.sqrt(np.maximum(np.square(squares).sum(axis=(2, 3)) - explained, 0.0)) / side
 
 
 def percentile_of_edges(found: NDArray[np.float64]) -> tuple[float, float] | None:

@@ -36,19 +36,18 @@ def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figur
     -------
     dict
         `dots`, `hue_flips` (counts), `dots_at`, `hue_flips_at` (where most are, or None), `edges` (count),
-        `overshoot` (original and corrected, percent, or None), `grain` (ratio by band, or None), `texture`
-        (contrast kept, or None), `changed` (share of pixels that differ by more than 1 of 255) and, with a
+        `overshoot` (original and corrected, percent, or None), `grain` (ratio by band, or None),
+        `changed` (share of pixels that differ by more than 1 of 255) and, with a
         truth, `gains`.
     """
     faults: dict[str, list[NDArray[np.intp]]] = {"dots": [], "hue_flips": []}
-    edges, places, textures, changed = [], [], [], 0
+    edges, places, changed = [], [], 0
     for row, col, window, inner in _tiles(*before.shape[:2]):
         old, new = _unit(before[window]), _unit(after[window])
         for name, find in (("dots", figures.dots), ("hue_flips", figures.hue_flips)):
             faults[name].append(np.argwhere(find(old, new)[inner]) + np.array([row, col]))
         edges.append(figures.overshoots(old, new, None if truth is None else _unit(truth[window])))
         places.append(figures.grain(old[inner], new[inner]))
-        textures.append(figures.textures(old[inner], new[inner]))
         changed += int((np.abs(new[inner] - old[inner]).max(axis=-1) > 1.0 / 255.0).sum())
     counts: Figures = {}
     for name, tiles in faults.items():
@@ -61,7 +60,6 @@ def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figur
         "edges": len(edge_table),
         "overshoot": figures.percentile_of_edges(edge_table),
         "grain": figures.grain_ratio(np.concatenate(places)),
-        "texture": figures.texture_kept(np.concatenate(textures)),
         "changed": changed / float(np.prod(before.shape[:2])),
         "gains": None if gained is None else asdict(gained),
     }

@@ -19,7 +19,6 @@ HEAD: Final = (
     "hue flips",
     "overshoot %",
     "grain",
-    "texture kept",
     "gain dB",
     "blocks < -0.5 dB",
     "worst block",
@@ -51,7 +50,6 @@ def cells(entry: GalleryEntry) -> list[str]:
         if overshoot is None
         else f"{overshoot[1]:.1f} (original {overshoot[0]:.1f})",
         "nothing even" if grain is None else " ".join(f"{ratio:.2f}" for ratio in grain.values()),
-        "" if found["texture"] is None else f"{found['texture']:.2f}",
     ]
     if gains is None:
         return [*row, "", "", ""]
@@ -109,8 +107,7 @@ _INTRODUCTION: Final = (
     f"Crops show {SIDE} pixels at {ZOOM}:1. Figures are taken from the pictures as shown: dots are single "
     "pixels outside what the original has around them, hue flips colours that it has nowhere near; overshoot "
     "is the 99th percentile beside clean edges, in percent of the step; grain is noise power in even places, "
-    "corrected over original, coarse, middle and fine; texture kept is the 5th percentile of the contrast of "
-    "low-contrast places, corrected over original; gains are against the truth, after each block's own "
+    "corrected over original, coarse, middle and fine; gains are against the truth, after each block's own "
     "best shift. A figure in bold misses its bar."
 )
 
@@ -124,7 +121,4 @@ def _words(entry: GalleryEntry) -> list[str]:
     if "seconds" in unit:
         calibrated, corrected = unit["seconds"]
         words.append(f"calibrated in {calibrated:.0f} s, corrected in {corrected:.0f} s")
-    rival = unit.get("rival")
-    if rival is not None and rival["reason"]:
-        words.append(f"no {rival['name']}: {rival['reason']}")
     return words

@@ -1,4 +1,4 @@
-"""The gallery: each picture calibrated from itself, corrected by default, given to others, and measured.
+"""The gallery: each picture calibrated from itself, corrected by default, and measured.
 
 Whatever is stored already is not made again.
 """
@@ -16,15 +16,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 import lensmodel
-from lab import peers
 from lab.code_version import version_of
 from lab.gallery import crops, measure
 from lab.gallery.pictures import FRAMES, Picture, take
-from lab.gallery.rendering import Rendered, aligned, read_rendered, rendered
+from lab.gallery.rendering import Rendered, read_rendered, rendered
 from lab.store import Unit, stored
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
@@ -40,11 +38,11 @@ OnPicture = Callable[[str, int, int], None]
 
 CACHE = "cache"
 CROPS = "crops"
+BEFORE, AFTER = "before.npy", "after.npy"
+"""Pictures as stored, rendered."""
+
 ANY_APERTURE: Final = 5.6
 """f-number of photos that do not say theirs: chosen, of no effect where one photo is the whole profile."""
-
-RIVALS: Final = ("RawTherapee capture sharpening", "RawTherapee RL")
-"""For a mosaic, and for a developed picture."""
 
 Words = Callable[[str], None]
 
@@ -85,37 +83,6 @@ class GallerySettings:
         return ModelSettings() if self.mode is None else ModelSettings(mode=self.mode)
 
 
-@dataclass(frozen=True, slots=True)
-class PictureFolder:
-    """Where everything about one picture is kept."""
-
-    folder: Path
-
-    @property
-    def before(self) -> Path:
-        """The original, rendered."""
-        return self.folder / "before.npy"
-
-    @property
-    def after(self) -> Path:
-        """The corrected picture, rendered; missing where the photo was left alone."""
-        return self.folder / "after.npy"
-
-    @property
-    def rival(self) -> Path:
-        """What RawTherapee makes of it; missing where it makes nothing."""
-        return self.folder / "rawtherapee.npy"
-
-    def picture(self, path: Path) -> Rendered | None:
-        """Map a picture, or None where it is missing."""
-        return np.load(path, mmap_mode="r", allow_pickle=False) if path.exists() else None
-
-    def save(self, path: Path, values: NDArray[Any]) -> None:
-        """Keep an array, whole or not at all."""
-        with atomic(path) as file:
-            np.save(file, values, allow_pickle=False)
-
-
 def entries_of(
     pictures: Sequence[Picture], output: Path, settings: GallerySettings, *, on_picture: OnPicture
 ) -> Iterator[GalleryEntry]:
@@ -143,20 +110,17 @@ def _entry(
     if picture.unreadable:
         unit: Unit = {"state": "not read", "reason": picture.unreadable, "notes": []}
         return GalleryEntry(picture, unit, {}, {}, (), ())
-    kept, unit = work(picture, output / CACHE, settings, say)
-    before = kept.picture(kept.before)
-    assert before is not None
-    after = kept.picture(kept.after)
-    shown = before if after is None else after
-    known = None if picture.truth is None else np.load(picture.truth, mmap_mode="r", allow_pickle=False)
+    folder, unit = work(picture, output / CACHE, settings, say)
+    before = _mapped(folder / BEFORE)
+    shown = _mapped(folder / AFTER) if (folder / AFTER).exists() else before
+    known = None if picture.truth is None else _mapped(picture.truth)
     say("measuring")
     name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
-    found, _ = stored(kept.folder / name, lambda: measure.measured(before, shown, known))
+    found, _ = stored(folder / name, lambda: measure.measured(before, shown, known))
     columns, sheets = ["original", "corrected"], [before, shown]
-    for word, other in ((unit["rival"]["name"], kept.picture(kept.rival)), ("truth", known)):
-        if other is not None:
-            columns.append(word)
-            sheets.append(other)
+    if known is not None:
+        columns.append("truth")
+        sheets.append(known)
     say("cutting crops")
     side = crops.side_of(before)
     named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
@@ -173,13 +137,13 @@ def _entry(
     return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made))
 
 
-def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -> tuple[PictureFolder, Unit]:
+def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -> tuple[Path, Unit]:
     """Calibrate a picture from itself and correct it, unless that is stored.
 
     Returns
     -------
-    kept : PictureFolder
-        Where the pictures are.
+    folder : Path
+        Holds the original as `BEFORE` and, where it was corrected, `AFTER`.
     unit : dict
         `state` ("corrected" or "left alone"), `reason`, `notes`, `announced` (dB by zone), `seconds`.
     """
@@ -187,15 +151,22 @@ def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -
     content = _hash(picture.path)
     code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))
     version = hashlib.sha256(f"{code} {settings.model}".encode()).hexdigest()[:8]
-    kept = PictureFolder(cache / f"{picture.slug}-{content[:8]}-{version}")
-    if settings.fresh and kept.folder.exists():
-        shutil.rmtree(kept.folder)
-    kept.folder.mkdir(parents=True, exist_ok=True)
-    unit, _ = stored(kept.folder / "work.json", lambda: _worked(picture, kept, settings, say))
-    rival, _ = stored(
-        kept.folder / f"rival-{version_of('lab.peers')[:12]}.json", lambda: _rival(picture, kept, unit, say)
-    )
-    return kept, {**unit, "rival": rival}
+    folder = cache / f"{picture.slug}-{content[:8]}-{version}"
+    if settings.fresh and folder.exists():
+        shutil.rmtree(folder)
+    unit, _ = stored(folder / "work.json", lambda: _worked(picture, folder, settings, say))
+    return folder, unit
+
+
+def _mapped(path: Path) -> Rendered:
+    return np.load(path, mmap_mode="r", allow_pickle=False)
+
+
+def _save(path: Path, values: Rendered) -> None:
+    """Keep an array, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(path) as file:
+        np.save(file, values, allow_pickle=False)
 
 
 def _taken(picture: Picture, say: Words) -> None:
@@ -206,10 +177,10 @@ def _taken(picture: Picture, say: Words) -> None:
     take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
 
 
-def _worked(picture: Picture, kept: PictureFolder, settings: GallerySettings, say: Words) -> Unit:
+def _worked(picture: Picture, folder: Path, settings: GallerySettings, say: Words) -> Unit:
     say("developing")
     developed = develop(picture.path)
-    kept.save(kept.before, rendered(developed.planes, developed.encoding))
+    _save(folder / BEFORE, rendered(developed.planes, developed.encoding))
     notes = []
     override = LensSettings()
     if developed.info.metadata.aperture is None:
@@ -220,12 +191,10 @@ def _worked(picture: Picture, kept: PictureFolder, settings: GallerySettings, sa
         "reason": "",
         "notes": notes,
         "announced": {},
-        "raw": developed.cfa is not None,
-        "orientation": developed.encoding.orientation,
     }
     began = time.monotonic()
     try:
-        model = _model(picture, kept, settings, override, say)
+        model = _model(picture, folder, settings, override, say)
     except LensModelError as error:
         return {**unit, "reason": f"calibration was refused: {error}", "seconds": [_since(began), 0.0]}
     calibrated = _since(began)
@@ -246,15 +215,15 @@ def _worked(picture: Picture, kept: PictureFolder, settings: GallerySettings, sa
             reason = f"correction was refused: {error}"
             return {**unit, "reason": reason, "seconds": [calibrated, _since(began)]}
         seconds = [calibrated, _since(began)]
-        kept.save(kept.after, read_rendered(output))
+        _save(folder / AFTER, read_rendered(output))
     announced = {zone: _finite(report.expected_gain_db) for zone, report in corrected.zones.items()}
     return {**unit, "state": "corrected", "announced": announced, "seconds": seconds}
 
 
 def _model(
-    picture: Picture, kept: PictureFolder, settings: GallerySettings, override: LensSettings, say: Words
+    picture: Picture, folder: Path, settings: GallerySettings, override: LensSettings, say: Words
 ) -> LensModel:
-    path = kept.folder / "own.lensprofile"
+    path = folder / "own.lensprofile"
     if path.exists():
         return load_profile(path).model
     reasons: list[str] = []
@@ -280,24 +249,6 @@ def _model(
         raise InvalidInputError(reasons[0] if reasons else str(error)) from error
     save_profile(path, LensProfile(model))
     return model
-
-
-def _rival(picture: Picture, kept: PictureFolder, unit: Unit, say: Words) -> Unit:
-    peer = next(p for p in peers.PEERS if p.name == RIVALS[0 if unit["raw"] else 1])
-    kept.rival.unlink(missing_ok=True)
-    if not peer.installed:
-        return {"name": peer.name, "reason": f"{peer.program} is not installed"}
-    say(peer.name)
-    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
-        try:
-            made, _ = peer.run(picture.path.resolve(), Path(name), peer.usual)
-            picture_of_it = read_rendered(made)
-        except (LensModelError, OSError, ValueError) as error:
-            return {"name": peer.name, "reason": str(error)}
-    before = kept.picture(kept.before)
-    assert before is not None
-    kept.save(kept.rival, aligned(picture_of_it, before, unit["orientation"]))
-    return {"name": peer.name, "reason": ""}
 
 
 def _finite(value: float | None) -> float | None:

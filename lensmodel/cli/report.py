@@ -37,13 +37,11 @@ from lensmodel.report import (
     compare,
     export,
     exporters,
-    format_of,
     lens_report,
     psf_grid,
     widest,
 )
 from lensmodel.report.documents import comparison_html, to_csv, to_html
-from lensmodel.report.lens_report import DRAWS
 from lensmodel.workflow.correcting import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
@@ -127,7 +125,7 @@ def report(
 def measured(
     profile: Path, aperture: float | None, aspect: float, photos: Sequence[Path], *, whole: bool
 ) -> LensReport:
-    """Report on the lens of a profile: whole, with errors and all colours, or only what the screen shows."""
+    """Report on the lens of a profile: whole, in all colours, or only what the screen shows."""
     known = files.profile_at(profile)
     with files.as_usage():
         asked = None if aperture is None else [LensSettings(aperture=aperture).aperture or aperture]
@@ -139,7 +137,6 @@ def measured(
             lateral=[lateral_of(develop(path)) for path in photos],
             channels=("g", "r", "b") if whole else ("g",),
             details=details_of(known),
-            draws=DRAWS if whole else 0,
         )
 
 
@@ -258,16 +255,14 @@ def export_psfs(
 
 def _format(output: Path, named: str | None) -> str:
     """Tell the format by the option and by the ending of the file; they must not contradict each other."""
-    ending = format_of(output)
+    ending = output.suffix.lower().removeprefix(".")
     chosen = named or ending
-    if chosen is None:
+    if chosen not in exporters:
         raise UsageError(
-            f"no format for {output.name}; add --format, or give a name that ends in "
+            f"no export format {chosen!r}; add --format, or give a name that ends in "
             + ", ".join(f".{name}" for name in exporters)
         )
-    with files.as_usage():
-        exporters.create(chosen)
-    if ending not in {None, chosen}:
+    if ending in exporters and ending != chosen:
         raise UsageError(
             f"{output.name} ends as {ending} does, but --format says {chosen}; change one of them"
         )

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Any, Final
 
-from lensmodel.report.comparison import Comparison
-from lensmodel.report.lens_report import NYQUIST, UNIT_NAMES, ApertureReport, LensReport
+from lensmodel.core.types import FieldPosition
+from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, Comparison, LensReport
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
-    *("direction", "value", "unit", "standard_error", "predicted_error", "extrapolated"),
+    *("direction", "value", "unit", "predicted_error", "extrapolated"),
 )
 _STYLE: Final = """
 :root { color-scheme: light; }
@@ -64,8 +64,7 @@ def to_html(report: LensReport) -> str:
         parts.append(f"<h2>{'At ' + found.at if found.at else 'Aperture unknown'}</h2>")
         parts.append(f"<p>{escape(found.centring.text[:1].upper() + found.centring.text[1:])}.</p>")
         parts.append(_figures(charts(report, aperture)))
-        parts.append(f'<p class="note">{escape(report.error_words)}</p>')
-    parts += ["<h2>What would help most</h2>", f"<p>{escape(report.advice.text)}</p>"]
+    parts += ["<h2>What would help most</h2>", f"<p>{escape(report.advice)}</p>"]
     return _page(report.name, parts)
 
 
@@ -75,17 +74,8 @@ def comparison_html(comparison: Comparison) -> str:
 
     first, second = comparison.first, comparison.second
     title = f"{first.name} and {second.name}"
-    rows = [
-        [
-            change.zone,
-            f"{change.first:.3f}",
-            f"{change.second:.3f}",
-            f"{change.share:+.0%}",
-            "unknown" if change.error is None else f"{change.error / change.first:.0%}",
-        ]
-        for change in comparison.zones
-    ]
-    head = ["Zone", f"MTF50 of {first.name}, c/px", f"of {second.name}", "Difference", "Its standard error"]
+    rows = [[c.zone, f"{c.first:.3f}", f"{c.second:.3f}", f"{c.share:+.0%}"] for c in comparison.zones]
+    head = ["Zone", f"MTF50 of {first.name}, c/px", f"of {second.name}", "Difference"]
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict">{escape(comparison.verdict)}</p>',
@@ -120,52 +110,37 @@ def to_csv(report: LensReport) -> str:
 def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
     for zone, value in found.zones.items():
         yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": "c/px"}
-    yield from _spots(found)
-    for direction, values, errors in (
-        ("tangential", found.tangential, found.tangential_error),
-        ("sagittal", found.sagittal, found.sagittal_error),
-    ):
+    for spot in (*found.spots, *found.sides):
+        own = {"quantity": f"MTF50 at {spot.place}", "unit": "c/px"} | _at(spot.position)
+        own |= {"predicted_error": _number(spot.predicted_error)}
+        yield own | {"direction": "tangential", "value": _number(spot.tangential)}
+        yield own | {"direction": "sagittal", "value": _number(spot.sagittal)}
+    for direction, values in (("tangential", found.tangential), ("sagittal", found.sagittal)):
         for i, (place, value) in enumerate(zip(found.positions, values, strict=True)):
             row, col = divmod(i, found.cols)
-            yield {
+            yield _at(place) | {
                 "quantity": "MTF50",
                 "direction": direction,
-                "r": _number(place.r),
-                "phi": _number(place.phi),
                 "row": str(row),
                 "col": str(col),
                 "value": _number(value),
                 "unit": "c/px",
-                "standard_error": _number(errors[i]) if errors and value < NYQUIST else "",
                 "predicted_error": _number(found.predicted_error[i]),
                 "extrapolated": str(int(found.extrapolated[i])),
             }
     for curve in found.curves:
-        for direction, values, errors in (
-            ("tangential", curve.tangential, curve.tangential_error),
-            ("sagittal", curve.sagittal, curve.sagittal_error),
-        ):
-            for k, r in enumerate(found.radii):
-                yield {
-                    "quantity": "MTF",
-                    "r": _number(r),
-                    "frequency_c_px": _number(curve.frequency),
-                    "frequency_lp_mm": _number(curve.lp_mm),
-                    "direction": direction,
-                    "value": _number(values[k]),
-                    "standard_error": _number(errors[k]) if errors else "",
-                }
-    for direction, widths in (("radial", found.along_u), ("around", found.along_v)):
-        for r, width in zip(found.radii, widths, strict=True):
-            row_ = {"quantity": "width of a point", "r": _number(r), "direction": direction}
-            yield row_ | {"value": _number(width), "unit": "px"}
+        known = {
+            "quantity": "MTF",
+            "frequency_c_px": _number(curve.frequency),
+            "frequency_lp_mm": _number(curve.lp_mm),
+        }
+        for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
+            for r, value in zip(found.radii, values, strict=True):
+                yield known | {"r": _number(r), "direction": direction, "value": _number(value)}
 
 
-def _spots(found: ApertureReport) -> Iterator[dict[str, str]]:
-    for spot in (*found.spots, *found.sides):
-        own = {"quantity": f"MTF50 at {spot.place}", "r": _number(spot.position.r), "unit": "c/px"}
-        for direction, value in (("tangential", spot.tangential), ("sagittal", spot.sagittal)):
-            yield own | {"phi": _number(spot.position.phi), "direction": direction, "value": _number(value)}
+def _at(place: FieldPosition) -> dict[str, str]:
+    return {"r": _number(place.r), "phi": _number(place.phi)}
 
 
 def _number(value: float | None) -> str:

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,19 +85,7 @@ def psf_grid(
     )
 
 
-class Exporter(Protocol):
-    """One format."""
-
-    @property
-    def suffix(self) -> str:
-        """How names of such files end, with the dot."""
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fits:
+def to_fits(psfs: PsfGrid) -> bytes:
     """FITS, 32-bit float: a cube (place, row, col), or an image for a single place, as Siril loads it.
 
     Notes
@@ -106,110 +94,82 @@ class Fits:
     extension POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error.
     Source: "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
     """
-
-    suffix: str = ".fits"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file."""
-        fits = _astropy_fits()
-        cube = psfs.kernels[:, ::-1, :]
-        primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
-        header = primary.header
-        header["ROWORDER"] = ("BOTTOM-UP", "first row stored is the bottom one")
-        header["GRIDROWS"], header["GRIDCOLS"] = psfs.rows, psfs.cols
-        header["FILTER"] = (psfs.settings.channel, "colour channel")
-        if psfs.settings.aperture is not None:
-            header["FNUMBER"] = (psfs.settings.aperture, "aperture, f-number")
-        if psfs.settings.focal_mm is not None:
-            header["FOCALLEN"] = (psfs.settings.focal_mm, "focal length, mm")
-        header["COMMENT"] = "point spread functions by lensmodel, sum 1"
-        table = fits.BinTableHDU.from_columns(
-            [
-                fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
-                fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
-                fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
-            ],
-            name="POSITIONS",
-        )
-        out = io.BytesIO()
-        fits.HDUList([primary, table]).writeto(out)
-        return out.getvalue()
+    fits = _astropy_fits()
+    cube = psfs.kernels[:, ::-1, :]
+    primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
+    header = primary.header
+    header["ROWORDER"] = ("BOTTOM-UP", "first row stored is the bottom one")
+    header["GRIDROWS"], header["GRIDCOLS"] = psfs.rows, psfs.cols
+    header["FILTER"] = (psfs.settings.channel, "colour channel")
+    if psfs.settings.aperture is not None:
+        header["FNUMBER"] = (psfs.settings.aperture, "aperture, f-number")
+    if psfs.settings.focal_mm is not None:
+        header["FOCALLEN"] = (psfs.settings.focal_mm, "focal length, mm")
+    header["COMMENT"] = "point spread functions by lensmodel, sum 1"
+    table = fits.BinTableHDU.from_columns(
+        [
+            fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
+            fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
+            fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
+        ],
+        name="POSITIONS",
+    )
+    out = io.BytesIO()
+    fits.HDUList([primary, table]).writeto(out)
+    return out.getvalue()
 
 
-@dataclass(frozen=True, slots=True)
-class Npz:
-    """NumPy archive with `psf` (n, k, k), `shape` (rows, cols), and of each place what `encode` names."""
-
-    suffix: str = ".npz"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file; an unknown aperture is NaN."""
-        out = io.BytesIO()
-        aperture = math.nan if psfs.settings.aperture is None else psfs.settings.aperture
-        np.savez_compressed(
-            out,
-            psf=psfs.kernels,
-            r=np.array([p.r for p in psfs.positions]),
-            phi=np.array([p.phi for p in psfs.positions]),
-            error=np.array(psfs.predicted_error),
-            shape=np.array([psfs.rows, psfs.cols]),
-            aperture=np.full(len(psfs.positions), aperture),
-            channel=np.array(psfs.settings.channel),
-        )
-        return out.getvalue()
+def to_npz(psfs: PsfGrid) -> bytes:
+    """NumPy archive with `psf` (n, k, k), `shape` (rows, cols), and r, phi, error of each place."""
+    out = io.BytesIO()
+    aperture = math.nan if psfs.settings.aperture is None else psfs.settings.aperture
+    np.savez_compressed(
+        out,
+        psf=psfs.kernels,
+        r=np.array([p.r for p in psfs.positions]),
+        phi=np.array([p.phi for p in psfs.positions]),
+        error=np.array(psfs.predicted_error),
+        shape=np.array([psfs.rows, psfs.cols]),
+        aperture=np.full(len(psfs.positions), aperture),
+        channel=np.array(psfs.settings.channel),
+    )
+    return out.getvalue()
 
 
-@dataclass(frozen=True, slots=True)
-class JsonMatrix:
+def to_json(psfs: PsfGrid) -> bytes:
     """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object."""
-
-    suffix: str = ".json"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file; nine digits hold any float32."""
-        if len(psfs.positions) == 1:
-            content: Any = _matrix(psfs.kernels[0])
-        else:
-            content = document(psfs)
-        return json.dumps(content, allow_nan=False).encode()
+    if len(psfs.positions) == 1:
+        content: Any = _matrix(psfs.kernels[0])
+    else:
+        content = document(psfs)
+    return json.dumps(content, allow_nan=False).encode()
 
 
-@dataclass(frozen=True, slots=True)
-class MtfTable:
+def to_mtf_table(psfs: PsfGrid) -> bytes:
     """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place."""
-
-    suffix: str = ".csv"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file; frequencies are cycles/pixel."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
-        known = ["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal"]
-        writer.writerow([*known, *heads])
-        for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
-            exact = kernel.astype(np.float64)
-            fifty = tangential_sagittal_mtf50(exact, place.phi)
-            contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
-            values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
-            writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
-        return out.getvalue().encode()
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
+    known = ["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal"]
+    writer.writerow([*known, *heads])
+    for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
+        exact = kernel.astype(np.float64)
+        fifty = tangential_sagittal_mtf50(exact, place.phi)
+        contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
+        values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
+        writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
+    return out.getvalue().encode()
 
 
-exporters: Registry[Exporter] = Registry(
-    "export format", {"csv": MtfTable, "fits": Fits, "json": JsonMatrix, "npz": Npz}
+exporters: Registry[bytes] = Registry(
+    "export format", {"csv": to_mtf_table, "fits": to_fits, "json": to_json, "npz": to_npz}
 )
-
-
-def format_of(path: Path) -> str | None:
-    """Return the format that the name of a file ends in, None where that is no format of ours."""
-    ending = path.suffix.lower()
-    return next((name for name in exporters if ending in {f".{name}", exporters.create(name).suffix}), None)
+"""Formats by name, each of which turns `psfs` into the bytes of a file; names of files end in it."""
 
 
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     """Write a grid in a format; the file appears complete or not at all."""
-    write_atomically(Path(path), exporters.create(file_format).encode(psfs))
+    write_atomically(Path(path), exporters.create(file_format, psfs=psfs))
 
 
 def document(psfs: PsfGrid) -> dict[str, Any]:

@@ -1,30 +1,22 @@
-"""The report on one copy of a lens: how sharp it is where, at which apertures and colours, with errors.
+"""The report on one copy of a lens: how sharp it is where, at which apertures and in which colours.
 
-Everything follows from the model and its samples. Frequencies are cycles/pixel. Tangential is the contrast
-along u (of lines across the radius), sagittal along v; the two are never mixed but where "mean" says so.
-
-How much a report would change with other photos: its model fitted anew to photos drawn again.
-
-Photos are drawn with replacement, as many as there are; the standard deviation over the draws is the standard
-error (B. Efron and R. Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 6). What all photos have in
-common, such as a bias of the estimate, does not show.
+Everything follows from the model. Frequencies are cycles/pixel. Tangential is the contrast along u (of lines
+across the radius), sagittal along v; the two are never mixed but where "mean" says so. How far off a figure
+may be is what the model expects of the kernel at its place (`predicted_error`).
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import zone_of
-from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.types import (
     ZONES,
     Channel,
@@ -41,8 +33,6 @@ from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.centring import Centring, centring
 from lensmodel.report.places import (
     DEFAULT_ASPECT,
-    Advice,
-    advice,
     corner_places,
     direction_in_words,
     grid,
@@ -80,7 +70,15 @@ _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
 """MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and
 a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
 
-DRAWS: Final = 16  # a standard deviation over so few is known to a fifth (chosen for time)
+_ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
+_ZONE_WORDS: Final[dict[Zone, str]] = {
+    "center": "in the centre",
+    "mid": "halfway out",
+    "corner": "in the corners",
+}
+
+_WELL_KNOWN: Final = 0.1
+"""Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)."""
 
 UNKNOWN: Final = 0.5
 """Expected relative L2 of a kernel from which on a place is drawn as unknown (chosen: half may be wrong)."""
@@ -122,16 +120,13 @@ class SensorGeometry:
 class Curve:
     """Contrast at one frequency over the radii of a report, mean over the angles that lie on the picture.
 
-    `lp_mm` is the frequency in line pairs per millimetre, where the pixel pitch is known; errors are standard
-    errors, empty where there are none.
+    `lp_mm` is the frequency in line pairs per millimetre, where the pixel pitch is known.
     """
 
     frequency: float
     lp_mm: float | None
     tangential: tuple[float, ...]
     sagittal: tuple[float, ...]
-    tangential_error: tuple[float, ...] = ()
-    sagittal_error: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -147,6 +142,7 @@ class Spot:
     position: FieldPosition
     tangential: float
     sagittal: float
+    predicted_error: float  # expected relative L2 of the kernel
     kernel: tuple[tuple[float, ...], ...]
 
     @property
@@ -176,17 +172,10 @@ class ApertureReport:
     positions: tuple[FieldPosition, ...]  # of the map, row by row from the top left
     tangential: tuple[float, ...]  # MTF50 at each place, cycles/pixel
     sagittal: tuple[float, ...]
-    tangential_error: tuple[float, ...]  # their standard errors; empty where they are not known
-    sagittal_error: tuple[float, ...]
     predicted_error: tuple[float, ...]  # expected relative L2 of the kernel at each place
     extrapolated: tuple[bool, ...]  # whether no photo shows a place
     radii: tuple[float, ...]
     curves: tuple[Curve, ...]
-    # Root mean square widths of a point by radius, pixels. Where they part there is astigmatism (W. T.
-    # Welford, "Aberrations of Optical Systems", 1986, sec. 8.3); photos of one focus cannot tell how far each
-    # focal surface lies from the sensor.
-    along_u: tuple[float, ...]
-    along_v: tuple[float, ...]
     spots: tuple[Spot, ...]  # the centre and the four corners
     sides: tuple[Spot, ...]  # left, right, top and bottom, at four fifths of the way to the edge
     centring: Centring
@@ -207,14 +196,6 @@ class ApertureReport:
     def zones(self) -> dict[Zone, float]:
         """Mean MTF50 of the map's places in each zone, cycles/pixel."""
         return {zone: _mean_in(zone, self.positions, self.mean) for zone in ZONES}
-
-    @property
-    def zone_errors(self) -> dict[Zone, float] | None:
-        """Standard errors of `zones`, their places taken to err together: they share their photos."""
-        if not self.tangential_error:
-            return None
-        both = [(t + s) / 2.0 for t, s in zip(self.tangential_error, self.sagittal_error, strict=True)]
-        return {zone: _mean_in(zone, self.positions, both) for zone in ZONES}
 
     @property
     def worst(self) -> Spot:
@@ -248,10 +229,6 @@ class LensReport:
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
     lateral: LateralColourCurve | None  # None where no photo showed it
-    advice: Advice  # which photo would help most
-    # what was drawn again for the standard errors; with fewer than three photos patches, which share their
-    # photo's focus, so that errors come out too small
-    drawn: str = ""
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
 
@@ -276,16 +253,17 @@ class LensReport:
         return ", ".join(parts)
 
     @property
-    def error_words(self) -> str:
-        """What the bands and error maps are."""
-        if not self.drawn:
-            return "Too little is known to estimate the error of these figures."
-        words = (
-            f"Bands and error maps: one standard error, from random redraws of the {self.drawn}. "
-            "Errors that all photos share are not included."
-        )
-        return words + (
-            " With fewer than three photos this error is too small." if self.drawn == "patches" else ""
+    def advice(self) -> str:
+        """Which photo would help most: of the place and aperture whose blur is known least."""
+        green = [one for one in self.tested if one.settings.channel == self.tested[0].settings.channel]
+        spots = [(spot, one) for one in green for spot in (*one.spots, *one.sides)]
+        least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
+        if least.predicted_error < _WELL_KNOWN:
+            return "The lens is well known by now; another photo would add little."
+        at = f", at {tested.at}" if tested.at else ""
+        return (
+            f"Next, a photo of something with fine detail at {least.place}{at}: its blur is expected to be "
+            f"wrong by {least.predicted_error:.0%}, more than elsewhere."
         )
 
     @property
@@ -296,7 +274,7 @@ class LensReport:
         if any(first.unknown):
             share = sum(first.unknown) / len(first.unknown)
             lines.append(f"Too little is known of {share:.0%} of the picture; those figures are guesses.")
-        return (*lines, self.advice.text)
+        return (*lines, self.advice)
 
 
 def lens_report(
@@ -308,7 +286,6 @@ def lens_report(
     lateral: Sequence[LateralColour] = (),
     channels: Sequence[Channel] = ("g", "r", "b"),
     apertures: Sequence[float] | None = None,
-    draws: int = DRAWS,
     rows: int = ROWS,
     size: int = 31,
     details: Mapping[str, str] | None = None,
@@ -330,8 +307,6 @@ def lens_report(
     channels : sequence of {"r", "g", "b"}
     apertures : sequence of float, optional
         f-numbers instead of those of the photos.
-    draws : int
-        Of the bootstrap; 0 makes no errors.
     rows : int
         Of the maps.
     size : int
@@ -352,12 +327,10 @@ def lens_report(
     cols = max(3, round(rows * aspect))
     numbers = list(apertures) if apertures is not None else _chosen(model)
     wanted = [LensSettings(aperture=n) for n in numbers] or [widest(model)]
-    redrawn, drawn = redrawn_models(model, np.random.default_rng(0), draws)  # same photos, same report
     questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
     tested = []
     for settings in questions:
-        again = redrawn if settings.channel == channels[0] else []
-        tested.append(_tested(model, again, settings, (rows, cols, aspect, size), pitch))
+        tested.append(_tested(model, settings, (rows, cols, aspect, size), pitch))
         on_step(len(tested), len(questions))
     first = tested[0]
     return LensReport(
@@ -368,15 +341,12 @@ def lens_report(
         sensor=SensorGeometry(pitch, height_px or _height(model, aspect)),
         tested=tuple(tested),
         lateral=_lateral(lateral),
-        advice=advice(model),
-        drawn=drawn if first.tangential_error else "",
         details=dict(details or {}),
     )
 
 
 def _tested(
     model: LensModel,
-    redrawn: Sequence[LensModel],
     settings: LensSettings,
     shape: tuple[int, int, float, int],
     pitch: float | None,
@@ -390,19 +360,6 @@ def _tested(
     tangential, sagittal = _mtf50([answer.kernel for answer in answers], places)
     kernels = list(model.kernels(around, settings, size))
     curves = _contrast(kernels, rings, [f for f, _ in frequencies])
-    maps: list[np.ndarray] = []
-    contrasts = []
-    for replica in redrawn:
-        both = list(replica.kernels([*places, *around], settings, size))
-        maps.append(np.minimum(_mtf50(both[: len(places)], places), NYQUIST))
-        contrasts.append(_contrast(both[len(places) :], rings, [f for f, _ in frequencies]))
-    errors: _Pairs = ((), ())
-    spread = np.empty((0,))
-    if len(maps) > 1:
-        deviations = np.std(np.array(maps), axis=0, ddof=1)
-        errors = tuple(deviations[0].tolist()), tuple(deviations[1].tolist())
-        spread = np.std(np.array(contrasts), axis=0, ddof=1)
-    along_u, along_v = _widths(kernels, rings)
     corners = [("the centre", FieldPosition(0.0, 0.0))]
     corners += [(place_in_words(place), place) for place in corner_places(aspect)]
     sides = [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
@@ -414,17 +371,13 @@ def _tested(
         positions=places,
         tangential=tangential,
         sagittal=sagittal,
-        tangential_error=errors[0],
-        sagittal_error=errors[1],
         predicted_error=tuple(float(answer.predicted_error) for answer in answers),
         extrapolated=tuple(bool(answer.extrapolated) for answer in answers),
         radii=RADII,
         curves=tuple(
-            Curve(f, lp, *(tuple(v.tolist()) for v in (*curves[i], *(spread[i] if spread.size else ()))))
+            Curve(f, lp, *(tuple(values.tolist()) for values in curves[i]))
             for i, (f, lp) in enumerate(frequencies)
         ),
-        along_u=along_u,
-        along_v=along_v,
         spots=tuple(_spot(model, words, place, settings, size) for words, place in corners),
         sides=tuple(_spot(model, words, place, settings, size) for words, place in sides),
         centring=centring(model, settings),
@@ -432,15 +385,10 @@ def _tested(
 
 
 def _spot(model: LensModel, words: str, place: FieldPosition, settings: LensSettings, size: int) -> Spot:
-    kernel = model.query(place, settings, size).kernel
-    tangential, sagittal = tangential_sagittal_mtf50(kernel, place.phi)
-    return Spot(
-        words,
-        place,
-        float(tangential),
-        float(sagittal),
-        tuple(tuple(row) for row in kernel.round(7).tolist()),
-    )
+    answer = model.query(place, settings, size)
+    tangential, sagittal = tangential_sagittal_mtf50(answer.kernel, place.phi)
+    kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
+    return Spot(words, place, float(tangential), float(sagittal), float(answer.predicted_error), kernel)
 
 
 def _mtf50(kernels: Sequence[Kernel], places: Sequence[FieldPosition]) -> _Pairs:
@@ -463,25 +411,6 @@ def _contrast(
         if len(places) == 1:
             out[:, :, column] = out[:, :, column].mean(axis=1, keepdims=True)  # u has no direction there
     return out
-
-
-def _widths(kernels: Sequence[Kernel], rings: Sequence[Sequence[FieldPosition]]) -> _Pairs:
-    """Root mean square widths along u and v by radius; the variance along a unit vector a is a' M a."""
-    left = iter(kernels)
-    along_u, along_v = [], []
-    for places in rings:
-        squares = []
-        for place in places:
-            moments = second_moments(next(left))
-            u = np.array([-math.sin(place.phi), math.cos(place.phi)])  # (row, col)
-            v = np.array([-math.cos(place.phi), -math.sin(place.phi)])
-            squares.append((float(u @ moments @ u), float(v @ moments @ v)))
-        squared = np.maximum(np.mean(squares, axis=0), 0.0)
-        if len(places) == 1:
-            squared[:] = squared.mean()
-        along_u.append(float(math.sqrt(squared[0])))
-        along_v.append(float(math.sqrt(squared[1])))
-    return tuple(along_u), tuple(along_v)
 
 
 def verdict(found: ApertureReport, best: float | None = None) -> str:
@@ -593,34 +522,59 @@ def _mean_in(zone: Zone, positions: Sequence[FieldPosition], values: Sequence[fl
     return float(np.mean(own)) if own else math.nan
 
 
-_FEWEST_GROUPS: Final = 3  # groups: two have but three different draws (chosen)
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One of two that are compared: what to call it, what was found, and what that rests on."""
+
+    name: str
+    found: ApertureReport
+    facts: str = ""
 
 
-def redrawn_models(model: LensModel, rng: np.random.Generator, draws: int) -> tuple[list[LensModel], str]:
-    """Fit the model to samples drawn again."""
-    excluded = model.settings.excluded
-    samples = [s for s in model.samples if s.photo not in excluded and s.settings.channel == "g"]
-    drawn = "photos" if len({s.photo for s in samples}) >= _FEWEST_GROUPS else "patches"
-    groups: defaultdict[Hashable, list[PsfSample]] = defaultdict(list)
-    for sample in samples:
-        groups[sample.photo if drawn == "photos" else (sample.photo, sample.position)].append(sample)
-    each = list(groups.values())
-    models: list[LensModel] = []
-    for _ in range(draws if len(each) >= _FEWEST_GROUPS else 0):
-        chosen = rng.integers(0, len(each), len(each))
-        try:
-            models.append(LensModel.fit(_copies(each, chosen), model.settings))
-        except LensModelError:
-            continue
-    return (models if len(models) >= max(draws // 2, 2) else []), drawn
+@dataclass(frozen=True, slots=True)
+class ZoneChange:
+    """How the second differs from the first in one zone: MTF50 in cycles/pixel."""
+
+    zone: Zone
+    first: float
+    second: float
+
+    @property
+    def share(self) -> float:
+        """Difference over the first."""
+        return (self.second - self.first) / self.first
+
+    @property
+    def words(self) -> str:
+        """The same for people."""
+        place = _ZONE_WORDS[self.zone]
+        if abs(self.share) < _ALIKE:
+            return f"about the same {place}"
+        return f"{abs(self.share):.0%} {'sharper' if self.share > 0 else 'softer'} {place}"
 
 
-def _copies(groups: Sequence[list[PsfSample]], chosen: NDArray[np.integer]) -> list[PsfSample]:
-    """Samples of the chosen groups; one that is drawn again is of another photo, or it would not count."""
-    seen: Counter[int] = Counter()
-    samples = []
-    for number in map(int, chosen):
-        copy = seen[number]
-        samples += [s if copy == 0 else replace(s, photo=f"{s.photo} {copy}") for s in groups[number]]
-        seen[number] += 1
-    return samples
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two copies of a lens, or two apertures of one, side by side."""
+
+    first: Side
+    second: Side
+
+    @property
+    def zones(self) -> tuple[ZoneChange, ...]:
+        """How the second differs from the first, from the centre outwards."""
+        one, two = self.first.found.zones, self.second.found.zones
+        return tuple(ZoneChange(zone, one[zone], two[zone]) for zone in ZONES)
+
+    @property
+    def verdict(self) -> str:
+        """The difference as one sentence."""
+        *some, last = (change.words for change in self.zones)
+        return f"Compared with {self.first.name}, {self.second.name} is {', '.join(some)} and {last}."
+
+
+def compare(first: Side, second: Side) -> Comparison:
+    """Compare two copies at one aperture, or two apertures of one copy; those of one name are numbered."""
+    if first.name == second.name:
+        first, second = replace(first, name=f"{first.name} (1)"), replace(second, name=f"{second.name} (2)")
+    return Comparison(first, second)

@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import Channel
-from lensmodel.report.comparison import SURE, Comparison
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
+    Comparison,
     Curve,
     LateralColourCurve,
     LensReport,
@@ -46,7 +44,6 @@ _SHARPNESS: Final = LinearSegmentedColormap.from_list(
 """From soft to sharp, palest where a photo is a little soft; lightness rises and falls once, for the
 colour-blind and for print (chosen)."""
 _CHANGES: Final = LinearSegmentedColormap.from_list("changes", ["#7f1d1d", "#fdf6e3", "#0b6e99"])
-_ERRORS: Final = LinearSegmentedColormap.from_list("errors", ["#fdf6e3", "#7f1d1d"])
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
 _CHANNELS: Final[dict[Channel, tuple[str, str]]] = {
     "r": ("red", "#c2410c"),
@@ -62,8 +59,8 @@ _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side
 _LETTERS: Final = 80  # of a legend beside each other (chosen: they fit below a chart)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
-_LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none (chosen)
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
+_HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _DOTS: Final = 160  # a inch of a PNG (chosen: a page is as wide as a screen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
@@ -116,7 +113,7 @@ def pages(report: LensReport) -> list[Figure]:
     for number in report.apertures:
         panels = _panels(report, report.at(number), "c/px")
         for first in range(0, len(panels), _A_PAGE):
-            figure = _page(report.name, "" if first else report.error_words)
+            figure = _page(report.name, "")
             _placed(figure, panels[first : first + _A_PAGE])
             drawn.append(figure)
     return drawn
@@ -134,13 +131,9 @@ def comparison_page(comparison: Comparison) -> Figure:
 def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
     at = f", {found.at}" if found.at else ""
     panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
-    if found.tangential_error:
-        errors = f"Standard error of MTF50, cycles/pixel{at}"
-        panels.append((errors, lambda on: _maps(on, found, report.sensor, None)))
     panels += [
         (f"Contrast over the picture{at}: sagittal solid, tangential dashed", _on(contrast, found)),
         (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
-        (f"Width of a point{at}: where the lines part is astigmatism", _on(widths, found)),
         (f"Centring{at}", _on(side_softer, found)),
     ]
     if len(report.apertures) > 1:
@@ -224,49 +217,27 @@ def save(figure: Figure, path: Path) -> None:
 # --- single axes ------------------------------------------------------------------------------
 
 
-def sharpness_map(
-    ax: Axes,
-    found: ApertureReport,
-    values: Sequence[float],
-    *,
-    factor: float = 1.0,
-    top: float = NYQUIST,
-    error: bool = False,
-) -> Any:  # noqa: ANN401 - an image of matplotlib, which colour bars take
-    """Draw a map of MTF50 or of its errors; places of which too little is known are hatched."""
-    shape = found.rows, found.cols
-    grid = np.clip(np.array(values, dtype=np.float64).reshape(shape), 0.0, top)
+def sharpness_map(ax: Axes, found: ApertureReport, values: Sequence[float], *, factor: float = 1.0) -> Any:  # noqa: ANN401 - an image of matplotlib, which colour bars take
+    """Draw a map of MTF50; places of which too little is known are hatched."""
+    grid = np.clip(np.array(values, dtype=np.float64).reshape(found.rows, found.cols), 0.0, NYQUIST)
     ax.grid(visible=False)
     extent = (0.0, found.aspect, 0.0, 1.0)
-    image = ax.imshow(grid, cmap=_ERRORS if error else _SHARPNESS, vmin=0.0, vmax=top, extent=extent)
+    image = ax.imshow(grid, cmap=_SHARPNESS, vmin=0.0, vmax=NYQUIST, extent=extent)
     wide, high = found.aspect / found.cols, 1.0 / found.rows
     for i, value in enumerate(values):
         row, col = divmod(i, found.cols)
         left, low = col * wide, 1.0 - (row + 1) * high
-        if found.unknown[i] and not error:
-            hatched: dict[str, Any] = {
-                "facecolor": "#f4f4f2",
-                "edgecolor": "#a8a8a2",
-                "hatch": "////",
-                "lw": 0,
-            }
-            ax.add_patch(Rectangle((left, low), wide, high, **hatched))
-        share = grid[row, col] / top
-        pale = share > 0.6 if error else 0.15 < share < 0.58
-        ink = "#131416" if pale != error or (found.unknown[i] and not error) else "#ffffff"
-        text = _cell(value, factor, error=error)
-        ax.text(left + wide / 2, low + high / 2, text, color=ink, **_IN_CELL)
-    ax.set_xticks([])
-    ax.set_yticks([])
+        if found.unknown[i]:
+            ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
+        pale = found.unknown[i] or 0.15 < grid[row, col] / NYQUIST < 0.58
+        ink = "#131416" if pale else "#ffffff"
+        ax.text(left + wide / 2, low + high / 2, _cell(value, factor), color=ink, **_IN_CELL)
+    ax.set(xticks=[], yticks=[])
     return image
 
 
-def _cell(value: float, factor: float, *, error: bool) -> str:
-    if not math.isfinite(value):
-        return "-"
-    if value >= NYQUIST and not error:
-        return ">" + _number(NYQUIST, factor)
-    return _number(value, factor)
+def _cell(value: float, factor: float) -> str:
+    return (">" if value >= NYQUIST else "") + _number(min(value, NYQUIST), factor)
 
 
 def _number(value: float, factor: float) -> str:
@@ -276,24 +247,15 @@ def _number(value: float, factor: float) -> str:
 
 
 def contrast(ax: Axes, found: ApertureReport) -> None:
-    """Draw contrast over the radius: sagittal solid, tangential dashed, bands of one standard error."""
+    """Draw contrast over the radius: sagittal solid, tangential dashed."""
     for ink, curve in zip(_INKS, found.curves, strict=False):
         _both_ways(ax, found.radii, curve, curve.name, ink)
     _radial(ax, "contrast", 1.0)
 
 
 def _both_ways(ax: Axes, radii: Sequence[float], curve: Curve, name: str, ink: str) -> None:
-    ways = (
-        ("S", "-", curve.sagittal, curve.sagittal_error),
-        ("T", "--", curve.tangential, curve.tangential_error),
-    )
-    for way, style, values, errors in ways:
-        ax.plot(radii, values, color=ink, ls=style, label=f"{name} {way}")
-        if errors:
-            low, high = np.subtract(values, errors), np.add(values, errors)
-            ax.fill_between(
-                radii, np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0), color=ink, alpha=0.12, lw=0
-            )
+    ax.plot(radii, curve.sagittal, color=ink, ls="-", label=f"{name} S")
+    ax.plot(radii, curve.tangential, color=ink, ls="--", label=f"{name} T")
 
 
 def colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
@@ -304,13 +266,6 @@ def colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
         both = [(t + s) / 2.0 for t, s in zip(curve.tangential, curve.sagittal, strict=True)]
         ax.plot(found.radii, both, color=ink, label=f"{name}, {curve.name}")
     _radial(ax, "contrast", 1.0)
-
-
-def widths(ax: Axes, found: ApertureReport) -> None:
-    """Draw how wide a point is along the radius and around the centre: where they part is astigmatism."""
-    ax.plot(found.radii, found.along_u, color=_INKS[0], ls="--", label="along the radius")
-    ax.plot(found.radii, found.along_v, color=_INKS[0], label="around the centre")
-    _radial(ax, "pixels, root mean square", max(_LEAST_WIDTH_PX, 1.1 * max(*found.along_u, *found.along_v)))
 
 
 def side_softer(ax: Axes, found: ApertureReport) -> None:
@@ -366,21 +321,19 @@ def both_contrasts(ax: Axes, comparison: Comparison, which: int) -> None:
 
 
 def difference(ax: Axes, comparison: Comparison) -> None:
-    """Draw MTF50 of the second less that of the first; places within two standard errors are grey."""
+    """Draw MTF50 of the second less that of the first."""
     one, two = comparison.first.found, comparison.second.found
     values = np.array(two.mean) - np.array(one.mean)
-    spread = [np.add(f.tangential_error, f.sagittal_error) / 2.0 for f in (one, two) if f.tangential_error]
-    error = np.hypot(*spread) if len(spread) == len((one, two)) else np.zeros(len(values))
     top = max(0.02, float(np.abs(values).max()))
     ax.grid(visible=False)
-    shown = np.where(np.abs(values) > SURE * error, values, 0.0).reshape(one.rows, one.cols)
+    shown = values.reshape(one.rows, one.cols)
     ax.imshow(shown, cmap=_CHANGES, vmin=-top, vmax=top, extent=(0.0, one.aspect, 0.0, 1.0))
     for i, value in enumerate(values):
         row, col = divmod(i, one.cols)
-        text = f"{value:+.2f}" if abs(value) > SURE * error[i] else "·"
-        ax.text((col + 0.5) * one.aspect / one.cols, 1.0 - (row + 0.5) / one.rows, text, **_IN_CELL)
+        place = (col + 0.5) * one.aspect / one.cols, 1.0 - (row + 0.5) / one.rows
+        ax.text(*place, f"{value:+.2f}", **_IN_CELL)
     ax.set(xticks=[], yticks=[])
-    ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper; a dot: within the error")
+    ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 
 def _legend(ax: Axes) -> None:
@@ -399,77 +352,44 @@ def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
 # --- pages ------------------------------------------------------------------------------------
 
 
-def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Unit | None) -> None:
-    """Tangential and sagittal on one scale: MTF50 in a unit, or its errors where the unit is None."""
-    pairs = [("tangential", found.tangential, found.tangential_error)]
-    pairs += [("sagittal", found.sagittal, found.sagittal_error)]
-    top, factor = NYQUIST, 1.0 if unit is None else sensor.factor(unit) or 1.0
-    if unit is None:  # an error of a figure beyond what the sensor shows is none
-        pairs = [
-            (name, tuple(math.nan if v >= NYQUIST else e for v, e in zip(values, errors, strict=True)), ())
-            for name, values, errors in pairs
-        ]
-        top = max(0.01, float(np.nanmax([*pairs[0][1], *pairs[1][1], 0.0])))
+def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Unit) -> None:
+    """Tangential and sagittal MTF50 on one scale."""
+    factor = sensor.factor(unit) or 1.0
     axes = place.subplots(1, 2)
-    for ax, (name, values, _) in zip(axes, pairs, strict=True):
-        image = sharpness_map(ax, found, values, factor=factor, top=top, error=unit is None)
+    for ax, name, values in zip(
+        axes, ("tangential", "sagittal"), (found.tangential, found.sagittal), strict=True
+    ):
+        image = sharpness_map(ax, found, values, factor=factor)
         ax.set_xlabel(name)
     scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
-    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, top * factor)
-    ticks = [tick / factor for tick in round_ticks if tick <= top * factor]
+    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, NYQUIST * factor)
+    ticks = [tick / factor for tick in round_ticks if tick <= NYQUIST * factor]
     scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
 
 
 def _photographer(report: LensReport) -> Figure:
-    """Verdict, map, corners as pictures, and what would help."""
+    """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
     found = report.tested[0]
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_PAGE)
-        figure.text(0.08, 0.955, report.name, fontsize=17, weight="bold", va="top")
-        figure.text(0.08, 0.92, textwrap.fill(report.verdict, 78), fontsize=11, va="top", linespacing=1.4)
+        figure = _page(report.name, report.verdict)
         big = figure.add_axes((0.08, 0.44, 0.84, 0.38))
         image = sharpness_map(big, found, found.mean)
         words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
         big.set_title(f"{words} (MTF50, cycles/pixel; hatched: not known)")
-        worst = found.worst
-        reach = 0.5 * math.hypot(found.aspect, 1.0) * worst.position.r
-        x, y = (reach * f(worst.position.phi) for f in (math.cos, math.sin))
-        big.add_patch(Circle((found.aspect / 2 + x, 0.5 + y), 0.07, fill=False, edgecolor="#131416", lw=2.0))
         scale = figure.colorbar(
             image, cax=figure.add_axes((0.08, 0.415, 0.84, 0.012)), orientation="horizontal"
         )
-        scale.set_ticks([0.0, 0.25, 0.5], labels=["soft", ".25", "no sensor shows more"])
-        scale.ax.get_xticklabels()[0].set_horizontalalignment("left")
-        scale.ax.get_xticklabels()[-1].set_horizontalalignment("right")
-        star = _star(61)
+        scale.set_ticks([0.02, 0.25, 0.45], labels=["soft", ".25", "no sensor shows more"])
+        figure.text(0.08, 0.365, "What becomes of a point, each to its own brightest pixel", fontsize=10)
         for k, spot in enumerate(found.spots):
             ax = figure.add_axes((0.08 + 0.172 * k, 0.2, 0.155, 0.13))
-            kernel = np.array(spot.kernel)
-            ax.imshow(_through(star, kernel), cmap="gray", vmin=0.0, vmax=1.0)
-            bold = "bold" if spot is worst else "normal"
-            ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=bold, loc="center")
-            ax.set(xticks=[], yticks=[])
+            ax.imshow(np.array(spot.kernel), cmap="gray", vmin=0.0)
+            weight = "bold" if spot is found.worst else "normal"
+            ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=weight, loc="center")
+            ax.set(xticks=[], yticks=[], xlabel=spot.words)
             ax.grid(visible=False)
-            ax.set_xlabel(
-                f"T {_cell(spot.tangential, 1.0, error=False)}  S {_cell(spot.sagittal, 1.0, error=False)}"
-            )
-        figure.text(0.08, 0.365, "A star of fine lines as the lens draws it", fontsize=10)
+        figure.text(0.08, 0.165, textwrap.fill(report.advice, 95), fontsize=10, va="top")
         lines = [report.facts, *(f"{k}: {v}" for k, v in report.details.items())]
-        figure.text(0.08, 0.165, textwrap.fill(report.advice.text, 95), fontsize=10, va="top")
         wrapped = "\n".join(textwrap.fill(line, 120) for line in lines)
         figure.text(0.08, 0.115, wrapped, fontsize=8, color="#55585d", va="top")
     return figure
-
-
-def _star(side: int) -> NDArray[np.float64]:
-    """A Siemens star of 16 pairs, drawn at four times the resolution."""
-    t = (np.arange(4 * side) + 0.5) / 4 - side / 2
-    angle = np.arctan2(t[:, None], t[None, :])
-    fine = (np.cos(16 * angle) > 0).astype(np.float64)
-    return fine.reshape(side, 4, side, 4).mean(axis=(1, 3))
-
-
-def _through(star: NDArray[np.float64], kernel: NDArray[np.float64]) -> NDArray[np.float64]:
-    reach = kernel.shape[0] // 2
-    padded = np.pad(star, reach, mode="reflect")
-    return np.asarray(fftconvolve(padded, kernel, mode="valid"))

@@ -20,7 +20,7 @@ from app.store import Store
 from app.store.corrections import Result
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
-from lab.demo.own_service import own_service
+from lab.demo.service import own_service
 from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
 from lensmodel.model import LensModel
@@ -197,7 +197,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
         api.save_report(lens_id, tmp_path / "report.html")
     _, stored = store.samples.of_lens(lens_id)
     model = LensModel.fit([one.sample for one in stored])
-    test = lens_report(model, "A lens", draws=0, rows=5, size=15, channels=("g",))
+    test = lens_report(model, "A lens", rows=5, size=15, channels=("g",))
     lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)

@@ -44,10 +44,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def green_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Test lenses in one colour, at few places, with few draws: that takes a fifth of the time."""
+    """Test lenses in one colour, at few places: that takes a fifth of the time."""
 
     def quick(*given: Any, **options: Any) -> LensReport:
-        return lens_report(*given, **options | {"channels": ("g",), "rows": 3, "draws": 2})
+        return lens_report(*given, **options | {"channels": ("g",), "rows": 3})
 
     monkeypatch.setattr("lensmodel.cli.report.lens_report", quick)
 
@@ -76,7 +76,7 @@ def test_the_report_as_json_reads_back(folder: Path) -> None:
 
     report = from_json(LensReport, stored)
     assert report.tested[0].settings.aperture == 5.6
-    assert report.advice.suggestions
+    assert report.advice
 
 
 def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, green_alone: None) -> None:
@@ -146,7 +146,7 @@ def test_a_comparison_needs_a_folder(folder: Path) -> None:
 
 
 def test_unknown_formats_and_channels_are_refused_and_nothing_is_written(folder: Path) -> None:
-    with pytest.raises(UsageError, match="csv, fits, json"):
+    with pytest.raises(UsageError, match=r"\.csv, \.fits, \.json"):
         run("export", NAME, "--format", "bmp", "-o", "psf.bmp")
     with pytest.raises(UsageError, match="r, g or b"):
         run("export", NAME, "--channel", "x", "-o", "psf.npz")

@@ -172,7 +172,7 @@ def reported(client: TestClient, steps: Steps, store: Store, settings: Settings)
     lens_id: str = steps.lens_id(steps.counted(patches=6))
     _, stored = store.samples.of_lens(lens_id)
     test = lens_report(
-        LensModel.fit([one.sample for one in stored]), "A lens", draws=0, rows=5, size=15, channels=("g",)
+        LensModel.fit([one.sample for one in stored]), "A lens", rows=5, size=15, channels=("g",)
     )
     lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None

@@ -10,6 +10,6 @@ from functools import partial
 from app.jobs import tasks
 from lensmodel.report import lens_report
 
-tasks.lens_report = partial(lens_report, draws=2, rows=5, size=15)  # instead of 16, 7 and 31
+tasks.lens_report = partial(lens_report, rows=5, size=15)  # instead of 7 and 31
 
 TASKS = tasks.TASKS

@@ -30,7 +30,7 @@ from app.routes import (
 )
 from app.routes.common import problems
 from app.runtime.outage import missable
-from app.runtime.settings import MIB, Settings
+from app.runtime.settings import Settings
 from app.store import Store
 
 
@@ -48,7 +48,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
             storage.settle(store.photos.newest_file)
-        cache = ModelCache(store, chosen.model_cache_mb * MIB)
+        cache = ModelCache(store)
         app.state.services = Services(
             chosen,
             store,

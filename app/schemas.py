@@ -152,7 +152,7 @@ class UploadFields(Question):
     )
     selector: OptionalName = Field(
         default=None,
-        description="who chooses its patches, one of GET /v1/formats; else whom the service has",
+        description="who chooses its patches, one of GET /v1/formats; r-map by default",
     )
     lens_id: OptionalId = None
     lens_serial: OptionalName = None

@@ -11,16 +11,11 @@ from lensmodel.workflow.sampling import KERNEL_PATCHES, PRESETS, Preset
 def configured_way(settings: Settings, name: str) -> Preset:
     """Return estimator, kernel size, patches, model mode and correction method of a model.
 
-    The settings of the service choose estimator and kernel size of the model `default`, and the patches of
-    both.
+    The settings of the service choose the estimator of the model `default`, and the patches of both.
     """
     way = PRESETS[name]
     if name == "default":
         own = settings.estimator != way.estimator
-        way = replace(
-            way,
-            estimator=settings.estimator,
-            kernel_size=settings.kernel_size,
-            patches=KERNEL_PATCHES if own else way.patches,
-        )
+        patches = KERNEL_PATCHES if own else way.patches
+        way = replace(way, estimator=settings.estimator, patches=patches)
     return replace(way, patches=settings.patches or way.patches)

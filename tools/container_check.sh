@@ -132,7 +132,7 @@ import json, sys
 sys.stdout.write("".join(part + "\0" for part in json.load(sys.stdin)["OCIv1"]["config"]["Entrypoint"]))')
 port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
 # A cheap estimator and few patches: this is about the container.
-environment+=("LENS_PORT=$port" LENS_SANDBOX=try LENS_PATCHES=4 LENS_KERNEL_SIZE=15)
+environment+=("LENS_PORT=$port" LENS_SANDBOX=try LENS_PATCHES=4)
 inside=(setpriv --reuid=10001 --regid=10001 --clear-groups --no-new-privs --bounding-set=-all --inh-caps=-all)
 # As compose.yaml has its worker begin.
 as_root=(setpriv --reuid=0 --regid=0 --clear-groups --no-new-privs --bounding-set=-all,+setuid,+setgid,+kill --inh-caps=-all)

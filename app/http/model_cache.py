@@ -11,7 +11,7 @@ import logging
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
@@ -24,6 +24,9 @@ from lensmodel.model import LensModel, ModelSettings
 from lensmodel.workflow.sampling import PRESETS
 
 log = logging.getLogger(__name__)
+
+MAX_BYTES: Final = 1 << 30
+"""Memory of the models of one process (chosen): some hundred lenses of a hundred photos."""
 
 _Key: TypeAlias = tuple[str, int | None]
 
@@ -49,11 +52,11 @@ class ModelCache:
     ----------
     store : Store
         Where the samples are.
-    max_bytes : int
+    max_bytes : int, optional
         Estimated size at most; the model in use is kept in any case.
     """
 
-    def __init__(self, store: Store, max_bytes: int) -> None:
+    def __init__(self, store: Store, max_bytes: int = MAX_BYTES) -> None:
         self._store, self._max_bytes = store, max_bytes
         self._models: OrderedDict[_Key, Fitted] = OrderedDict()
         self._guard = threading.Lock()

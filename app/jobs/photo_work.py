@@ -42,6 +42,10 @@ LOOK_AFTER_S: Final = 5.0
 """Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one."""
 
 
+SELECTOR: Final = "r-map"
+"""Who chooses the patches of a photo that names nobody, of `lensmodel.patches.selectors`."""
+
+
 class PhotoWork:
     """Jobs of photos and of their cells."""
 
@@ -199,7 +203,7 @@ class _Steps:
             "developed": str(developed),
             "count": self._way.patches,
             "estimator": self._way.estimator,
-            "selector": photo.given.get("selector") or self._context.settings.selector,
+            "selector": photo.given.get("selector") or SELECTOR,
         }
         with self._context.sandbox.folder() as folder:
             try:

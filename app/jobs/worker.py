@@ -50,6 +50,9 @@ TIDY_S: Final = 60.0  # of deletion: nobody waits for it
 KEEP_JOBS: Final = timedelta(days=2)
 """How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into."""
 
+OUTAGE_S: Final = 12 * 3600.0
+"""How long a job waits for a database, a storage or a disk before it fails (chosen): a night."""
+
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"
 
@@ -216,7 +219,7 @@ class Worker:
                 work(record, *arguments)
 
         def work(record: JobRecord, *arguments: str | int) -> None:
-            patience = Patience(self._settings.outage_hours * 3600.0)
+            patience = Patience(OUTAGE_S)
             while True:
                 try:
                     handler(*arguments)

@@ -22,6 +22,7 @@ from app.http import views
 from app.http.dependencies import Call, CallDep
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
+from app.routes import photos as photo_routes
 from app.routes.common import Cursor, Limit, OnlyId, find_lens, matches_tag, next_link, problems
 from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
 from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
@@ -88,9 +89,9 @@ def _admit(call: Call) -> None:
     most_bytes, _ = most(call.settings, call.store.accounts.quota_of(call.owner))
     check_stored(call.store.photos.load_of(call.owner)[1], most_bytes)
     unfinished = call.store.corrections.unfinished_of(call.owner)
-    if unfinished >= call.settings.max_queued_photos:
+    if unfinished >= photo_routes.MAX_UNFINISHED:
         raise QuotaError(
-            f"{unfinished} corrections are unfinished, {call.settings.max_queued_photos} may be: wait",
+            f"{unfinished} corrections are unfinished, {photo_routes.MAX_UNFINISHED} may be: wait",
             headers={"Retry-After": "30"},
         )
 

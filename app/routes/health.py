@@ -14,7 +14,7 @@ from fastapi import APIRouter, Response, status
 from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.jobs import LONG_POLL_S
-from app.routes.photos import GIB
+from app.routes.photos import GIB, MAX_UNFINISHED
 from app.routes.psf import MEDIA_TYPES
 from app.runtime import metrics
 from app.sandbox import confine
@@ -159,7 +159,7 @@ def read_limits(call: CallDep) -> LimitsOut:
     return LimitsOut(
         max_upload_bytes=settings.max_upload_bytes,
         max_megapixels=settings.max_megapixels,
-        max_queued_photos=settings.max_queued_photos,
+        max_queued_photos=MAX_UNFINISHED,
         max_stored_bytes=int(settings.max_stored_gb * GIB),
         max_psf_size=MAX_PSF_SIZE,
         long_poll_seconds=LONG_POLL_S,

@@ -47,6 +47,9 @@ MAX_UPLOADS: Final = 8
 MAX_PHOTOS: Final = 100_000
 """Photos of one owner, unless his keys say another number (chosen): all that one photographer has."""
 
+MAX_UNFINISHED: Final = 500
+"""Photos, and corrections, of one owner that wait or are worked on (chosen): a day's work of one machine."""
+
 SEND_AGAIN = "send the same file again, and ask then (LENS_KEEP_PHOTOS says how long files stay)"
 
 _FIELDS: Final = {
@@ -202,10 +205,9 @@ def _admit(call: Call) -> None:
     unfinished, stored, kept = call.store.photos.load_of(call.owner)
     quota = call.store.accounts.quota_of(call.owner)
     most_bytes, most_photos = most(limits, quota)
-    if unfinished >= limits.max_queued_photos:
+    if unfinished >= MAX_UNFINISHED:
         raise QuotaError(
-            f"{unfinished} photos are being worked on, {limits.max_queued_photos} may be: "
-            "wait for some to finish",
+            f"{unfinished} photos are being worked on, {MAX_UNFINISHED} may be: wait for some to finish",
             headers={"Retry-After": "30"},
         )
     check_stored(stored, most_bytes)

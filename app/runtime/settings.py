@@ -39,12 +39,12 @@ class Settings(BaseSettings):
         default="", description="SQLAlchemy address; empty = sqlite file in the data folder."
     )
     storage_url: str = Field(
-        default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
+        default="",
+        description="file:// or s3:// address of the blobs, for all machines; empty = in the data folder.",
     )
     storage_seconds: float = Field(
         default=20.0, gt=0, description="Longest that one request to an object store may take."
     )
-    shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
@@ -55,9 +55,6 @@ class Settings(BaseSettings):
             "keys where others can reach it, or once there is a key."
         ),
     )
-    requests_per_minute: int = Field(
-        default=6000, ge=0, description="Requests of one owner with keys in one API process; 0 = any number."
-    )
 
     allowed_hosts: str = Field(
         default="",
@@ -66,9 +63,6 @@ class Settings(BaseSettings):
 
     max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
     max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
-    max_queued_photos: int = Field(
-        default=500, ge=1, description="Unfinished photos of one owner; more are refused."
-    )
     max_stored_gb: float = Field(
         default=200.0, gt=0, description="Bytes of photos and results of one owner, in GiB."
     )
@@ -115,11 +109,6 @@ class Settings(BaseSettings):
     lease_seconds: float = Field(
         default=20.0, gt=0, description="A worker silent for so long is taken for dead."
     )
-    outage_hours: float = Field(
-        default=12.0,
-        ge=0,
-        description="How long a job waits for a database, a storage or a disk before it fails.",
-    )
 
     task_seconds: float = Field(
         default=3600.0,
@@ -133,21 +122,11 @@ class Settings(BaseSettings):
         le=1000,
         description="Patches that are used of one photo; 0: as the model of its lens.",
     )
-    kernel_size: int = Field(
-        default=55, ge=3, le=55, description="Largest side of the estimated kernels in pixels, odd."
-    )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
-    selector: str = Field(
-        default="r-map",
-        description="Who chooses patches: r-map, good-regions, or another of the registry of selectors.",
-    )
     assume_single_copy: bool = Field(
         default=False, description="Photos without a serial belong to the one lens of that model."
     )
 
-    model_cache_mb: int = Field(
-        default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
-    )
     metrics_address: str = Field(
         default="",
         description="Where a worker has /metrics of its own, as 127.0.0.1:9000; empty: nowhere.",
@@ -171,12 +150,6 @@ class Settings(BaseSettings):
         return values
 
     @model_validator(mode="after")
-    def _odd_kernel(self) -> Settings:
-        if self.kernel_size % 2 == 0:
-            raise ValueError(f"kernel_size must be odd, got {self.kernel_size}")
-        return self
-
-    @model_validator(mode="after")
     def _known_estimator(self) -> Settings:
         if self.estimator != "default":
             # not at the top: heavy, and most processes never ask for another one
@@ -194,23 +167,11 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _known_selector(self) -> Settings:
-        if self.selector != "r-map":
-            from lensmodel.patches import selectors  # noqa: PLC0415 - as above
-
-            try:
-                selectors.create(self.selector)
-            except UnknownMethodError as error:
-                raise ValueError(str(error)) from error
-        return self
-
-    @model_validator(mode="after")
     def _one_machine_or_many(self) -> Settings:
-        many = not self.database.startswith("sqlite")
-        if many and self.storage.startswith("file://") and not self.shared_filesystem:
+        if not self.database.startswith("sqlite") and not self.storage_url:
             raise ValueError(
-                "a database server means several machines, but storage_url is a folder of one: "
-                "use s3://..., or set LENS_SHARED_FILESYSTEM=true where all machines see that folder"
+                "a database server means several machines, which cannot see the data folder of this one: set "
+                "LENS_STORAGE_URL to s3://..., or to file://... of a folder that all of them see"
             )
         return self
 

@@ -139,7 +139,7 @@ def usual_settings() -> Settings:
     """Read and check the environment once: for each test anew it takes as long as a small test."""
     return Settings(
         database_url=SERVER,
-        shared_filesystem=True,
+        storage_url="file:///the-folder-of-each-test" if SERVER else "",
         min_free_mb=0,
         task_user="none",  # trying others out takes a process for each folder
         task_niceness=0,  # tests wait for photos too: beside other programs they would starve
@@ -151,7 +151,8 @@ def usual_settings() -> Settings:
 @pytest.fixture
 def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
     data = tmp_path / "data"
-    return usual_settings.model_copy(update={"data_dir": data})
+    own = {"storage_url": f"file://{data / 'blobs'}"} if SERVER else {}
+    return usual_settings.model_copy(update={"data_dir": data, **own})
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -34,7 +34,6 @@ PATIENCE_S = 120.0
 SETTINGS = {
     "LENS_ESTIMATOR": "default",
     "LENS_PATCHES": "3",
-    "LENS_KERNEL_SIZE": "15",
     "LENS_WORKER_SLOTS": "2",
     "LENS_MIN_FREE_MB": "0",
     "LENS_SANDBOX": "try",  # whatever this machine has

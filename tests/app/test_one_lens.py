@@ -24,7 +24,7 @@ def asked(model: LensModel) -> np.ndarray:
 @pytest.mark.parametrize("blank", [0, pytest.param(60, marks=pytest.mark.slow)])
 def test_page_and_terminal_learn_one_lens_from_one_file(blank: int, tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "first.dng", 0, blank=blank)
-    defaults = {"LENS_PATCHES": "0", "LENS_KERNEL_SIZE": "55"}
+    defaults = {"LENS_PATCHES": "0"}
     with running(tmp_path / "data", **defaults) as service:
         counted = service.calibrated(photo)
         content = service.http.get(f"/v1/lenses/{counted['lens_id']}/profile").content

@@ -148,13 +148,13 @@ def test_the_service_works_by_methods_of_a_package(package: Path, tmp_path: Path
     path = os.environ.get("PYTHONPATH", "")
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PYTHONPATH", os.pathsep.join([str(package), path]))
-        service = Service(tmp_path / "data", LENS_ESTIMATOR="careful", LENS_SELECTOR="everywhere")
+        service = Service(tmp_path / "data", LENS_ESTIMATOR="careful")
         service.start()
     try:
         formats = service.get("/v1/formats")
         assert {"careful"} <= set(formats["estimators"])
         assert {"everywhere"} <= set(formats["selectors"])
-        photo = service.upload(write_photo(tmp_path / "a.dng", 1))
+        photo = service.upload(write_photo(tmp_path / "a.dng", 1), selector="everywhere")
         assert service.job(photo["id"])["state"] == "succeeded"
         answer = service.http.post("/v1/corrections", json={"photo_id": photo["id"], "method": "adjoint"})
         assert service.job(answer.json()["id"])["state"] == "succeeded"

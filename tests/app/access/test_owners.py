@@ -350,9 +350,10 @@ def test_a_stream_of_events_ends_with_the_key(
 
 
 def test_more_requests_than_there_may_be_are_told_when_to_come_again(
-    settings: Settings, store: Store
+    settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slow = settings.model_copy(update={"auth": "keys", "requests_per_minute": 12})
+    monkeypatch.setattr(access, "REQUESTS_PER_MINUTE", 12)
+    slow = settings.model_copy(update={"auth": "keys"})
     anna, ben = key_of(store, "anna"), key_of(store, "ben")
     with TestClient(create_app(slow)) as client:
         answers = [client.get("/v1/lenses", headers=anna) for _ in range(3)]
@@ -373,7 +374,6 @@ def test_a_bucket_fills_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert taken == [0.0] * 10 + [1.0]
     clock[0] += 1.0
     assert (bucket.wait_of("anna"), bucket.wait_of("anna")) == (0.0, 1.0)
-    assert access.Rates(0).wait_of("anna") == 0.0
 
 
 def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: Store) -> None:

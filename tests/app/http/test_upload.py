@@ -246,8 +246,8 @@ def test_a_nonsense_length_is_refused(client: TestClient) -> None:
     assert (answer.status_code, answer.json()["code"]) == (400, "malformed_upload")
 
 
-def test_too_many_unfinished_photos_are_refused(client: TestClient, settings: Settings) -> None:
-    object.__setattr__(settings, "max_queued_photos", 1)
+def test_too_many_unfinished_photos_are_refused(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.routes.photos.MAX_UNFINISHED", 1)
     client.post("/v1/photos", content=TIFF)
 
     answer = client.post("/v1/photos", content=TIFF + b"x")

@@ -32,14 +32,14 @@ TIFF = b"II*\x00" + bytes(9000)
 
 
 def test_photos_that_wait_for_their_owner_keep_no_others_out(
-    settings: Settings, store: Store, steps: Any
+    settings: Settings, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = settings.model_copy(update={"max_queued_photos": 2})
+    monkeypatch.setattr("app.routes.photos.MAX_UNFINISHED", 2)
     for _ in range(5):
         waiting = steps.receive()
         steps.inspect(waiting, serial=None)
         store.photos.set_state(waiting.public_id, ("inspecting",), "needs_lens")
-    with TestClient(create_app(few)) as client:
+    with TestClient(create_app(settings)) as client:
         sent = [client.post("/v1/photos", content=TIFF + bytes([k])).status_code for k in range(3)]
 
     assert sent == [202, 202, 429]

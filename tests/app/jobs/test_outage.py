@@ -136,9 +136,9 @@ def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> N
 
 
 def test_a_job_that_waited_in_vain_ends_as_such(
-    worker: Worker, store: Store, steps: Any, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    worker: Worker, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "_settings", settings.model_copy(update={"outage_hours": 0.0}))
+    monkeypatch.setattr("app.jobs.worker.OUTAGE_S", 0.0)
     photo = steps.receive()
     steps.inspect(photo)
 
@@ -361,7 +361,7 @@ def test_photos_outlast_a_database_that_is_away(tmp_path: Path) -> None:
         settings = Settings(
             data_dir=tmp_path / "data",
             database_url=server.url("app"),
-            shared_filesystem=True,
+            storage_url=f"file://{tmp_path}/blobs",
             worker_slots=2,
             min_free_mb=0,
         )

@@ -11,7 +11,6 @@ from sqlalchemy import update
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
-from app.main import create_app
 from app.routes.corrections import byte_range
 from app.runtime.settings import Settings
 from app.store import Store
@@ -355,11 +354,10 @@ def test_results_count_for_the_quota_and_expire(
 
 
 def test_nobody_has_more_unfinished_corrections_than_unfinished_photos(
-    settings: Settings, store: Store, steps: Steps
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = settings.model_copy(update={"max_queued_photos": 2})
-    with TestClient(create_app(few), raise_server_exceptions=False) as client:
-        photo = steps.counted().public_id
-        answers = [post(client, photo_id=photo, strength=strength) for strength in (1.0, 0.5, 0.25)]
+    monkeypatch.setattr("app.routes.photos.MAX_UNFINISHED", 2)
+    photo = steps.counted().public_id
+    answers = [post(client, photo_id=photo, strength=strength) for strength in (1.0, 0.5, 0.25)]
 
     assert [answer.status_code for answer in answers] == [202, 202, 429]

@@ -21,9 +21,9 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -287,7 +287,8 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         If anything was lost, counted twice, or seen by another owner.
     """
     plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
-    with installation(folder, servers=servers) as given:
+    with contextlib.ExitStack() as stack:
+        given = stack.enter_context(installation(folder, servers=servers))
         settings = given.settings
         settings.data_dir.mkdir(parents=True)
         store, storage = Store(settings), Storage(settings.storage)
@@ -300,10 +301,9 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
             numbers = range(plan.photos - plan.late, plan.photos)
             chances = [random.Random(chance.random()) for _ in numbers]
             each = zip(numbers, chances, strict=True)
-            late = threading.Thread(
-                target=lambda: [send_late(store, storage, *one) for one in each], daemon=True
+            late = stack.enter_context(ThreadPoolExecutor(1)).submit(
+                lambda: [send_late(store, storage, *one) for one in each]
             )
-            late.start()
             for _ in range(plan.workers):
                 crew.hire()
             deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
@@ -327,12 +327,13 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
                         time.sleep(chance.uniform(0.5, 2.5))
                 crew.replace_the_dead()
             end = time.monotonic() + stretched(plan.patience_s)
-            while late.is_alive() or (now := set(states(store))) != {"counted"}:
+            while not late.done() or (now := set(states(store))) != {"counted"}:
                 now = set(states(store))
                 crew.replace_the_dead()
                 assert not now & {"failed", "cancelled", "needs_lens"}, f"{said(store)}\n{faults(crew.log)}"
                 assert time.monotonic() < end, f"{states(store)}\n{crew.log.read_text()[-4000:]}"
                 time.sleep(0.2)
+            late.result()  # what it did not foresee
             check(settings, store, storage, plan)
         finally:
             crew.close()

@@ -3,11 +3,9 @@
 from lensmodel.model.answer import ModelSettings, PsfAnswer
 from lensmodel.model.lens_model import LensModel, ModelField
 from lensmodel.model.profile import Camera, LensProfile, load_profile, save_profile
-from lensmodel.model.validation import Flag
 
 __all__ = [
     "Camera",
-    "Flag",
     "LensModel",
     "LensProfile",
     "ModelField",

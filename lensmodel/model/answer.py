@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -31,12 +31,6 @@ class ModelSettings:
         Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
         eq. (8) of the paper [1]_, and from three photos on the factors on it with the least
         leave-one-photo-out error.
-    rotational : float or None
-        Strength of rotational symmetry: 0 none, 1 all angles count alike. None: by cross-validation.
-    mirror : float or None
-        Weight of each sample's mirror image about the meridional plane, 0..1. None: same.
-    robust : bool
-        Whether photos and samples of the regression that do not fit the others count less.
     excluded : tuple of str
         Photos whose samples do not count; they stay listed.
     mode : {"default", "paper"}
@@ -59,9 +53,6 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    rotational: float | None = None
-    mirror: float | None = None
-    robust: bool = True
     excluded: tuple[str, ...] = ()
     mode: str = DEFAULT
 
@@ -72,22 +63,11 @@ class ModelSettings:
                 raise InvalidInputError(
                     f"bandwidth {name} must be positive, or None for automatic, got {value}"
                 )
-        for name in ("rotational", "mirror"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 <= value <= 1.0:
-                raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
         if self.mode not in MODES:
             raise UnknownMethodError(
                 f"no mode {self.mode!r} of the lens model; choose one of {', '.join(MODES)}"
             )
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
-
-    @property
-    def regression(self) -> ModelSettings:
-        """The choices that hold: the mode "paper" leaves none but those of bandwidths and photos."""
-        if self.mode != PAPER:
-            return self
-        return replace(self, mirror=0.0, robust=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,6 @@ from lensmodel.model import bodies, support
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
-from lensmodel.model.validation import Flag
 
 _LEAST_ERROR: Final = 0.01
 """Relative L2 error below which no part of an answer is believed (chosen: of an answer of several parts one
@@ -255,10 +254,6 @@ class LensModel:
     def bandwidth(self) -> dict[str, float]:
         """Bandwidths of the regression in use, by variable; empty without one."""
         return {} if self._regression is None else self._regression.bandwidth
-
-    def flags(self) -> tuple[Flag, ...]:
-        """Photos and samples of the regression that count less than they claim, with reasons."""
-        return () if self._regression is None else self._regression.validation.flags
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""

@@ -31,8 +31,6 @@ _STEPS = 6
 _ROOM = 1.35
 """Side over that of an answer, for kernels that are scaled down to it: few are scaled by more (chosen)."""
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
-MIRRORED = np.array([1.0, -1.0])
-"""Factor on the scales that turns a map into that of the mirror image about the meridional plane."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +73,6 @@ class LocalKernels:
         angles: NDArray[np.float64],
         widths: NDArray[np.float64],
         size: int,
-        mirror: float = 0.0,
     ) -> NDArray[np.float64]:
         """Means of the neighbours at places of `angles` (q,) and `widths` (q, 2), shape (q, size, size).
 
@@ -88,7 +85,7 @@ class LocalKernels:
         light = np.empty((len(angles), size, size))
         t = np.arange(size, dtype=np.float64) - size // 2
         open_ = np.arange(len(angles))
-        maps, weights, rows, starts = self._seen(answers, angles, widths, mirror)
+        maps, weights, rows, starts = self._seen(answers, angles, widths)
         for _ in range(_STEPS):
             part = _subset(starts, open_)
             kernels = np.zeros((len(open_), size, size))
@@ -111,26 +108,21 @@ class LocalKernels:
 
         count, side = len(rows), 2 * int(np.ceil(self.side // 2 * _ROOM)) + 1
         single = Answers(rows, np.ones(count), np.arange(count + 1))
-        maps, weights, _, starts = self._seen(single, np.zeros(count), np.ones((count, 2)), 0.0)
+        maps, weights, _, starts = self._seen(single, np.zeros(count), np.ones((count, 2)))
         kernels = np.zeros((count, side, side))
         loops.sums(self.splines, self.radii, rows, weights, maps, starts, np.zeros((count, 2)), kernels)
         return kernels
 
     def _seen(
-        self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], mirror: float
+        self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-        """Maps, weights times determinants, rows and starts; mirrored samples follow their originals."""
+        """Maps, weights times determinants, rows and starts."""
         asked = np.repeat(np.arange(len(angles)), answers.counts)
         rows = answers.rows
         scale = self.widths[rows] / widths[asked]
         factor = answers.weights * scale[:, 0] * scale[:, 1]
         own, here = self.angles[rows], angles[asked]
-        if mirror == 0.0:
-            return affine_maps(own, here, scale * self.finer), factor, rows, answers.starts
-        scale = scale * self.finer
-        both = np.stack([affine_maps(own, here, scale), affine_maps(own, here, scale * MIRRORED)], axis=1)
-        shares = np.stack([factor, mirror * factor], axis=1) / (1.0 + mirror)
-        return both.reshape(-1, 2, 2), shares.ravel(), np.repeat(rows, 2), answers.starts * 2
+        return affine_maps(own, here, scale * self.finer), factor, rows, answers.starts
 
 
 def affine_maps(

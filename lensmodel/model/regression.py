@@ -57,7 +57,7 @@ class Regression:
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Regression:
         """Fit widths, bandwidths and robust weights; `NoSamplesError` if no sample has a weight."""
-        settings, normalised = settings.regression, settings.mode != PAPER
+        normalised = settings.mode != PAPER
         base = np.array([s.weight for s in samples])
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples has a weight; include a photo again")
@@ -67,7 +67,7 @@ class Regression:
         widths = WidthField.fit(common, base) if normalised else WidthField()
         local = LocalKernels.of(common, points, widths)
         validation = cross_validate(common, settings, local, points, base)
-        if normalised and any(flag.sample is None for flag in validation.flags):
+        if normalised and validation.spoilt:
             # a spoilt photo has bent the widths too: fit them again without it
             widths = WidthField.fit(common, validation.weights)
             local = local.rescaled(points, widths)
@@ -100,11 +100,11 @@ class Regression:
         """Return the kernels that neighbours make, in pixels of some pitch, shape (q, size, size)."""
         widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
-        own, mirror = self.pitch_um, self.validation.choice.mirror
+        own = self.pitch_um
         if own is None or pitch_um is None or bodies.alike(own, pitch_um):
-            return self.local.kernels(near, angles, widths, size, mirror)
+            return self.local.kernels(near, angles, widths, size)
         inside = min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
-        kernels = self.local.kernels(near, angles, widths, inside, mirror)
+        kernels = self.local.kernels(near, angles, widths, inside)
         return np.stack([bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
     def error(self, near: Answers, found: support.Support) -> float:

@@ -14,20 +14,19 @@ median of their held-out errors d_i, then samples::
 
     q_i <- q_i psi((d_i - median d) / s),   psi(t) = (1 - (t / c)^2)^2 below c = 4.685, else 0
 
-psi is Tukey's biweight; a sample that fits better than the median keeps its weight. Nothing is removed:
-a sample of weight zero stays listed with its reason, and one may exclude or include photos by hand.
+psi is Tukey's biweight; a sample that fits better than the median keeps its weight.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
@@ -38,7 +37,6 @@ MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 (chosen)."""
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
 """The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
-MIRRORS = (0.0, 0.3, 1.0)  # weights of mirror images: none, some, full (chosen)
 _CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
 _CV_PHOTOS = 3
@@ -49,33 +47,19 @@ _SCORED = 800
 """Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
 ONE_FOCAL_LENGTH = 0.25
 """Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
-_ROTATIONAL = 10.0  # chords of the circle: so wide that phi does not count
 _UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
 _FEWEST = 2  # one sample cannot be left out
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
 _ROUNDS = 4  # of reweighting: each costs as much, and later ones change the weights less (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
-_LISTED = 0.5
-"""Weight below which a photo is named: it then counts for less than half of what it claims (chosen)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Flag:
-    """A photo or sample that counts less than it claimed."""
-
-    photo: str  # photo id as in the samples
-    sample: int | None  # row of the sample in the model; None = the whole photo
-    factor: float  # what its weight was multiplied by, 0..1
-    error: float  # its relative L2 against the model of the other photos (median, for a photo)
-    reason: str  # in plain words
+_SPOILT = 0.5  # factor below which a photo is spoilt: it counts for less than half of its claim (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
     """Samples prepared for cross-validation."""
 
-    gram: NDArray[np.float64]  # (n, n), products <C_i, C_j> and <C_i, M C_j>, M the reflection v -> -v
-    mirrored: NDArray[np.float64]
+    gram: NDArray[np.float64]  # (n, n), products <C_i, C_j>
     place: NDArray[np.float64]  # (n, n), squared distances in r, in phi and in the settings, in bandwidths
     turn: NDArray[np.float64]
     others: NDArray[np.float64]
@@ -86,7 +70,6 @@ class HeldOut:
     def of(
         cls,
         rows: NDArray[np.floating],
-        side: int,
         where: NDArray[np.float64],
         scale: NDArray[np.float64],
         claims: NDArray[np.float64],
@@ -94,11 +77,9 @@ class HeldOut:
     ) -> HeldOut:
         """Prepare kernels given as flat rows of a square grid, at points `where` (n, 7)."""
         rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
-        flipped = rows.reshape(-1, side, side)[:, ::-1].reshape(len(rows), -1)
         gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
         return cls(
             gram=rows @ rows.T,
-            mirrored=rows @ flipped.T,
             place=gap[..., 0],
             turn=gap[..., 1] + gap[..., 2],
             others=gap[..., 3:].sum(axis=-1),
@@ -106,9 +87,9 @@ class HeldOut:
             groups=groups,
         )
 
-    def errors(self, r: float = 1.0, phi: float = 1.0, mirror: float = 0.0) -> NDArray[np.float64]:
+    def errors(self, r: float = 1.0, phi: float = 1.0) -> NDArray[np.float64]:
         """Relative L2 of each sample against the model of the other groups."""
-        return self.errors_of(self.weights(r, phi), mirror)
+        return self.errors_of(self.weights(r, phi))
 
     def weights(self, r: float = 1.0, phi: float = 1.0) -> NDArray[np.float64]:
         """Held-out Nadaraya-Watson weights, rows of sum 1."""
@@ -119,14 +100,11 @@ class HeldOut:
         total = weight.sum(axis=1, keepdims=True)
         return np.asarray(weight / np.where(total > 0, total, 1.0))
 
-    def errors_of(self, weight: NDArray[np.float64], mirror: float = 0.0) -> NDArray[np.float64]:
+    def errors_of(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Relative L2 of each sample against its weighted mean of others."""
         own = np.diag(self.gram)
-        direct, across = weight @ self.gram, weight @ self.mirrored
-        whole = 1.0 + mirror
-        linear = np.diag(direct + mirror * across) / whole
-        square = ((1 + mirror**2) * direct + 2 * mirror * across) / whole**2
-        squared = own - 2 * linear + np.einsum("ij,ij->i", square, weight)
+        mean = weight @ self.gram
+        squared = own - 2 * np.diag(mean) + np.einsum("ij,ij->i", mean, weight)
         relative = np.sqrt(np.maximum(squared, 0.0) / np.maximum(own, 1e-30))
         return np.where(weight.sum(axis=1) > 0, relative, 1.0)
 
@@ -147,58 +125,52 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What cross-validation chose: factors on the bandwidths, weight of the mirrored samples."""
+    """Factors on the bandwidths in r and phi that cross-validation chose."""
 
     r: float = 1.0
     phi: float = 1.0
-    mirror: float = 0.0
     error: float = 1.0
 
 
-def choose_factors(held: HeldOut, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
+def choose_factors(held: HeldOut, *, r: bool = True, phi: bool = True) -> Choice:
     """Search the factors, each only where it is free, for the least held-out error."""
 
-    def best(options: tuple[float, ...], make: Callable[[float], Choice]) -> Choice:
+    def best(options: Iterable[Choice]) -> Choice:
         # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
-        tried = [make(option) for option in options]
+        tried = list(options)
         least = min(choice.error for choice in tried)
         return next(choice for choice in tried if choice.error <= least * _AS_GOOD + _NEGLIGIBLE)
 
-    def at(r_: float, phi_: float, mirror_: float) -> Choice:
-        return Choice(r_, phi_, mirror_, held.score(held.errors(r_, phi_, mirror_)))
+    def at(r_: float, phi_: float) -> Choice:
+        return Choice(r_, phi_, held.score(held.errors(r_, phi_)))
 
-    chosen = at(1.0, 1.0, 0.0)
+    chosen = at(1.0, 1.0)
     for _ in range(2):
-        now = chosen
+        before = chosen
         if r:
-            now = best(MULTIPLES, lambda x, c=now: at(x, c.phi, c.mirror))  # type: ignore[misc] # mypy infers no default
+            chosen = best(at(factor, chosen.phi) for factor in MULTIPLES)
         if phi:
-            now = best(PHI_MULTIPLES, lambda x, c=now: at(c.r, x, c.mirror))  # type: ignore[misc] # same
-        if mirror:
-            now = best(MIRRORS, lambda x, c=now: at(c.r, c.phi, x))  # type: ignore[misc] # same
-        if (now.r, now.phi, now.mirror) == (chosen.r, chosen.phi, chosen.mirror):
+            chosen = best(at(chosen.r, factor) for factor in PHI_MULTIPLES)
+        if (chosen.r, chosen.phi) == (before.r, before.phi):
             break
-        chosen = now
     return chosen
 
 
 def robust_factors(
-    held: HeldOut, photos: NDArray[np.intp], *, r: float, phi: float, mirror: float
+    held: HeldOut, photos: NDArray[np.intp], choice: Choice
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Factors on the weights of samples."""
+    """Factors on the weights of samples and of photos, and the held-out errors."""
     count = int(photos.max()) + 1
     by_sample, by_photo = np.ones(photos.size), np.ones(count)
-    errors = held.errors(r, phi, mirror)
-    if count < _MIN_PHOTOS:
-        return by_sample, by_photo, errors
-    plain = held.weights(r, phi)
-    for _ in range(_ROUNDS):
+    plain = held.weights(choice.r, choice.phi)
+    errors = held.errors_of(plain)
+    for _ in range(_ROUNDS if count >= _MIN_PHOTOS else 0):
         weight = plain * (by_sample * by_photo[photos])
         total = weight.sum(axis=1, keepdims=True)
-        errors = held.errors_of(weight / np.where(total > 0, total, 1.0), mirror)
+        errors = held.errors_of(weight / np.where(total > 0, total, 1.0))
         medians = np.array([np.median(errors[photos == p]) for p in range(count)])
         by_photo = _biweight(medians, floor=0.25)
-        trusted = errors[by_photo[photos] > _LISTED]
+        trusted = errors[by_photo[photos] > _SPOILT]
         by_sample = _biweight(errors, reference=trusted if trusted.size else errors, floor=0.35)
     return by_sample, by_photo, errors
 
@@ -214,52 +186,6 @@ def _biweight(
     return np.asarray(np.where(t < 1.0, (1.0 - t * t) ** 2, 0.0))
 
 
-def _flags(
-    samples: Sequence[PsfSample],
-    by_sample: NDArray[np.float64],
-    by_photo: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    names: Sequence[str],
-) -> tuple[Flag, ...]:
-    """List photos, then samples, whose weights were halved or worse."""
-    flagged: list[Flag] = []
-    for p, name in enumerate(names):
-        rows = [i for i, s in enumerate(samples) if s.photo == name]
-        if by_photo[p] < _LISTED:
-            others = [i for i, s in enumerate(samples) if s.photo != name]
-            reason = _reason([samples[i] for i in rows], [samples[i] for i in others])
-            flagged.append(Flag(name, None, float(by_photo[p]), float(np.median(errors[rows])), reason))
-    whole = {flag.photo for flag in flagged}
-    for i, sample in enumerate(samples):
-        if by_sample[i] < _LISTED and sample.photo not in whole:
-            near = sorted(
-                (s for s in samples if s.photo != sample.photo),
-                key=lambda s, r=sample.position.r: abs(s.position.r - r),  # type: ignore[misc] # bound per round
-            )[:12]
-            flagged.append(
-                Flag(sample.photo, i, float(by_sample[i]), float(errors[i]), _reason([sample], near))
-            )
-    return tuple(flagged)
-
-
-def _reason(these: Sequence[PsfSample], others: Sequence[PsfSample]) -> str:
-    """Say how kernels differ from others near them: wider, elongated all one way, sharper, or else."""
-    shapes = [second_moments(s.kernel) for s in these]
-    mean = np.mean(shapes, axis=0)
-    usual = np.mean([second_moments(s.kernel) for s in others], axis=0) if others else mean
-    ratio = math.sqrt(max(float(np.trace(mean)), 1e-6) / max(float(np.trace(usual)), 1e-6))
-    excess = np.linalg.eigvalsh(mean - usual)
-    if ratio > 1.15:
-        if excess[1] > 4.0 * abs(excess[0]):
-            return (
-                f"{ratio:.1f} times as wide as the other photos and stretched one way: camera shake or motion"
-            )
-        return f"{ratio:.1f} times as wide as the other photos: out of focus"
-    if ratio < 0.87:
-        return f"{ratio:.1f} times as wide as the other photos: sharpened, or of another lens"
-    return "as wide as the other photos but of another shape: perhaps another lens"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossValidation:
     """What the samples say of each other."""
@@ -270,17 +196,14 @@ class CrossValidation:
     errors: NDArray[np.float64]
     noise: NDArray[np.float64]
     choice: Choice
-    flags: tuple[Flag, ...] = ()
+    spoilt: bool = False  # whether a photo counts for less than half of what it claims
 
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
     """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
     bandwidths = rule = va.support_widths(rule) if settings.mode == PAPER else dict(rule)
     bandwidths["r"] = settings.r or rule["r"] * choice.r
-    phi = rule["phi"] * choice.phi
-    if settings.rotational is not None:
-        phi = rule["phi"] ** (1.0 - settings.rotational) * _ROTATIONAL**settings.rotational
-    bandwidths["phi"] = settings.phi or phi
+    bandwidths["phi"] = settings.phi or rule["phi"] * choice.phi
     bandwidths["aperture_stops"] = settings.stops or rule["aperture_stops"]
     return bandwidths
 
@@ -321,23 +244,17 @@ def cross_validate(
     def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
         kernels = local.upright(rows)
         scale = va.scales(bandwidth(rule, settings, Choice()))
-        flat = kernels.reshape(len(rows), -1)
-        return HeldOut.of(flat, kernels.shape[1], where[rows], scale, weights[rows], groups[rows])
+        return HeldOut.of(kernels.reshape(len(rows), -1), where[rows], scale, weights[rows], groups[rows])
 
     green = counting[where[counting, 4] == _judging_channel(where[counting, 4])]
-    choice = Choice(mirror=settings.mirror or 0.0)
-    automatic = settings.mode != PAPER and len(np.unique(photo[counting])) >= _CV_PHOTOS
+    choice, paper = Choice(), settings.mode == PAPER
+    automatic = not paper and len(np.unique(photo[counting])) >= _CV_PHOTOS
 
     def chosen(weights: NDArray[np.float64]) -> Choice:
         if not automatic:
             return choice
-        factors = choose_factors(
-            held(_thinned(green, _CV_SAMPLES), weights),
-            r=settings.r is None,
-            phi=settings.phi is None and settings.rotational is None,
-            mirror=settings.mirror is None,
-        )
-        return factors if settings.mirror is None else replace(factors, mirror=settings.mirror)
+        few = held(_thinned(green, _CV_SAMPLES), weights)
+        return choose_factors(few, r=settings.r is None, phi=settings.phi is None)
 
     scored = _thinned(counting, _SCORED)
     weights, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
@@ -348,24 +265,20 @@ def cross_validate(
     prepared = held(scored, base)
     _, own_photo = np.unique(photo[scored], return_inverse=True)
     known = names[np.unique(photo[scored])]
-    by_sample, by_photo, held_out = robust_factors(
-        prepared, own_photo, r=choice.r, phi=choice.phi, mirror=choice.mirror
-    )
-    flags: tuple[Flag, ...] = ()
-    if settings.robust and several:
+    by_sample, by_photo, held_out = robust_factors(prepared, own_photo, choice)
+    spoilt = False
+    if not paper and several:
         own = {str(name): factor for name, factor in zip(known, by_photo, strict=True)}
-        weights = base * np.array([own.get(s.photo, 1.0) for s in samples])
-        weights[scored] *= by_sample
-        flags = _flags([samples[i] for i in scored], by_sample, by_photo, held_out, [str(n) for n in known])
-        flags = tuple(f if f.sample is None else replace(f, sample=int(scored[f.sample])) for f in flags)
-        if not (weights > 0).any():
-            weights, flags = base.copy(), ()
-        if flags:
+        weighed = base * np.array([own.get(s.photo, 1.0) for s in samples])
+        weighed[scored] *= by_sample
+        if (weighed > 0).any():
+            weights, spoilt = weighed, bool((by_photo < _SPOILT).any())
+        if spoilt or bool((by_sample < _SPOILT).any()):
             choice = chosen(weights)
     scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
     errors[scored], noise[scored] = held_out, scatter
-    return CrossValidation(weights, errors, noise, choice, flags)
+    return CrossValidation(weights, errors, noise, choice, spoilt)
 
 
 def _judging_channel(wavelengths: NDArray[np.float64]) -> float:

@@ -105,20 +105,18 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
 
 
 def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
-    """Samples near the settings, without those that the model has flagged."""
-    flagged = {flag.sample for flag in model.flags() if flag.sample is not None}
-    spoilt = {flag.photo for flag in model.flags() if flag.sample is None} | set(model.settings.excluded)
+    """Samples near the settings, none of photos that do not count."""
 
     def near(sample: PsfSample) -> bool:
         own, a, b = sample.settings, sample.settings.stops, settings.stops
-        if own.channel != settings.channel or sample.weight <= 0 or sample.photo in spoilt:
+        if own.channel != settings.channel or sample.weight <= 0 or sample.photo in model.settings.excluded:
             return False
         if a is not None and b is not None and abs(a - b) > _NEAR_STOPS:
             return False
         both = own.focal_mm and settings.focal_mm
         return not both or abs(math.log2(own.focal_mm / settings.focal_mm)) <= 0.25  # type: ignore[operator]
 
-    return [sample for i, sample in enumerate(model.samples) if i not in flagged and near(sample)]
+    return [sample for sample in model.samples if near(sample)]
 
 
 def _constant(h: _Array, value: _Array, weight: _Array) -> _Fit:

@@ -10,7 +10,7 @@ import rawpy
 from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
 from lensmodel.photo.headers.header import Header, check_size
 from lensmodel.photo.headers.opening import opened_header
-from lensmodel.photo.raw import raw_size
+from lensmodel.photo.raw import exposure_of, opened_raw
 from lensmodel.photo.tags.metadata import is_centred, metadata_of
 from lensmodel.photo.values import Limits, PhotoInfo
 
@@ -43,18 +43,23 @@ def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
     """
     path, limits = Path(path), limits or Limits()
     with opened_header(path, limits) as header:
-        return info_of(path, header, limits)
+        if header.kind not in {"raw", "dng"}:
+            return info_of(path, header, limits)
+        with opened_raw(path) as raw:
+            return info_of(path, header, limits, raw)
 
 
 def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None = None) -> PhotoInfo:
     """Put together what a parsed header says, and LibRaw where it has a RAW file open; see `inspect`."""
-    width, height = header.width, header.height
-    if header.kind in {"raw", "dng"}:
+    width, height, metadata = header.width, header.height, metadata_of(header)
+    if raw is not None:
         if (packing := _UNDECODED.get(header.compression)) is not None:
             raise UnsupportedFormatError(
                 f"RAW data packed as {packing} are not read; convert it to a plain DNG or TIFF"
             )
-        width, height = raw_size(path) if raw is None else (raw.sizes.width, raw.sizes.height)
+        width, height = raw.sizes.width, raw.sizes.height
+        if header.camera is not None:
+            metadata = exposure_of(raw, metadata)
         check_size(width, height, path.stat().st_size, limits)
     if header.kind == "jpeg" and header.channels == 4:
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
@@ -62,5 +67,4 @@ def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None 
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
         )
-    metadata = metadata_of(header)
     return PhotoInfo(header.kind, width, height, metadata, centred=is_centred(header, metadata))

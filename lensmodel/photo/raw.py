@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC
 from pathlib import Path
 from typing import Final, Literal
 
@@ -26,7 +27,7 @@ from lensmodel.photo.defects import Suspects
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
-from lensmodel.photo.values import Matrix3, PlaneNoise
+from lensmodel.photo.values import LensIdentity, Matrix3, PhotoMetadata, PlaneNoise
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,9 @@ method, its power at low frequencies is about 3.7 times that of the sensor in re
 """
 
 _FULL: Final = 65535.0  # 16 bits
+
+_ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}
+"""How LibRaw says that a picture is turned -> EXIF orientation."""
 
 _FEW_CODES: Final = 1024
 """Levels of a plane that make rounding the larger part of its noise; sensors count 4096 and more."""
@@ -111,10 +115,21 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
         ) from error
 
 
-def raw_size(path: Path) -> tuple[int, int]:
-    """Width and height that LibRaw develops, in sensor orientation; the header only is read."""
-    with opened_raw(path) as raw:
-        return raw.sizes.width, raw.sizes.height
+def exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
+    """What LibRaw knows of a photo whose header names the camera alone; 0 is its word for unknown."""
+    said = raw.other
+    return replace(
+        camera,
+        lens=LensIdentity(model=raw.lens.model or None),
+        aperture=round(said.aperture, 1) or None,
+        focal_mm=said.focal_length or None,
+        iso=said.iso_speed or None,
+        exposure_s=said.shutter_speed or None,
+        # the camera's clock has no zone; LibRaw takes its seconds for those of this machine
+        taken_at=said.timestamp and said.timestamp.astimezone(UTC).replace(tzinfo=None),
+        orientation=_ORIENTATIONS.get(raw.sizes.flip, 1),
+        artist=said.artist or None,
+    )
 
 
 def develop_raw(

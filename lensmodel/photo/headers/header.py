@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from lensmodel.core.errors import DecompressionBombError, ImageTooLargeError
-from lensmodel.photo.headers.ciff import CiffShot
 from lensmodel.photo.headers.ifd import TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
@@ -35,7 +34,7 @@ class Header:
     compression: int = 1  # TIFF tag 259; 1 is none
     directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
     tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
-    ciff: CiffShot | None = None  # what the heap of a CRW file says, which has no TIFF structure
+    camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
     xmp: bytes | None = None  # XMP packet, and ICC profile: of a PNG also one made of what its chunks declare
     icc: bytes | None = None
     # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in

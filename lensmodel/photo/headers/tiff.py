@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
@@ -13,7 +14,6 @@ from lensmodel.core.errors import (
     TruncatedImageError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.headers.ciff import read_ciff
 from lensmodel.photo.headers.header import MAX_BLOCK_BYTES, Header, check_size
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, Directory, TiffReader
 from lensmodel.photo.headers.jpeg import read_jpeg
@@ -185,13 +185,18 @@ def _check_colours(directory: Directory) -> None:
         )
 
 
+_CIFF_CAMERA: Final = re.compile(rb"Canon\0([ -~]{1,60})\0")
+"""Record 0x080A of a CRW file: maker and model (CIFF 1.0, 1997)."""
+
+
 def read_raw(buffer: Buffer, limits: Limits) -> Header:
     """Find the TIFF structures of RAW files that are not plain TIFF; LibRaw tells their size."""
     head = bytes(buffer[:12])
     if head[4:12] == b"ftypcrx ":
         return Header("raw", tiff=tuple(_canon_boxes(buffer)))
-    if (ciff := read_ciff(buffer)) is not None:
-        return Header("raw", ciff=ciff)
+    if head[6:].startswith(b"HEAPCC"):
+        named = _CIFF_CAMERA.search(buffer)
+        return Header("raw", camera=("Canon", "" if named is None else named[1].decode("ascii")))
     if head.startswith(b"FUJIFILMCCD"):
         return _fujifilm(buffer, limits)
     reader = TiffReader.open(buffer)

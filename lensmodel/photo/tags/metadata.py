@@ -1,6 +1,6 @@
 """What the file says about camera, lens and exposure, from EXIF, maker note and XMP.
 
-CRW files, which are older than all three, say it in a heap of their own (`ciff`).
+CRW files, which are older than all three, name their camera here; LibRaw tells the rest.
 
 The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
 one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Final
 
 from lensmodel.photo.declared import by_tags
-from lensmodel.photo.headers.ciff import CiffShot
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.ifd import Directory, IfdEntry
 from lensmodel.photo.headers.opening import opened_header
@@ -99,8 +98,8 @@ def names_no_lens(model: str) -> bool:
 
 def metadata_of(header: Header) -> PhotoMetadata:
     """Put together what a parsed header holds; see `read_metadata`."""
-    if header.ciff is not None:
-        return _of_ciff(header.ciff)
+    if header.camera is not None:
+        return PhotoMetadata(header.camera[0], header.camera[1] or None)
     exif = _Exif.of(header)
     xmp = read_xmp(header.xmp)
     note = (
@@ -136,24 +135,6 @@ def _rating(said: str | None, tag: float | None) -> int | None:
     """Stars by XMP, where -1 is rejected, else by the tag that Windows writes."""
     stars = tag if (of_xmp := _quotient(said)) is None else of_xmp
     return int(stars) if stars is not None and -1 <= stars <= 5 else None
-
-
-def _of_ciff(shot: CiffShot) -> PhotoMetadata:
-    serial = shot.body_serial
-    return PhotoMetadata(
-        camera_maker=shot.maker,
-        camera_model=shot.model,
-        body_serial=None if serial is None or is_placeholder(serial) else serial,
-        lens=LensIdentity(model=shot.lens_model),
-        aperture=_first_within(*_APERTURES, shot.aperture),
-        focal_mm=_first_within(*_FOCALS_MM, shot.focal_mm),
-        focus_m=shot.focus_m,
-        iso=_first_within(*_SPEEDS, shot.iso),
-        exposure_s=_first_within(*_EXPOSURES_S, shot.exposure_s),
-        taken_at=shot.taken_at,
-        orientation=shot.orientation,
-        pixel_pitch_um=_first_within(*_PITCHES_UM, shot.pitch_um),
-    )
 
 
 def baseline_exposure_of(header: Header) -> float | None:

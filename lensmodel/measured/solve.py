@@ -31,7 +31,7 @@ Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 200
 sharp picture, non-negative least squares); M. Delbracio et al., "The non-parametric sub-pixel local
 point spread function estimation is a well posed problem", IJCV 96, 2012, section 3.
 
-**A kernel that changes within the window** (`solve_varying`), at the phase between pixels that
+**A kernel that changes within the window** (`varying`), at the phase between pixels that
 fits best. It is linear in the place, with u and v from -1 to 1 over rows and columns of the window:
 
     y(p) = sum_t (k(t) + u k_u(t) + v k_v(t)) x(p - t) + c(p) + n(p)
@@ -165,6 +165,7 @@ def solve(
     latent_noise: NDArray[np.floating] | None = None,
     *,
     even: bool = False,
+    varying: bool = False,
 ) -> Solved:
     """Find the kernel that makes the latent picture the observed one.
 
@@ -185,6 +186,9 @@ def solve(
         equations, or noise would be taken for picture and the kernel come out too wide.
     even : bool
         Whether c is the same all over the window, as it has to be where that is hardly wider than the kernel.
+    varying : bool
+        Whether the kernel changes within the window; that in the middle is found then, on the grid between
+        pixels that fits best, so that it needs no centring. Only for a latent picture without noise.
 
     Raises
     ------
@@ -193,38 +197,41 @@ def solve(
     NotEnoughEvidenceError
         If fewer pixels count than the kernel has, or no kernel explains them.
     """
-    require_fit(observed, latent, measured, size)
-    weight = weights_of(measured, variance)
-    a, b, power = _normal_equations(observed, latent, weight, size, even=even)
+    _require_fit(observed, latent, measured, size)
+    weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
+    a, b, power = _normal_equations(observed, latent, weight, size, even=even, varying=varying)
     if latent_noise is not None:
-        a -= stationary(latent_noise, size) * weight.sum()
-    prior = np.diag(1.0 / prior_width(size) ** 2)
-    count = int(measured.sum())
-    misfit = 1.0
-    start = np.zeros(size * size)
+        a -= _stationary(latent_noise, size) * weight.sum()
+    prior = 1.0 / prior_width(size) ** 2
+    count, misfit, moved = int(measured.sum()), 1.0, (0.0, 0.0)
+    k = np.zeros(size * size)
+    eq = _Equations(a, b, power).over(misfit, prior)
     for _ in range(2):  # the second time with the residuals of the first
         if latent_noise is None:
-            k = bounded(a / misfit + prior, b / misfit, start)
+            k = _bounded(eq.a + np.diag(prior), eq.b, k)
         else:  # less its noise a latent picture leaves directions open, and the free minimum's sum with them
-            k = nonnegative_least_squares(a / misfit + prior, b / misfit, start, _STEPS)
-        misfit = max((power - 2.0 * float(b @ k) + float(k @ a @ k)) / count, 1.0)
-        start = k
+            k = nonnegative_least_squares(eq.a + np.diag(prior), eq.b, k, _STEPS)
+        rest = eq.power - 2.0 * float(eq.b @ k) + float(k @ eq.a @ k)
+        misfit = max(misfit * rest / count, 1.0)
+        eq = _Equations(a, b, power).over(misfit, prior)
+    if varying:
+        k, moved = _on_its_grid(eq, prior, k, size)
     light = float(k.sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
     kernel = as_kernel(k.reshape(size, size))
-    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
+    off = centroid(kernel)
     return Solved(
         kernel=kernel,
         light=light,
-        offset=mean_y - float(mean_x @ k),
-        shift=centroid(kernel),
-        error=error_of(a / misfit + prior, k),
+        offset=_weighted_mean(observed, weight) - float(_means_of_latent(latent, weight, size) @ k),
+        shift=(off[0] + moved[0], off[1] + moved[1]),
+        error=_error_of(eq.a + np.diag(prior), k),
         misfit=misfit,
     )
 
 
-def require_fit(
+def _require_fit(
     observed: NDArray[np.floating], latent: NDArray[np.floating], measured: NDArray[np.bool_], size: int
 ) -> None:
     """Refuse shapes that do not fit each other, and too few pixels; see `solve`."""
@@ -239,12 +246,7 @@ def require_fit(
         )
 
 
-def weights_of(measured: NDArray[np.bool_], variance: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return one over the variance of each pixel, 0 where it does not count."""
-    return np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
-
-
-def bounded(
+def _bounded(
     a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Minimise k'Ak/2 - b'k over k >= 0 of the free minimum's sum."""
@@ -255,10 +257,10 @@ def bounded(
     light = float(scipy.linalg.solve(a, b, assume_a="pos").sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    return of_sum(a, b, start, light, largest + lift)
+    return _of_sum(a, b, start, light, largest + lift)
 
 
-def of_sum(
+def _of_sum(
     a: NDArray[np.float64],
     b: NDArray[np.float64],
     start: NDArray[np.float64],
@@ -321,12 +323,12 @@ def _normal_equations(
     return a, b, power
 
 
-def weighted_mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
+def _weighted_mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
     """Return the mean of values that count by their weight."""
     return float((values * weight).sum() / weight.sum())
 
 
-def means_of_latent(
+def _means_of_latent(
     latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
 ) -> NDArray[np.float64]:
     """Return the weighted mean of x(p - u) for each u, in the order of the kernel's values."""
@@ -339,7 +341,7 @@ def means_of_latent(
     return means.ravel() / weight.sum()
 
 
-def stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
+def _stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
     """Return the covariance of all values of a window of `size` pixels, shape (k², k²)."""
     rows, cols = np.divmod(np.arange(size * size), size)
     return np.asarray(
@@ -353,7 +355,7 @@ def prior_width(size: int) -> NDArray[np.float64]:
     return (PEAK / (1.0 + (t[:, None] ** 2 + t[None, :] ** 2) / REACH**2)).ravel()
 
 
-def error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
+def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
     """Return the root of the posterior variance of all values over the norm of the kernel."""
     try:
         inverse = scipy.linalg.inv(precision, check_finite=False)
@@ -381,68 +383,27 @@ _SEARCHED: Final = 100
 """Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
-    """Normal equations of the kernel in the middle: k'Ak/2 - b'k, and y'Wy."""
+    """Normal equations of the kernel, or of k, k_u and k_v: k'Ak/2 - b'k, and y'Wy."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
     power: float
 
-
-def solve_varying(
-    observed: NDArray[np.floating],
-    latent: NDArray[np.floating],
-    measured: NDArray[np.bool_],
-    variance: NDArray[np.floating],
-    size: int,
-) -> Solved:
-    """Find the kernel in the middle of a window; parameters, result and errors are those of `solve`.
-
-    The latent picture has no noise. The kernel needs no centring: it lies on the grid that fits best.
-    """
-    require_fit(observed, latent, measured, size)
-    weight = weights_of(measured, variance)
-    a, b, power = _normal_equations(observed, latent, weight, size, varying=True)
-    prior = 1.0 / prior_width(size) ** 2
-    count, misfit = int(measured.sum()), 1.0
-    values = np.zeros(size * size)
-    for _ in range(2):  # the second time with the residuals of the first
-        eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
-        values = bounded(eq.a + np.diag(prior), eq.b, values)
-        rest = eq.power - 2.0 * float(eq.b @ values) + float(values @ eq.a @ values)
-        misfit = max(misfit * rest / count, 1.0)
-    eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
-    values, moved = _on_its_grid(eq, prior, values, size)
-    light = float(values.sum())
-    if not light > 0.0:
-        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    kernel = as_kernel(values.reshape(size, size))
-    off = centroid(kernel)
-    offset = weighted_mean(observed, weight) - float(means_of_latent(latent, weight, size) @ values)
-    return Solved(
-        kernel=kernel,
-        light=light,
-        offset=offset,
-        shift=(off[0] + moved[0], off[1] + moved[1]),
-        error=error_of(eq.a + np.diag(prior), values),
-        misfit=misfit,
-    )
-
-
-def _without_change(
-    a: NDArray[np.float64], b: NDArray[np.float64], power: float, prior: NDArray[np.float64]
-) -> _Equations:
-    """Eliminate k_u and k_v."""
-    n = len(prior)
-    inner = a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
-    right = np.concatenate([a[n:, :n], b[n:, None]], axis=1)
-    solved = scipy.linalg.solve(inner, right, assume_a="sym", check_finite=False)
-    return _Equations(
-        a[:n, :n] - a[:n, n:] @ solved[:, :n],
-        b[:n] - a[:n, n:] @ solved[:, n],
-        power - float(b[n:] @ solved[:, n]),
-    )
+    def over(self, misfit: float, prior: NDArray[np.float64]) -> _Equations:
+        """Divide by the misfit, and eliminate k_u and k_v where they are there (Schur's complement)."""
+        a, b, power, n = self.a / misfit, self.b / misfit, self.power / misfit, len(prior)
+        if len(b) == n:
+            return _Equations(a, b, power)
+        inner = a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
+        right = np.concatenate([a[n:, :n], b[n:, None]], axis=1)
+        solved = scipy.linalg.solve(inner, right, assume_a="sym", check_finite=False)
+        return _Equations(
+            a[:n, :n] - a[:n, n:] @ solved[:, :n],
+            b[:n] - a[:n, n:] @ solved[:, n],
+            power - float(b[n:] @ solved[:, n]),
+        )
 
 
 def _on_its_grid(
@@ -459,7 +420,7 @@ def _on_its_grid(
     def cost(phase: tuple[float, float], near: NDArray[np.float64]) -> float:
         if phase not in known:
             a, b = _moved(eq, phase, size)
-            k = of_sum(a + np.diag(prior), b, near, light, largest, _SEARCHED)
+            k = _of_sum(a + np.diag(prior), b, near, light, largest, _SEARCHED)
             off = centroid(as_kernel(k.reshape(size, size)))
             misfit = float(k @ a @ k) - 2.0 * float(b @ k) + float(prior @ (k * k))
             known[phase] = misfit + (off[0] ** 2 + off[1] ** 2) / CENTRED_PX**2, k
@@ -560,7 +521,7 @@ def window_psf(
     _, shift = roughly(observed, measured, variance, latent, min(SMALL, size))
     sharp = latent(shift, size // 2)
     if latent_noise is None:
-        solved = solve_varying(observed, sharp, measured, variance, size)
+        solved = solve(observed, sharp, measured, variance, size, varying=True)
         return solved.kernel, solved, shift
     # less its noise a latent picture says too little of how the kernel changes, and of the best grid
     solved = solve(observed, sharp, measured, variance, size, latent_noise)

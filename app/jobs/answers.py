@@ -109,12 +109,11 @@ class Selected(Answer):
 
 
 class ZoneGain(Answer):
-    """What a correction is expected to have done in one zone; `measured`, at the edges of a chart."""
+    """What a correction is expected to have done in one zone."""
 
     cells: Count = 0
     expected_gain_db: float | None = None
     psf_error: float | None = None
-    measured: Annotated[list[dict[Text, Text | float | None]], Field(max_length=20)] = []
     left: Count = 0
     held_back: Share = 0.0
     reasons: Annotated[list[Text], Field(max_length=20)] = []

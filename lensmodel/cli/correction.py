@@ -16,10 +16,10 @@ import lensmodel
 from lensmodel import correction
 from lensmodel.api import FORMATS
 from lensmodel.cli import files
-from lensmodel.cli.console import Display, gain_words, mtf50_words
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
+from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.endings import CORRECTED
@@ -213,7 +213,7 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
     """Return remarks on a corrected photo."""
     if result["nothing_to_correct"]:
         return ["nothing to correct: its pixels stayed as they were"]
-    return [*measured(result["zones"]), *audited(result["audit"]), *colour_remarks(result["chroma_step"])]
+    return [*audited(result["audit"]), *colour_remarks(result["chroma_step"])]
 
 
 def colour_remarks(step: tuple[int, int]) -> list[str]:
@@ -223,18 +223,6 @@ def colour_remarks(step: tuple[int, int]) -> list[str]:
     return [
         f"the JPEG stores one colour for {step[0]} x {step[1]} pixels: "
         "brightness is corrected pixel by pixel, colour no more finely than that"
-    ]
-
-
-def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
-    """Tell in words what the edges of a chart gained; nothing of any other photo."""
-    return [
-        f"{ZONE_WORDS[zone]} of the chart, {edges.direction}: MTF50 from {mtf50_words(edges.mtf50_before)} "
-        f"to {mtf50_words(edges.mtf50_after)} cycles/pixel, {edges.gain:.1f} times "
-        f"(median of {edges.edges} edges), overshoot {edges.overshoot_after:.1f} %; "
-        f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
-        for zone, report in zones.items()
-        for edges in report.measured
     ]
 
 

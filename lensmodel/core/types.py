@@ -228,15 +228,3 @@ class NoiseModel:
             If it is not finite.
         """
         return cls(shot=0.0, read=sigma * sigma)
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeGain:
-    """What a correction did to the edges of one direction in one zone of a photographed chart: medians."""
-
-    direction: Direction
-    edges: int  # how many were measured before and after
-    mtf50_before: float  # cycles/pixel
-    mtf50_after: float
-    gain: float  # MTF50 after over before
-    overshoot_after: float  # how far the edge profile rises above its bright level, in percent of the step

@@ -16,7 +16,7 @@ from scipy import fft
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
-from lensmodel.core.types import ZONES, EdgeGain, Plane, Planes, Zone
+from lensmodel.core.types import ZONES, Plane, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
@@ -88,9 +88,6 @@ class ZoneReport:
         the PSFs are too uncertain.
     psf_error : float
         Mean expected relative error of the PSFs.
-    measured : tuple of EdgeGain
-        Gain at the edges of a chart by direction, if the photo shows one; `pipeline.correct_photo` measures
-        it.
     left : int
         Cells left as they were, because there was nothing to gain.
     held_back : float
@@ -102,7 +99,6 @@ class ZoneReport:
     cells: int
     expected_gain_db: float | None
     psf_error: float
-    measured: tuple[EdgeGain, ...] = ()
     left: int = 0
     held_back: float = 0.0
     reasons: tuple[str, ...] = field(default=())

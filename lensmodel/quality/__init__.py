@@ -2,7 +2,7 @@
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
-from lensmodel.quality.edge_finder import edge_gains, find_edges
+from lensmodel.quality.edge_finder import find_edges
 from lensmodel.quality.images import best_shift, registered_zone_psnr, shifted, to_srgb
 from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
 
@@ -13,7 +13,6 @@ __all__ = [
     "best_shift",
     "by_zone",
     "crossing",
-    "edge_gains",
     "find_edges",
     "measure_edges",
     "mtf50_from_kernel",

@@ -18,7 +18,6 @@ from lensmodel.quality.edge import EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 
-DIRECTIONS: Final[tuple[Direction, ...]] = ("tangential", "sagittal", "oblique")
 _ALONG: Final = math.cos(math.radians(10.0))
 """Edges whose normal lies further from u and v belong to neither (chosen: of points three times as long as
 wide ten degrees take a tenth of the MTF50)."""

@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import ZONES, Direction, EdgeGain, NoiseModel, Zone
-from lensmodel.quality.charts import DIRECTIONS, Box, direction_of
+from lensmodel.core.types import NoiseModel
+from lensmodel.quality.charts import Box
 from lensmodel.quality.edge import EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
@@ -143,41 +142,6 @@ def _edge_on(
             if response is not None:
                 return FoundEdge(box, response, (segment.at(-1.0), segment.at(1.0)))
     return None
-
-
-def edge_gains(
-    before: NDArray[np.floating],
-    after: NDArray[np.floating],
-    frame: Frame | None = None,
-    *,
-    origin: tuple[int, int] = (0, 0),
-    noise: NoiseModel = _SILENT,
-    clip: float = 1.0,
-) -> dict[Zone, tuple[EdgeGain, ...]]:
-    """Sharpness of a chart's edges before and after a correction, by zone and direction.
-
-    The edges are those that `find_edges` finds before the correction; medians, one for each direction with an
-    edge that can be measured both times.
-    """
-    edges = find_edges(before, noise=noise, clip=clip)
-    if not edges:
-        return {}
-    frame = frame or Frame(*before.shape)
-    rows: dict[tuple[Zone, Direction], list[tuple[float, float, float, float]]] = {}
-    for edge in edges:
-        old, new = edge.response, _measured(after, edge.box)
-        if new is None or old.mtf50 <= 0.0:
-            continue
-        place = frame.position(origin[0] + edge.middle[0], origin[1] + edge.middle[1])
-        key = zone_of(place.r), direction_of(old.normal, place)
-        rows.setdefault(key, []).append((old.mtf50, new.mtf50, new.mtf50 / old.mtf50, new.overshoot))
-    gains: dict[Zone, tuple[EdgeGain, ...]] = {}
-    for zone, direction in ((zone, direction) for zone in ZONES for direction in DIRECTIONS):
-        seen = rows.get((zone, direction), [])
-        if seen:
-            medians = (float(value) for value in np.median(seen, axis=0))
-            gains[zone] = (*gains.get(zone, ()), EdgeGain(direction, len(seen), *medians))
-    return gains
 
 
 def _measured(plane: NDArray[np.floating], box: Box) -> EdgeResponse | None:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from lensmodel import correction, quality
+from lensmodel import correction
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError, OutsideSupportError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
@@ -65,7 +65,7 @@ def correct_photo(
     solver = correction.deconvolvers.resolve(wanted)
     if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
-    corrected = correction.correct_planes(
+    return correction.correct_planes(
         planes,
         field,
         developed.frame,
@@ -84,7 +84,6 @@ def correct_photo(
         workers=workers,
         on_step=on_step,
     )
-    return _with_measured_gain(corrected, developed, roi)
 
 
 def _way(
@@ -135,26 +134,6 @@ def _own_samples(
         log.info("the photo adds nothing to what is known of its lens: %s", error)
         return []
     return [one.sample for one in made]
-
-
-def _with_measured_gain(
-    corrected: correction.Corrected, developed: LinearPhoto, roi: tuple[int, int, int, int] | None
-) -> correction.Corrected:
-    """Say what the correction did to the edges of a chart, where the photo shows one."""
-    top, left, height, width = roi or (0, 0, developed.frame.height, developed.frame.width)
-    gains = quality.edge_gains(
-        developed.planes[1, top : top + height, left : left + width],
-        corrected.planes[1],
-        developed.frame,
-        origin=(top, left),
-        noise=developed.noise[1],
-        clip=developed.clip[1],
-    )
-    zones = {
-        zone: dataclasses.replace(report, measured=gains.get(zone, ()))
-        for zone, report in corrected.zones.items()
-    }
-    return dataclasses.replace(corrected, zones=zones)
 
 
 def placed(developed: LinearPhoto, model: LensModel) -> LinearPhoto:

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import gaussian
-from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, NoiseModel
-from lensmodel.correction import correct_planes
-from lensmodel.quality import by_zone, edge_gains, find_edges, measure_edges
+from lensmodel.core.types import LensSettings, NoiseModel
+from lensmodel.quality import by_zone, find_edges, measure_edges
 from lensmodel.simulate import BlurOptions, blurred, demo_scene, draw_lens, edge_chart
 
 FRAME = Frame(900, 1200)
@@ -62,34 +60,8 @@ def test_found_boxes_lie_in_the_frame_and_every_edge_is_found_once() -> None:
     assert apart.min() > 40.0
 
 
-class Gaussian:
-    """A lens with the same kernel everywhere."""
-
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        del position, channel
-        return gaussian(size, np.eye(2) * 1.4**2)
-
-
-@pytest.mark.slow  # in decibels the same is asked in tests/lensmodel/workflow/test_pipeline.py
-def test_correction_with_the_true_psf_gains_in_every_zone() -> None:
-    noise = NoiseModel(1 / 50000, 1e-6)
-    planes = np.stack([noisy(soft(1.4), noise)] * 3)
-
-    corrected = correct_planes(planes, Gaussian(), FRAME, method="fast", noise=[noise] * 3, clip=[1.0] * 3)
-    gains = edge_gains(planes[1], corrected.planes[1], noise=noise)
-
-    known = by_zone(measure_edges(planes[1], BOXES))
-    better = by_zone(measure_edges(corrected.planes[1], BOXES))
-    assert gains.keys() == known.keys()
-    for zone, gain in ((zone, gain) for zone, own in gains.items() for gain in own):
-        assert gain.gain > 2.0
-        assert gain.mtf50_before == pytest.approx(known[zone].mtf50, rel=0.05)
-        assert gain.mtf50_after == pytest.approx(better[zone].mtf50, rel=0.05)
-        assert 0.0 < gain.overshoot_after < better[zone].overshoot + 1.0  # there the largest of the zone
-
-
 @pytest.mark.slow
-def test_edges_behind_a_lens_are_as_sharp_as_those_in_known_boxes_and_gain() -> None:
+def test_edges_behind_a_lens_are_as_sharp_as_those_in_known_boxes() -> None:
     lens, settings = draw_lens(5, "soft-fast"), LensSettings()
     noise = NoiseModel(1 / 50000, 1e-6)
     options = BlurOptions(size=41, step=0.3, lateral=False)
@@ -110,23 +82,6 @@ def test_edges_behind_a_lens_are_as_sharp_as_those_in_known_boxes_and_gain() -> 
                 ratios.append(edge.response.mtf50 / known.response.mtf50)
     assert len(ratios) >= 8
     assert np.abs(np.median(ratios) - 1.0) < 0.05
-
-    corrected = correct_planes(planes, lens.field(settings), FRAME, noise=[noise] * 3, clip=[1.0] * 3)
-    gains = edge_gains(planes[1], corrected.planes[1], noise=noise)
-    assert gains.keys() == {"center", "mid", "corner"}
-    assert min(gain.gain for own in gains.values() for gain in own) > 1.3
-
-
-def test_part_of_a_frame_reports_the_zones_of_the_frame() -> None:
-    photo = soft(1.0)
-    top, left = 0, 700
-    part = photo[top:420, left:]
-
-    gains = edge_gains(part, part, FRAME, origin=(top, left))
-
-    assert "center" not in gains
-    assert "corner" in gains
-    assert all(gain.gain == 1.0 for own in gains.values() for gain in own)
 
 
 @pytest.mark.parametrize("name", ["city", "lake"])
@@ -177,12 +132,3 @@ def test_strange_planes_have_no_edges_and_no_errors(plane: NDArray[np.float64]) 
     plane = plane.astype(np.float32)
 
     assert find_edges(plane) == ()
-    assert edge_gains(plane, plane) == {}
-
-
-def test_edges_that_a_correction_destroyed_are_not_counted() -> None:
-    photo = soft(1.0)[:420, 700:]
-
-    assert edge_gains(photo, photo)
-    assert edge_gains(photo, np.full_like(photo, 0.5)) == {}
-    assert edge_gains(photo, np.full_like(photo, np.nan)) == {}

@@ -59,6 +59,9 @@ class PopulationLens(Protocol):
     def focal_mm(self) -> float:
         """Focal length."""
 
+    def working(self, f_number: float | None = None) -> float:
+        """F-number of the light at the sensor, of an aperture as it is called; None means widest."""
+
     def wavefronts(
         self, xy: NDArray[np.float64], wavelengths_um: NDArray[np.float64], f_number: float | None = None
     ) -> NDArray[np.floating]:
@@ -245,7 +248,7 @@ def kernels_of(
     lens: PopulationLens, xy: NDArray[np.float64], f_number: float | None = None
 ) -> NDArray[np.float32]:
     """Kernels of a lens, shape (place, 3, SIDE, SIDE): red, green, blue; each centred on its own centroid."""
-    used = lens.f_number if f_number is None else f_number
+    used = lens.working(f_number)
     wavelengths = np.array([w for pair in WAVELENGTHS_UM.values() for w in pair])
     coefficients = lens.wavefronts(xy, wavelengths, f_number)
     circles = lens.aperture(xy, f_number)

@@ -20,6 +20,7 @@ from lab.population.photos import KINDS, Camera, Kind, Scenes
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
+from lensmodel.neural.features import FAR_M
 from lensmodel.neural.statistics import to_octant
 
 Family = Literal["wavefront", "third-order", "traced"]
@@ -30,16 +31,18 @@ SHARD: Final = 25
 _KIND_SHARES: Final = (0.64, 0.12, 0.24)
 _PHOTO_COUNTS: Final = ((1, 2, 3, 5), (0.3, 0.2, 0.2, 0.3))
 _PLAIN_PATCHES: Final = 72  # of each photo
+_OPENED: Final = 0.35  # share of traced lenses of training that are opened far beyond their design
 _OFF_CENTRE: Final = 0.08  # share of lenses whose pictures are cut out of a larger one
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Settings of a lens at which kernels are known."""
+    """A lens as it is set for a photo."""
 
+    lens: PopulationLens
     f_number: float
     focal_mm: float
-    zoom: float  # 0..1 between the two fields of a zoom
+    focus_m: float
 
 
 def places(rng: np.random.Generator, cells: int = 4) -> NDArray[np.float64]:
@@ -60,25 +63,40 @@ def places(rng: np.random.Generator, cells: int = 4) -> NDArray[np.float64]:
     return np.array(at)
 
 
-def draw_lens(
-    family: Family, rng: np.random.Generator, *, held_out: bool
-) -> tuple[PopulationLens, list[State]]:
-    """Draw a lens and the states it is photographed at."""
+def draw_states(family: Family, rng: np.random.Generator, *, held_out: bool) -> list[State]:
+    """Draw a lens as it is photographed: wide open and stopped down, at some focal lengths and distances."""
+    apart = rng.spawn(1)[0]
     if family == "traced":
         names = sorted(name for name in PRESCRIPTIONS if (name in HELD_OUT) == held_out)
-        lens: PopulationLens = traced.draw(rng, names)
-        zooms = [0.0]
+        lens = traced.draw(rng, names, opened=not held_out and apart.random() < _OPENED)
+        ways: list[tuple[PopulationLens, float, float]] = [(lens, lens.focal_mm, FAR_M)]
+        ways += [(near, near.focal_mm, near.focus_m) for near in _refocused(lens, apart)]
     else:
-        zoom = family == "wavefront" and rng.random() < 0.12
-        lens = RandomLens(rng, family, zoom=zoom)
-        zooms = [0.0, float(rng.uniform(0.3, 1.0))] if zoom else [0.0]
+        second = family == "wavefront" and rng.random() < 0.12
+        drawn = RandomLens(rng, family, zoom=second)
+        ways = [(drawn, drawn.focal_mm, FAR_M)]
+        if second:
+            state, ratio = float(rng.uniform(0.3, 1.0)), float(np.exp(rng.uniform(np.log(1.2), np.log(4.0))))
+            zooms, focuses = ((1, 0), (0, 1), (1, 1))[int(apart.integers(3))]
+            focal = drawn.focal_mm * ratio ** (state * zooms)
+            focus = min(focal / _magnification(apart) / 1000, FAR_M) if focuses else FAR_M
+            ways.append((drawn.at_state(state), focal, focus))
     stops = [0.0, *rng.uniform(0.4, 3.0, int(rng.choice([0, 1, 2], p=[0.6, 0.28, 0.12])))]
-    ratio = float(np.exp(rng.uniform(np.log(1.2), np.log(4.0))))
-    return lens, [
-        State(lens.f_number * 2 ** (stop / 2), lens.focal_mm * ratio**zoom, zoom)
-        for zoom in zooms
-        for stop in stops
-    ]
+    widest = ways[0][0].f_number
+    pairs = [(way, stop) for i, way in enumerate(ways) for stop in (stops if i < 2 else stops[:1])]
+    return [State(lens, widest * 2 ** (stop / 2), focal, focus) for (lens, focal, focus), stop in pairs]
+
+
+def _refocused(lens: traced.TracedLens, rng: np.random.Generator) -> list[traced.TracedLens]:
+    """The lens focused on one or two nearer things, as far as it forms an image of them; often not at all."""
+    count = int(rng.choice([0, 1, 2], p=[0.5, 0.35, 0.15]))
+    near = [lens.at_focus(min(lens.focal_mm / _magnification(rng) / 1000, FAR_M)) for _ in range(count)]
+    return [one for one in near if traced.forms_image(one)]
+
+
+def _magnification(rng: np.random.Generator) -> float:
+    """Focal length over distance: a landscape's foreground to the nearest that ordinary lenses focus on."""
+    return float(np.exp(rng.uniform(np.log(0.01), np.log(0.15))))
 
 
 def draw_sensor(rng: np.random.Generator) -> tuple[float, float]:
@@ -101,7 +119,7 @@ def make_lens(
     Plain lenses have five RAW photos that nothing spoils.
     """
     rng = np.random.default_rng([number, FAMILIES.index(family), int(held_out)])
-    lens, states = draw_lens(family, rng, held_out=held_out)
+    states = draw_states(family, rng, held_out=held_out)
     if plain:
         states = states[:1]
     xy = places(rng, 4 if held_out else 3)
@@ -109,11 +127,7 @@ def make_lens(
     if rng.random() < _OFF_CENTRE and not plain:
         size = rng.uniform(0.45, 0.95)
         on_lens = size * xy + rng.uniform(-1, 1, 2) * (1 - size) * np.array([0.8, 0.5])
-    kernels = []
-    for state in states:
-        at = lens.at_state(state.zoom, 1.0) if isinstance(lens, RandomLens) and state.zoom else lens
-        kernels.append(kernels_of(at, on_lens, state.f_number))
-    stacked = np.array(kernels)
+    stacked = np.array([kernels_of(state.lens, on_lens, state.f_number) for state in states])
     if not plain:
         stacked = behind_sensor(stacked, *draw_sensor(rng))
     kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
@@ -134,8 +148,8 @@ def make_lens(
         "xy": xy.astype(np.float32),
         "fine": fine_of(stacked).astype(np.float16),
         "coarse": coarse_of(stacked).astype(np.float16),
-        "states": np.array([(s.f_number, s.focal_mm) for s in states], np.float32),
-        "facts": np.array([lens.pitch_um, KINDS.index(kind)], np.float32),
+        "states": np.array([(s.f_number, s.focal_mm, s.focus_m) for s in states], np.float32),
+        "facts": np.array([states[0].lens.pitch_um, KINDS.index(kind)], np.float32),
     }
 
 

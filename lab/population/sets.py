@@ -43,7 +43,7 @@ class Lens:
         settings = np.full((len(states), 5), np.nan)
         settings[:, 0] = np.log(states[:, 0])
         settings[:, 1] = np.log(0.54 * states[:, 0] / pitch)
-        settings[:, 2] = np.log(states[:, 1])
+        settings[:, 2 : 1 + states.shape[1]] = np.log(states[:, 1:])  # focus is not in shards of before
         settings[:, 4] = kind
         octants = octant_of(xy)
         turned = []
@@ -124,8 +124,9 @@ def draw_set(lens: Lens, samples: int, queries: int, rng: np.random.Generator, *
         settings[:, :2] = np.nan
     elif varied and rng.random() < _UNKNOWN:
         settings[:, 1] = np.nan
-    if len(np.unique(settings[:, 2])) == 1 or rng.random() < 0.2:
-        settings[:, 2] = np.nan
+    for column in (2, 3):  # of fixed lenses, and those that write nothing
+        if len(np.unique(settings[:, column])) == 1 or rng.random() < 0.2:
+            settings[:, column] = np.nan
     statistics, truth = lens.statistics[chosen].astype(np.float32), lens.truth[state][asked]
     if varied and rng.random() < 0.5:
         statistics, truth = _swapped(statistics, truth)

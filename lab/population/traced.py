@@ -3,15 +3,17 @@
 A copy is drawn by `draw`. Its wavefront is Hamilton's mixed characteristic over the direction cosines of the
 light at the sensor, so that the PSF is a plain Fourier transform of it at any aperture and angle. With pupil
 coordinates p = -2 N (L - L0) the light of a ray arrives at 2 N dW/dp from the reference point, and the rim of
-the axial beam is |p| = 1. Off the axis the pupil is smaller, seldom round, and cut by rims: four circles
-enclose it. Source: M. Born and E. Wolf, "Principles of Optics", 7th ed., 1999, sec. 4.1.
+the axial beam is |p| = 1. N is the f-number at the sensor: that of the aperture ring at infinity, larger when
+the whole lens is moved forward to focus on what is near, with the aberrations that it has there. Off the axis
+the pupil is smaller, seldom round, and cut by rims: four circles enclose it. Source: M. Born and E. Wolf,
+"Principles of Optics", 7th ed., 1999, sec. 4.1.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Final, NamedTuple
 
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from lab.population.kernels import basis, draw_pitch_um
 from lab.population.prescriptions import PRESCRIPTIONS
-from lab.population.tracing import AIM_UM, Array, Crossing, Nominal, System, aimed
+from lab.population.tracing import AIM_UM, Array, Crossing, Nominal, System, aimed, principal
 from lensmodel.core.errors import InvalidInputError
 
 GREEN_UM: Final = (0.52, 0.555)
@@ -38,6 +40,7 @@ _WORST_PX: Final = 8.0  # r.m.s. spot at 0.9 of the half diagonal that a copy ma
 _EDGE: Final = 0.9
 _WORST_COLOUR_PX: Final = 10.0  # lateral colour between the ends of `_COLOURS_UM`
 _WORST_MISFIT_UM: Final = 0.1  # r.m.s.: beyond it the terms do not hold the traced wavefront
+_SOFT_PX: Final = (1.5, 5.0)  # r.m.s. spots in the center of copies that are opened beyond their design
 _COLOURS_UM: Final = (0.45, 0.54, 0.63)
 _TRIES: Final = 60
 
@@ -111,6 +114,8 @@ class TracedLens:
     corner_light : float
         Open share of the pupil at r = 1 over that in the centre, wide open: the clear apertures of the first
         and the last surface are chosen for it. 1 means as open as the stop lets it be.
+    focus_m : float
+        From the sensor to what is in focus.
     """
 
     design: str
@@ -120,6 +125,7 @@ class TracedLens:
     pitch_um: float
     faults: Faults
     corner_light: float = 1.0
+    focus_m: float = math.inf
 
     @property
     def nominal(self) -> Nominal:
@@ -129,7 +135,7 @@ class TracedLens:
     @cached_property
     def scale(self) -> float:
         """Millimetres of the copy per unit of the design."""
-        angles, heights, _ = self.nominal.principal
+        angles, heights, _, _ = principal(self.nominal)
         angle = math.radians(self.cover * self.nominal.prescription.half_field_deg)
         if angle > angles[-1]:
             raise InvalidInputError(f"{self.design} sees {np.degrees(angles[-1]):.1f} degrees only")
@@ -139,6 +145,19 @@ class TracedLens:
     def focal_mm(self) -> float:
         """Focal length."""
         return self.scale * self.nominal.focal(AIM_UM)
+
+    @property
+    def distance_mm(self) -> float:
+        """From what is in focus to the first vertex."""
+        return 1000.0 * self.focus_m - self.scale * float(self.nominal.prescription.thickness.sum())
+
+    def working(self, f_number: float | None = None) -> float:
+        """F-number of the light at the sensor, of an aperture as it is called; None means widest."""
+        return self.nominal.working(f_number or self.f_number, self.distance_mm / self.scale)
+
+    def at_focus(self, focus_m: float) -> TracedLens:
+        """Return the lens moved forward to focus on what is `focus_m` from the sensor."""
+        return replace(self, focus_m=focus_m)
 
     @cached_property
     def system(self) -> System:
@@ -176,6 +195,8 @@ class TracedLens:
     @cached_property
     def limits_mm(self) -> Array:
         """Clear radii of the first and the last curved surface."""
+        if math.isfinite(self.focus_m):
+            return self.at_focus(math.inf).limits_mm
         axial = self.scale * self.nominal.marginal(self.f_number)[1]
         if self.corner_light >= 1.0:
             return np.full(axial.shape, np.inf)
@@ -202,7 +223,7 @@ class TracedLens:
         spot, along = (_centred(v, open_) for v in (light.place_um, light.slope))
         share = np.array(weights)[:, None] / np.maximum(open_.sum(axis=2), 1)
         best = -(share * (spot * along).sum(axis=(0, 3))).sum() / (share * (along**2).sum(axis=(0, 3))).sum()
-        return float(best + 4.0 * self.f_number * self.pitch_um * self.faults.focus_px) / 1000.0
+        return float(best + 4.0 * self.working() * self.pitch_um * self.faults.focus_px) / 1000.0
 
     def wavefronts(
         self, xy: Array, wavelengths_um: Array, f_number: float | None = None
@@ -255,11 +276,12 @@ class TracedLens:
         self, xy: Array, wavelengths_um: Array, f_number: float | None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
         """Coefficients, lateral shifts, and r.m.s. misfit (um) in the open pupil `(p, w)`."""
-        N = f_number or self.f_number
-        if self.f_number * 0.995 > N:
-            raise InvalidInputError(f"the lens opens to f/{self.f_number:g}, not f/{N:g}")
+        wanted = f_number or self.f_number
+        if self.f_number * 0.995 > wanted:
+            raise InvalidInputError(f"the lens opens to f/{self.f_number:g}, not f/{wanted:g}")
+        N = self.working(wanted)
         waves = np.asarray(wavelengths_um, dtype=np.float64)
-        light = self._light(np.asarray(xy, dtype=np.float64), waves, N, self.focus_mm)
+        light = self._light(np.asarray(xy, dtype=np.float64), waves, wanted, self.focus_mm)
         x, y = light.p
         terms = np.concatenate([np.stack([np.ones_like(x), x, y]), basis(x, y)])  # (t, p, w, r)
         known = np.isfinite(light.path_um)
@@ -284,15 +306,19 @@ class TracedLens:
 
     def _rays(self, xy: Array, waves: Array, f_number: float) -> tuple[Crossing, Array]:
         """Trace overfilled bundles; also the entrance area `(p,)` per area of the stop."""
-        angles, heights, _ = self.nominal.principal
+        distance = self.distance_mm
+        angles, heights, slopes, _ = principal(self.nominal, distance / self.scale)
         r, azimuth = np.hypot(*xy.T), np.arctan2(xy[:, 1], xy[:, 0])
-        image = heights * (self.scale / self.half_diagonal_mm)
+        image = heights + self.nominal.extension(distance / self.scale) * slopes
+        image = image * (self.scale / self.half_diagonal_mm)
         theta = np.interp(np.minimum(r, image[-1]), image, angles)
         directions = np.sin(theta)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
         radius = self.stop_mm(f_number)
-        maps = aimed(self.nominal, self.system, self.scale, directions, theta, azimuth, radius)
+        maps = aimed(self.nominal, self.system, self.scale, directions, theta, azimuth, radius, distance)
         entrance = maps[:, :, :2] @ (_OVERFILL * radius * _sunflower(_RAYS)) + maps[:, :, 2:]
-        return self.system.launch(directions, entrance, waves), np.abs(np.linalg.det(maps[:, :, :2]))
+        return self.system.launch(directions, entrance, waves, distance), np.abs(
+            np.linalg.det(maps[:, :, :2])
+        )
 
     def _light(self, xy: Array, waves: Array, f_number: float, focus_mm: float) -> _Light:
         seen, _ = self._rays(xy, waves, f_number)
@@ -312,8 +338,9 @@ class TracedLens:
         L = seen.cosines[:2]
         x0 = _mean(place[:, :, middle], inside)[:, :, None, None]
         path = seen.path + farther * seen.cosines[2] - (L * (seen.place - x0)).sum(axis=0)
-        centre, circles = _pupil(L[:, :, middle], rims[:, :, :, middle], arrived[:, middle], f_number)
-        p = -2.0 * f_number * (L - centre[:, :, None, None])
+        working = self.working(f_number)
+        centre, circles = _pupil(L[:, :, middle], rims[:, :, :, middle], arrived[:, middle], working)
+        p = -2.0 * working * (L - centre[:, :, None, None])
         return _Light(
             np.where(arrived, p, 0.0),
             np.where(arrived, 1000.0 * path, np.nan),
@@ -325,7 +352,7 @@ class TracedLens:
         )
 
 
-def draw(rng: np.random.Generator, designs: Sequence[str]) -> TracedLens:
+def draw(rng: np.random.Generator, designs: Sequence[str], *, opened: bool = False) -> TracedLens:
     """Draw a copy of one of the designs.
 
     Parameters
@@ -333,40 +360,60 @@ def draw(rng: np.random.Generator, designs: Sequence[str]) -> TracedLens:
     rng : Generator
     designs : sequence of str
         Names to choose from.
+    opened : bool
+        One that opens one to two stops beyond its design, and is soft in the center: such lenses are rare
+        among the others, and hardest to tell.
 
     Returns
     -------
     TracedLens
-        One that light comes through everywhere, whose spots up to 0.9 of the half diagonal are not above
-        eight pixels, and whose wavefronts the Zernike terms hold.
+        One that `forms_image`.
 
     Raises
     ------
     InvalidInputError
         If none is found.
     """
-    corner = np.array([[math.cos(a), math.sin(a)] for a in (0.6, 2.5, -0.6, -2.5)])
-    places = np.concatenate([np.zeros((1, 2)), 0.5 * corner[:2], _EDGE * corner, corner])
-    for _ in range(_TRIES):
-        lens = _candidate(rng, str(rng.choice(list(designs))))
-        try:
-            if lens.spots_px(places)[:-4].max() > _WORST_PX:
-                continue
-            _, shift, misfit = lens._fitted(places, np.array(_COLOURS_UM), None)  # noqa: SLF001 - of this module
-        except InvalidInputError:
-            continue
-        if np.abs(shift).max() <= _WORST_COLOUR_PX * lens.pitch_um and misfit.max() <= _WORST_MISFIT_UM:
+    for _ in range(_TRIES * (1 + opened)):
+        lens = _candidate(rng, str(rng.choice(list(designs))), opened=opened)
+        if (not opened or _is_soft(lens)) and forms_image(lens):
             return lens
     raise InvalidInputError(f"no copy of {', '.join(designs)} forms an image")
 
 
-def _candidate(rng: np.random.Generator, design: str) -> TracedLens:
+def _is_soft(lens: TracedLens) -> bool:
+    try:
+        return bool(_SOFT_PX[0] < lens.spots_px(np.zeros((1, 2)))[0] < _SOFT_PX[1])
+    except InvalidInputError:
+        return False
+
+
+def forms_image(lens: TracedLens) -> bool:
+    """Whether a lens does what a photo and its wavefronts need.
+
+    Light comes through everywhere, spots up to 0.9 of the half diagonal are not above eight pixels, and the
+    Zernike terms hold the wavefronts.
+    """
+    corner = np.array([[math.cos(a), math.sin(a)] for a in (0.6, 2.5, -0.6, -2.5)])
+    places = np.concatenate([np.zeros((1, 2)), 0.5 * corner[:2], _EDGE * corner, corner])
+    try:
+        if lens.spots_px(places)[:-4].max() > _WORST_PX:
+            return False
+        _, shift, misfit = lens._fitted(places, np.array(_COLOURS_UM), None)  # noqa: SLF001 - of this module
+    except InvalidInputError:
+        return False
+    return bool(np.abs(shift).max() <= _WORST_COLOUR_PX * lens.pitch_um and misfit.max() <= _WORST_MISFIT_UM)
+
+
+def _candidate(rng: np.random.Generator, design: str, *, opened: bool) -> TracedLens:
     """A copy that may not work. Tolerances of ordinary series production (chosen)."""
     one = PRESCRIPTIONS[design]
     half_diagonal = float(
         rng.choice([21.6, 14.2, 10.8, 8.0], p=[0.4, 0.3, 0.15, 0.15]) * rng.uniform(0.9, 1.1)
     )
     stops = rng.uniform(0.0, 1.5) if rng.random() < 0.55 else -rng.uniform(0.0, 2.0)
+    if opened:
+        stops = rng.uniform(1.0, 2.0)
     f_number = float(np.clip(one.f_number * 2.0 ** (-stops / 2.0), 0.95, 11.0))
     elements, surfaces = len(one.elements()), one.curvature.size
     focal = half_diagonal / math.tan(math.radians(0.85 * one.half_field_deg))

@@ -7,8 +7,9 @@ ray-tracing procedure", JOSA 52, 1962.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -77,13 +78,13 @@ class System:
     rims: tuple[int, ...]
 
     def trace(self, start: Array, direction: Array, index: Array) -> Crossing:
-        """Trace plane waves.
+        """Trace rays.
 
         Parameters
         ----------
         start : ndarray, shape (3, p, 1, r)
-            Where rays start: a plane across their direction.
-        direction : ndarray, shape (3, p, 1, 1)
+            Where rays start.
+        direction : ndarray, shape (3, p, 1, 1) or (3, p, 1, r)
         index : ndarray, shape (s, w)
             Behind each surface.
         """
@@ -114,7 +115,9 @@ class System:
         path += before[:, None] * t
         return Crossing(X[:2], path, D, stop, np.array([rims[i] for i in self.rims]))
 
-    def launch(self, directions: Array, entrance: Array, wavelengths_um: Array) -> Crossing:
+    def launch(
+        self, directions: Array, entrance: Array, wavelengths_um: Array, distance: float = math.inf
+    ) -> Crossing:
         """Trace from the plane across each direction through the first vertex.
 
         Parameters
@@ -124,11 +127,21 @@ class System:
         entrance : ndarray, shape (p, 2, r)
             Where rays cross that plane.
         wavelengths_um : ndarray, shape (w,)
+        distance : float
+            From the plane of the objects to the first vertex. Objects at a finite one lie where a ray of
+            each direction through the first vertex comes from; paths are counted from there, less that ray's.
         """
         d, across = frames(directions)
         start = np.einsum("pak,par->kpr", across, entrance)[:, :, None, :]
+        light, ahead = d.T[:, :, None, None], np.zeros(())
+        if math.isfinite(distance):
+            away = distance / light[2]
+            rays = start + away * light
+            length = np.sqrt((rays * rays).sum(axis=0))
+            light, ahead = rays / length, length - away
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            return self.trace(start, d.T[:, :, None, None], self.index(wavelengths_um))
+            seen = self.trace(start, light, self.index(wavelengths_um))
+            return seen._replace(path=seen.path + ahead)
 
     def index(self, wavelengths_um: Array) -> Array:
         """Index behind each surface, `(s, w)`."""
@@ -249,18 +262,21 @@ class Nominal:
         """Paraxial focal length."""
         return float(-1.0 / self.paraxial(wavelength_um)[-1, 1, 0])
 
-    @cached_property
-    def axial(self) -> tuple[Array, Array, Array]:
-        """Sines `(h,)`, ascending, and heights at the stop `(h,)` and the rims `(h, k)` of axial rays."""
-        one = self.prescription
-        reach = _WIDEST * 0.5 * abs(self.focal(AIM_UM)) / one.f_number
-        heights = np.linspace(0.0, reach, _HEIGHTS)
-        entrance = np.stack([np.zeros_like(heights), heights])[None]
-        seen = self.system.launch(np.zeros((1, 2)), entrance, np.array([AIM_UM]))
-        sine = np.abs(seen.cosines[1, 0, 0])
-        broken = np.flatnonzero(~np.isfinite(sine[1:]) | (np.diff(sine) <= 0.0))
-        last = int(broken[0]) + 1 if broken.size else sine.size
-        return sine[:last], np.abs(seen.stop[1, 0, 0, :last]), np.abs(seen.rims[:, 1, 0, 0, :last]).T
+    def extension(self, distance: float) -> float:
+        """How far behind the design's image plane objects at a distance are imaged, paraxial.
+
+        Raises
+        ------
+        InvalidInputError
+            If they lie within the focal length.
+        """
+        if not math.isfinite(distance):
+            return 0.0
+        (y, u), (per_y, per_u) = self.paraxial(AIM_UM)[-1].T
+        slope = u + per_u / distance
+        if distance <= 0.0 or slope * u <= 0.0:
+            raise InvalidInputError(f"{self.prescription.name} forms no image of objects at {distance:g}")
+        return float(y / u - (y + per_y / distance) / slope)
 
     def marginal(self, f_number: float) -> tuple[float, Array]:
         """Radius of the stop at an aperture, and heights `(k,)` of the axial rim ray at the rims.
@@ -270,7 +286,7 @@ class Nominal:
         InvalidInputError
             If the design does not open so far.
         """
-        sine, stop, rims = self.axial
+        sine, stop, rims = _axial(self, math.inf)
         wanted = 0.5 / f_number
         if wanted > sine[-1]:
             raise InvalidInputError(
@@ -281,48 +297,97 @@ class Nominal:
             np.array([np.interp(wanted, sine, column) for column in rims.T]),
         )
 
-    @cached_property
-    def principal(self) -> tuple[Array, Array, Array]:
-        """Angles (rad) and image heights `(n,)` along +x, and maps `(n, 2, 3)` from the stop to the entrance.
+    def working(self, f_number: float, distance: float) -> float:
+        """F-number of the light at the sensor with the stop of `f_number`, focused at a distance.
+
+        Half the reciprocal sine of the axial rim ray: larger than at infinity, as the image is farther.
 
         Raises
         ------
         InvalidInputError
-            If no light comes through well inside the published field.
+            If the stop is not filled.
         """
-        one = self.prescription
-        radius, _ = self.marginal(max(one.f_number, 4.0))
-        before = self.paraxial(AIM_UM)[one.stop]
-        maps = [np.array([[1.0 / before[0, 0], 0.0, 0.0], [0.0, 1.0 / before[0, 0], 0.0]])]
-        angles, heights = [0.0], [0.0]
-        for k in range(1, round(_FIELDS * _BEYOND) + 1):
-            angle = np.radians(one.half_field_deg) * k / _FIELDS
-            direction = np.array([[np.sin(angle), 0.0]])
-            found = _aimed(self.system, direction, maps[-1][None], radius, 3)
-            if found is None:
-                break
-            chief = self.system.launch(direction, found[:, :, 2:], np.array([AIM_UM]))
-            height = float(chief.place[0, 0, 0, 0])
-            if not np.isfinite(height) or height <= heights[-1]:
-                break
-            angles.append(float(angle))
-            heights.append(height)
-            maps.append(found[0])
-        if len(angles) < _FIELDS // 2:
-            raise InvalidInputError(
-                f"{one.name}: no light comes through beyond {np.degrees(angles[-1]):.1f} degrees"
-            )
-        return np.array(angles), np.array(heights), np.array(maps)
+        if not math.isfinite(distance):
+            return f_number
+        radius = self.marginal(f_number)[0]
+        sine, stop, _ = _axial(self, distance)
+        if radius > stop[-1]:
+            raise InvalidInputError(f"{self.prescription.name}: the stop of f/{f_number:.2f} is not filled")
+        return 0.5 / float(np.interp(radius, stop, sine))
 
 
-def _aimed(system: System, directions: Array, maps: Array, radius: float, steps: int) -> Array | None:
+class Principal(NamedTuple):
+    """Principal rays of a design, from the axis outwards.
+
+    `angles` (n,) of their objects in radians; `heights` (n,) on the design's image plane and `slopes` (n,)
+    there, along +x; `maps` (n, 2, 3) from the stop to the entrance.
+    """
+
+    angles: Array
+    heights: Array
+    slopes: Array
+    maps: Array
+
+
+@lru_cache(maxsize=512)
+def _axial(nominal: Nominal, distance: float) -> tuple[Array, Array, Array]:
+    """Sines `(h,)`, ascending, and heights at the stop `(h,)` and the rims `(h, k)` of axial rays."""
+    reach = _WIDEST * 0.5 * abs(nominal.focal(AIM_UM)) / nominal.prescription.f_number
+    heights = np.linspace(0.0, reach, _HEIGHTS)
+    entrance = np.stack([np.zeros_like(heights), heights])[None]
+    seen = nominal.system.launch(np.zeros((1, 2)), entrance, np.array([AIM_UM]), distance)
+    sine = np.abs(seen.cosines[1, 0, 0])
+    broken = np.flatnonzero(~np.isfinite(sine[1:]) | (np.diff(sine) <= 0.0))
+    last = int(broken[0]) + 1 if broken.size else sine.size
+    return sine[:last], np.abs(seen.stop[1, 0, 0, :last]), np.abs(seen.rims[:, 1, 0, 0, :last]).T
+
+
+@lru_cache(maxsize=512)
+def principal(nominal: Nominal, distance: float = math.inf) -> Principal:
+    """Follow principal rays of objects at a distance, as far as light comes through.
+
+    Raises
+    ------
+    InvalidInputError
+        If none comes through well inside the published field.
+    """
+    one = nominal.prescription
+    radius, _ = nominal.marginal(max(one.f_number, 4.0))
+    before = nominal.paraxial(AIM_UM)[one.stop]
+    maps = [np.array([[1.0 / before[0, 0], 0.0, 0.0], [0.0, 1.0 / before[0, 0], 0.0]])]
+    angles, heights, slopes = [0.0], [0.0], [0.0]
+    extension = nominal.extension(distance)
+    for k in range(1, round(_FIELDS * _BEYOND) + 1):
+        angle = np.radians(one.half_field_deg) * k / _FIELDS
+        direction = np.array([[np.sin(angle), 0.0]])
+        found = _aimed(nominal.system, direction, maps[-1][None], radius, 3, distance)
+        if found is None:
+            break
+        chief = nominal.system.launch(direction, found[:, :, 2:], np.array([AIM_UM]), distance)
+        height, slope = float(chief.place[0, 0, 0, 0]), float((chief.cosines[0] / chief.cosines[2])[0, 0, 0])
+        if not np.isfinite(height) or height + extension * slope <= heights[-1] + extension * slopes[-1]:
+            break
+        angles.append(float(angle))
+        heights.append(height)
+        slopes.append(slope)
+        maps.append(found[0])
+    if len(angles) < _FIELDS // 2:
+        raise InvalidInputError(
+            f"{one.name}: no light comes through beyond {np.degrees(angles[-1]):.1f} degrees"
+        )
+    return Principal(np.array(angles), np.array(heights), np.array(slopes), np.array(maps))
+
+
+def _aimed(
+    system: System, directions: Array, maps: Array, radius: float, steps: int, distance: float
+) -> Array | None:
     """Refine affine maps `(p, 2, 3)` from the stop to the entrance; None if a field gets hardly any light."""
     turn = np.arange(6) * (np.pi / 3.0)
     ring = np.stack([np.cos(turn), np.sin(turn)])
     targets = radius * np.hstack([np.zeros((2, 1)), 0.5 * ring, 0.9 * ring])
     for _ in range(steps):
         entrance = maps[:, :, :2] @ targets + maps[:, :, 2:]
-        stop = system.launch(directions, entrance, np.array([AIM_UM])).stop[:, :, 0]
+        stop = system.launch(directions, entrance, np.array([AIM_UM]), distance).stop[:, :, 0]
         seen = np.asarray(np.isfinite(stop).all(axis=0))
         if (seen.sum(axis=1) < 6).any():
             return None
@@ -342,6 +407,7 @@ def aimed(
     angles: Array,
     azimuth: Array,
     radius: float,
+    distance: float,
 ) -> Array:
     """Maps `(p, 2, 3)` from the stop to the entrance of a copy, `scale` times as large as its design.
 
@@ -350,14 +416,14 @@ def aimed(
     InvalidInputError
         If hardly any light comes through.
     """
-    known, _, maps = nominal.principal
+    known, _, _, maps = principal(nominal, distance / scale)
     flat = maps.reshape(len(maps), 6)
     start = np.stack([np.interp(angles, known, column) for column in flat.T], axis=1).reshape(-1, 2, 3)
     c, s = np.cos(azimuth), np.sin(azimuth)
     turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     linear = turn @ start[:, :, :2] @ turn.transpose(0, 2, 1)
     offset = scale * turn @ start[:, :, 2:]
-    found = _aimed(system, directions, np.concatenate([linear, offset], axis=2), radius, 1)
+    found = _aimed(system, directions, np.concatenate([linear, offset], axis=2), radius, 1, distance)
     if found is None:
         raise InvalidInputError(f"{nominal.prescription.name}: no light comes through at some place")
     return found

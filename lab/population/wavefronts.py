@@ -172,13 +172,16 @@ class RandomLens:
         green = field.coefficients(_FOCUS_PLACES, np.array([_MIDDLE_UM]), focus)[:, 0]
         return spots(green, self.f_number)[1] / self.pitch_um
 
-    def at_state(self, state: float, focal_ratio: float) -> RandomLens:
-        """Return the lens at another focal length: 0 and 1 are the two fields that were drawn."""
+    def at_state(self, state: float) -> RandomLens:
+        """Return the lens at another focal length or focus: 0 and 1 are the two fields that were drawn."""
         other = object.__new__(RandomLens)
         other.__dict__.update(self.__dict__)
         other.state = state
-        other.focal_mm = self.focal_mm * focal_ratio**state
         return other
+
+    def working(self, f_number: float | None = None) -> float:
+        """F-number of the light at the sensor: the aperture as it is called."""
+        return self.f_number if f_number is None else f_number
 
     def wavefronts(
         self, xy: NDArray[np.float64], wavelengths_um: NDArray[np.float64], f_number: float | None = None

@@ -11,6 +11,7 @@ from lab.population.grids import grid_of
 from lab.population.photos import KINDS, Processing, Scenes, bayer, demosaic
 from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
 from lab.population.traced import draw
+from lensmodel.neural.features import FAR_M, relation_features
 from lensmodel.neural.network import SIDE
 
 
@@ -96,6 +97,30 @@ def test_processing_keeps_a_flat_picture(kind: str) -> None:
     made = processing.develop(np.full((64, 64), 0.25, np.float32), flat)
     assert np.ptp(made) < 0.02
     assert made.mean() == pytest.approx(0.25, abs=0.06)  # a tone curve may move it a little
+
+
+def test_a_traced_lens_is_photographed_at_several_apertures_and_focus_distances() -> None:
+    drawn = [
+        library.draw_states("traced", np.random.default_rng(seed), held_out=False) for seed in (5, 7, 11, 12)
+    ]
+    near = [state for states in drawn for state in states if state.focus_m < FAR_M]
+    assert near
+    for state in near:
+        assert 6.0 < 1000.0 * state.focus_m / state.focal_mm < 101.0
+        assert state.lens.working(state.f_number) > state.f_number
+    assert all(states[0].focus_m == FAR_M for states in drawn)
+
+
+def test_samples_of_another_focus_distance_say_so(folder: Path) -> None:
+    stored = library.make_lens("traced", 3, Scenes(folder / "scenes", held_out=False), held_out=False)
+    assert stored is not None
+    lens = Lens.of(stored)
+    assert len(np.unique(lens.settings[:, 3])) > 1
+    query = lens.settings[np.argmin(lens.settings[:, 3])][None]
+    relation = relation_features(lens.xy[:1], query, lens.xy[:2], lens.settings[[0, 0]])[0]
+    apart = lens.settings[0, 3] - query[0, 3]
+    np.testing.assert_allclose(relation[:, 4], apart**2, rtol=1e-5)
+    np.testing.assert_allclose(relation[:, 17], apart, rtol=1e-5)
 
 
 def test_describe_orders_percentiles(lens: Lens) -> None:

@@ -41,10 +41,12 @@ def design(
     return Prescription("test", "", 1.0, f_number, 5.0, c, d, k, np.zeros((len(c), 1)), glass, stop)
 
 
-def axial_fan(one: Prescription, heights: np.ndarray, wave: float = AIM_UM) -> tuple[np.ndarray, np.ndarray]:
+def axial_fan(
+    one: Prescription, heights: np.ndarray, wave: float = AIM_UM, distance: float = math.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """Where axial rays of these heights cross the image plane, and their slopes."""
     entrance = np.stack([np.zeros_like(heights), heights])[None]
-    seen = Nominal(one).system.launch(np.zeros((1, 2)), entrance, np.array([wave]))
+    seen = Nominal(one).system.launch(np.zeros((1, 2)), entrance, np.array([wave]), distance)
     return seen.place[1, 0, 0], seen.cosines[1, 0, 0] / seen.cosines[2, 0, 0]
 
 
@@ -56,23 +58,48 @@ def planoconvex(*, turned: bool) -> Prescription:
     return design([*rows[:1], rows[1]])
 
 
+@pytest.mark.parametrize("distance", [math.inf, 1000.0, 200.0])
 @pytest.mark.parametrize("turned", [False, True])
-def test_spherical_aberration_of_a_thin_lens_is_that_of_third_order(turned: bool) -> None:
+def test_spherical_aberration_of_a_thin_lens_is_that_of_third_order(turned: bool, distance: float) -> None:
     one = planoconvex(turned=turned)
     n = float(refractive_index(np.array(GLASS), np.array([AIM_UM]))[0])
-    q = -1.0 if turned else 1.0  # shape factor; the object lies at infinity, p = -1
+    q = -1.0 if turned else 1.0  # shape factor
     f, h = 100.0, np.array([2.0, 4.0])
-    p = -1.0
+    p = 2.0 * f / distance - 1.0  # position factor
+    image = 1.0 / (1.0 / f - 1.0 / distance)
     # F. A. Jenkins and H. E. White, "Fundamentals of Optics", 4th ed., 1976, eq. 9m
     longitudinal = (
         h**2
         / (8 * f**3 * n * (n - 1))
         * ((n + 2) / (n - 1) * q**2 + 4 * (n + 1) * p * q + (3 * n + 2) * (n - 1) * p**2 + n**3 / (n - 1))
-        * f**2
+        * image**2
     )
-    y, slope = axial_fan(one, h)
-    crossing = 100.0 - y / slope - 100.0
-    assert crossing == pytest.approx(-longitudinal, rel=0.02)
+    y, slope = axial_fan(one, h, distance=distance)
+    crossing = f - y / slope - image
+    assert crossing == pytest.approx(-longitudinal, rel=0.03)
+    assert Nominal(one).extension(distance) == pytest.approx(image - f, abs=1e-3)
+
+
+def test_a_lens_that_focuses_on_what_is_near_is_slower_and_has_another_corner() -> None:
+    far = copy_of("heliar")
+    near = far.at_focus(10.0 * far.focal_mm / 1000.0)
+    assert far.working() == far.f_number
+    assert near.working() / far.f_number == pytest.approx(1.0 + 1.0 / 9.0, rel=0.05)  # 1 + magnification
+    xy = np.array([[0.001, 0.0], [0.9, 0.0]])
+    sharp, soft = near.spots_px(xy)
+    assert sharp < 1.3 * far.spots_px(xy)[0]  # in focus still
+    assert abs(soft / far.spots_px(xy)[1] - 1.0) > 0.05
+    assert traced.forms_image(near)
+
+
+def test_focus_far_away_is_as_good_as_infinite() -> None:
+    far = copy_of("heliar")
+    xy = np.array([[0.3, 0.1], [0.7, 0.5]])
+    waves = np.array([0.45, 0.63])
+    difference = far.at_focus(1e6).wavefronts(xy, waves) - far.wavefronts(xy, waves)
+    assert np.abs(difference).max() < 2e-3
+    with pytest.raises(InvalidInputError, match="is not filled"):
+        far.at_focus(0.06).wavefronts(xy, waves)
 
 
 def test_a_parabola_that_refracts_without_aberration_is_traced_without_aberration() -> None:

@@ -18,7 +18,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.traced import draw
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork
-from lensmodel.neural.network import WEIGHTS, with_errors_raised, with_provenance
+from lensmodel.neural.network import WEIGHTS, with_errors_raised, with_logits_scaled, with_provenance
 
 
 def _arguments() -> argparse.Namespace:
@@ -107,7 +107,9 @@ def _publish(asked: argparse.Namespace) -> None:
     data = asked.weights.read_bytes()
     rng = np.random.default_rng(0)
     apart = sets.load_library(asked.folder / "held-out", set())
-    drawn = (sets.draw_set(lens, 64, 8, rng, varied=False) for lens in apart)
+    drawn = [sets.draw_set(lens, 64, 8, rng, varied=False) for lens in apart]
+    powers = sets.best_powers(FieldNetwork.from_bytes(data), drawn)
+    data = with_logits_scaled(data, powers)
     shift = sets.understated(FieldNetwork.from_bytes(data), drawn)
     data = with_errors_raised(data, shift)
     figures = sets.judge(FieldNetwork.from_bytes(data), sets.load_sets(asked.fixed))
@@ -115,8 +117,10 @@ def _publish(asked: argparse.Namespace) -> None:
         data,
         fixed_set={name: round(value, 4) for name, value in figures.items()},
         errors_raised=round(shift, 4),
+        powers=[round(power, 2) for power in powers],
     )
     write_atomically(WEIGHTS, published)
+    print("kernels are raised to the powers " + ", ".join(f"{power:.2f}" for power in powers))
     print(f"told errors are raised by {np.exp(shift):.2f}, the median on lenses held out")
     print(f"{WEIGHTS}: {len(published) / 2**20:.1f} MiB, {FieldNetwork.from_bytes(published).name}")
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))

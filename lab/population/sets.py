@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from lab.population.library import FAMILIES, Family, load_shard
 from lensmodel.core.files import atomic
-from lensmodel.neural import Conditions, FieldNetwork
+from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
 from lensmodel.neural.features import KINDS
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import group
 from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image
 
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
+_POWERS: Final = np.arange(0.84, 1.05, 0.02)
 
 
 @dataclass(slots=True)
@@ -143,8 +144,8 @@ def conditions_of(settings: NDArray[np.float64]) -> Conditions:
     return Conditions(f_number, pitch, focal, focus, KINDS[int(settings[4])])
 
 
-def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Relative L2 errors of the network's kernels on a set, and those it expects; both (queries, 3)."""
+def _answers(network: FieldNetwork, drawn: Set) -> Iterator[tuple[FieldAnswer, NDArray[np.float64]]]:
+    """What the network answers to each query of a set, and the true kernels."""
     tokens = np.empty((len(drawn.xy), 0), np.float32)
     for photo in np.unique(drawn.photo):
         part = drawn.photo == photo
@@ -154,14 +155,34 @@ def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], ND
             tokens = np.empty((len(drawn.xy), encoded.shape[1]), np.float32)
         tokens[part] = encoded
     memory = network.memory(tokens, drawn.xy, [conditions_of(row) for row in drawn.settings])
-    made, told = [], []
     for xy, row, shares in zip(drawn.query_xy, drawn.query_settings, drawn.truth, strict=True):
-        answer = network.query(memory, xy, conditions_of(row))
         truth = from_octant_image(int(octant_of(xy)), assembled(shares))
-        power = np.square(truth).sum((1, 2))
-        made.append(np.sqrt(np.square(answer.kernels - truth).sum((1, 2)) / power))
-        told.append(answer.error)
-    return np.array(made), np.array(told)
+        yield network.query(memory, xy, conditions_of(row)), truth
+
+
+def _relative(kernels: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sqrt(np.square(kernels - truth).sum((1, 2)) / np.square(truth).sum((1, 2)))
+
+
+def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Relative L2 errors of the network's kernels on a set, and those it expects; both (queries, 3)."""
+    pairs = [(_relative(answer.kernels, truth), answer.error) for answer, truth in _answers(network, drawn)]
+    return np.array([made for made, _ in pairs]), np.array([told for _, told in pairs])
+
+
+def best_powers(network: FieldNetwork, sets: Iterable[Set]) -> tuple[float, float, float]:
+    """Powers of the kernels of red, green and blue that err least: below 1, what is learned is too sure.
+
+    Red and blue share one, because training exchanges them.
+    """
+    errors = []
+    for drawn in sets:
+        for answer, truth in _answers(network, drawn):
+            raised = [np.maximum(answer.kernels, 0.0) ** power for power in _POWERS]
+            errors.append([_relative(k / k.sum((1, 2), keepdims=True), truth) for k in raised])
+    mean = np.mean(errors, axis=0)  # (powers, 3)
+    green, others = (float(_POWERS[int(np.argmin(row))]) for row in (mean[:, 1], mean[:, 0] + mean[:, 2]))
+    return others, green, others
 
 
 def of_photos(lens: Lens, photos: int) -> Set:

@@ -348,6 +348,18 @@ def _changed(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
     return out.getvalue()
 
 
+def with_logits_scaled(data: bytes, powers: Sequence[float]) -> bytes:
+    """Weights whose kernels of red, green and blue are raised to powers, as all their logits are scaled."""
+
+    def change(arrays: dict[str, Any]) -> None:
+        for name in ("kernel.2.weight", "kernel.2.bias"):
+            scaled = np.stack(np.split(arrays[name].astype(np.float32), 3))
+            scaled *= np.reshape(powers, (3, *[1] * (scaled.ndim - 1)))
+            arrays[name] = np.concatenate(scaled).astype(np.float16)
+
+    return _changed(data, change)
+
+
 def with_errors_raised(data: bytes, shift: float) -> bytes:
     """Weights whose told errors are exp(shift) times as large."""
 

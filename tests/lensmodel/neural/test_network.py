@@ -13,6 +13,7 @@ from scipy import ndimage
 from lab.population.sets import judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
+from lensmodel.neural.network import WEIGHTS, with_logits_scaled
 from lensmodel.neural.statistics import LENGTH, WINDOW
 from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place
 
@@ -159,6 +160,21 @@ def test_weights_say_where_they_come_from() -> None:
     assert network.provenance["lenses"] > 500
     assert network.provenance["curve"][-1]["figures"]
     assert len(network.name) == 12
+
+
+def test_scaled_logits_raise_kernels_to_powers() -> None:
+    plain = FieldNetwork.load()
+    scaled = FieldNetwork.from_bytes(with_logits_scaled(WEIGHTS.read_bytes(), (1.0, 0.5, 1.0)))
+    sharp = photo(1.0)
+    before, after = (
+        network.query(network.memory(network.encode(sharp, PLACES, WIDE_OPEN), PLACES, [WIDE_OPEN] * 12),
+                      PLACES[0], WIDE_OPEN).kernels
+        for network in (plain, scaled)
+    )  # fmt: skip
+    root = np.sqrt(before[1, 30:45, 30:45])
+    kept = after[1, 30:45, 30:45]
+    np.testing.assert_allclose(kept / kept.sum(), root / root.sum(), atol=2e-3)
+    np.testing.assert_allclose(after[0], before[0], atol=1e-5)
 
 
 def test_packaged_weights_give_their_published_figures() -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
@@ -27,13 +26,15 @@ from lensmodel.core.types import (
 )
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
+from lensmodel.correction.compiled.common import Complex, Real, through
+from lensmodel.correction.compiled.filters import smooth
 
-Real = NDArray[np.float32]
 Window: TypeAlias = tuple[slice, slice]
 
 REBLUR, SPECTRUM, ISOLATED = "re-blur", "spectrum", "isolated pixels"
 
-LIMITS: Final[Mapping[str, float]] = {REBLUR: 2.0, SPECTRUM: 2.0, ISOLATED: 1.5}
+_STANDS_OUT: Final = 1.5
+LIMITS: Final[Mapping[str, float]] = {REBLUR: 2.0, SPECTRUM: 2.0, ISOLATED: _STANDS_OUT}
 """Figure of each check, in the unit of its own equation, from which a correction is held back (chosen: above
 what sound corrections of photographs reach)."""
 
@@ -198,10 +199,12 @@ def audit_tile(
     shape = (y.shape[1], y.shape[2])
     inner = inner or (slice(0, shape[0]), slice(0, shape[1]))
     noise = np.array([[n.shot, n.read] for n in evidence.noise], dtype=np.float32)
-    spikes = np.empty(shape, dtype=np.float32)
+    spikes = np.zeros(shape, dtype=np.float32)
     powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
     clip = np.asarray(np.minimum(evidence.clip, 1e9), dtype=np.float32)
-    _figures(y, x, noise, clip, _point_gains(evidence), spikes, powers)
+    if not _spikes(y, x, noise, clip, _point_gains(evidence), spikes):
+        spikes = np.zeros(_blocks(shape), dtype=np.float32)
+    _powers(y, x, noise, clip, powers)
     wide = around(powers)
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
     beyond = wide[:2].max(axis=0) / known
@@ -277,62 +280,88 @@ def _point_gains(evidence: Evidence) -> Real:
 
 
 @jit
-def _figures(  # noqa: C901, PLR0912 - one pass over the tile
-    y: Real, x: Real, noise: Real, clip: Real, gains: Real, spikes: Real, powers: Real
-) -> None:
-    """How far each pixel stands out, and sums over blocks: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
-    rows, cols = spikes.shape
-    zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
-    luma = np.empty((2, rows, cols), np.float32)
-    spikes[:] = zero
+def _into_blocks(lines: Real, row: int, sums: Real) -> None:
+    """Add lines `(kind, cols)` to the row of blocks that holds a row of pixels."""
+    for kind in range(lines.shape[0]):
+        for block in range(sums.shape[2]):
+            total = np.float32(0.0)
+            for j in range(8 * block, min(8 * block + 8, lines.shape[1])):
+                total += lines[kind, j]
+            sums[kind, row // 8, block] += total
+
+
+@jit
+def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
+    """Sums over blocks of the mean of the colours: D_1, D_2 of x, D_1, D_2, D_4 of y, sigma²."""
+    rows, cols = y.shape[1:]
+    zero, third, ninth = np.float32(0.0), np.float32(1.0 / 3.0), np.float32(1.0 / 9.0)
+    share, rim = np.float32(1.0 / 12.0), _COARSE
+    luma = np.empty((2, rows, cols + 2 * rim), np.float32)
+    lines = np.zeros((6, cols), np.float32)
     for i in range(rows):
+        before, after = luma[0, i, rim : rim + cols], luma[1, i, rim : rim + cols]
         for j in range(cols):
-            luma[0, i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
-            luma[1, i, j] = third * (
+            before[j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
+            after[j] = third * (
                 min(x[0, i, j], clip[0]) + min(x[1, i, j], clip[1]) + min(x[2, i, j], clip[2])
             )
-            total = zero
+        luma[0, i, :rim], luma[0, i, rim + cols :] = before[0], before[cols - 1]
+        luma[1, i, :rim], luma[1, i, rim + cols :] = after[0], after[cols - 1]
+    for i in range(rows):
+        for j in range(cols):
+            total = noise[0, 1] + noise[1, 1] + noise[2, 1]
             for c in range(3):
-                total += noise[c, 0] * max(y[c, i, j], zero) + noise[c, 1]
-            powers[5, i // 8, j // 8] += total * np.float32(1.0 / 9.0)
-    shown = np.empty((rows, cols), np.float32)
+                total += noise[c, 0] * max(y[c, i, j], zero)
+            lines[5, j] += ninth * total
+        for kind in range(5):
+            plane = luma[1] if kind < 2 else luma[0]
+            s = _COARSE if kind == 4 else 1 + kind % 2
+            above, here, below = plane[max(i - s, 0)], plane[i], plane[min(i + s, rows - 1)]
+            line = lines[kind]
+            for j in range(cols):
+                two = here[rim + j] + here[rim + j]
+                down = above[rim + j] + below[rim + j] - two
+                across = here[rim + j - s] + here[rim + j + s] - two
+                line[j] += share * (down * down + across * across)
+        if i % 8 == 7 or i == rows - 1:
+            _into_blocks(lines, i, powers)
+            lines[:] = zero
+
+
+@jit
+def _spikes(y: Real, x: Real, noise: Real, clip: Real, gains: Real, spikes: Real) -> bool:
+    """How far a pixel of a colour stands out, where that may be more than noise; whether one does."""
+    rows, cols = spikes.shape
+    zero = np.float32(0.0)
+    shown, out = np.empty((rows, cols), np.float32), np.zeros(cols, np.float32)
+    least = np.float32((_SPIKE * _STANDS_OUT) ** 2)
+    found = False
     for c in range(3):
+        shot, read = noise[c, 0], noise[c, 1]
         for i in range(rows):
             for j in range(cols):
                 shown[i, j] = min(x[c, i, j], clip[c])
         for i in range(1, rows - 1):
+            above, here, below = shown[i - 1], shown[i], shown[i + 1]
+            number = 0
             for j in range(1, cols - 1):
-                top = max(shown[i - 1, j], shown[i + 1, j], shown[i, j - 1], shown[i, j + 1])
-                low = min(shown[i - 1, j], shown[i + 1, j], shown[i, j - 1], shown[i, j + 1])
-                now = shown[i, j]
-                if low <= now <= top:
-                    continue
-                for a in (i - 1, i + 1):
-                    for b in (j - 1, j + 1):
-                        top = max(top, shown[a, b])
-                        low = min(low, shown[a, b])
-                out = max(now - top, low - now)
-                if out <= zero:
-                    continue
-                mean, number = zero, 0
-                for a in range(max(i - 2, 0), min(i + 3, rows)):
-                    for b in range(max(j - 2, 0), min(j + 3, cols)):
-                        mean += y[c, a, b]
-                        number += 1
-                bump = abs(y[c, i, j] - mean / np.float32(number))
-                grain = np.sqrt(max(noise[c, 0] * max(y[c, i, j], zero) + noise[c, 1], np.float32(1e-12)))
-                spikes[i, j] = max(spikes[i, j], out / (gains[c] * bump + np.float32(_SPIKE) * grain))
-    share = np.float32(1.0 / 12.0)
-    for kind in range(5):
-        plane = luma[1] if kind < 2 else luma[0]
-        s = 1 if kind % 2 == 0 and kind < 4 else (2 if kind < 4 else _COARSE)
-        for i in range(rows):
-            above, below = max(i - s, 0), min(i + s, rows - 1)
-            for j in range(cols):
-                two = np.float32(2.0) * plane[i, j]
-                down = plane[above, j] + plane[below, j] - two
-                across = plane[i, max(j - s, 0)] + plane[i, min(j + s, cols - 1)] - two
-                powers[kind, i // 8, j // 8] += share * (down * down + across * across)
+                top = max(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
+                low = min(above[j - 1], above[j], above[j + 1], here[j - 1], here[j + 1])
+                top = max(top, below[j - 1], below[j], below[j + 1])
+                low = min(low, below[j - 1], below[j], below[j + 1])
+                out[j] = max(here[j] - top, low - here[j], zero)
+                number += out[j] * out[j] > least * (shot * max(y[c, i, j], zero) + read)
+            if number == 0:
+                continue
+            for j in range(1, cols - 1):
+                variance = max(shot * max(y[c, i, j], zero) + read, np.float32(1e-12))
+                if out[j] * out[j] > least * variance:
+                    window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
+                    bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
+                    figure = out[j] / (gains[c] * bump + np.float32(_SPIKE) * np.sqrt(variance))
+                    spikes[i, j] = max(spikes[i, j], figure)
+                    found = True
+    return found
 
 
 def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
@@ -341,12 +370,18 @@ def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
     shape = (y.shape[1], y.shape[2])
     grid = fast_shape(tuple(max(n, b.kernel.shape[0]) for n in shape for b in evidence.blurs[:1]))
     worst = np.zeros(_blocks(shape), dtype=np.float32)
+    limit = np.float32(LIMITS[REBLUR] ** 2)
     for c, blur in enumerate(evidence.blurs):
-        transfer = blur.spectrum(grid)
-        blurred, again = (
-            fft.irfft2(fft.rfft2(plane, grid) * transfer, grid)[: shape[0], : shape[1]]
-            for plane in (x[c], y[c])
-        )
+        K = blur.spectrum(grid)
+        scratch = np.empty_like(K)
+
+        def spread(plane: Plane, K: Complex = K, scratch: Complex = scratch) -> Real:
+            """A plane as the blur shows it, on its canvas."""
+            work = np.zeros(grid, dtype=np.float32)
+            work[: shape[0], : shape[1]] = plane
+            through(work, scratch, K, forward=True, first=0, last=shape[0], begin=0, end=shape[0])
+            return work
+
         rim = min(blur.reach, (min(shape) - 1) // 2)
         counted = np.zeros(shape, dtype=np.float32)
         counted[rim : shape[0] - rim, rim : shape[1] - rim] = 1.0
@@ -355,50 +390,38 @@ def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
             counted *= measured
         clipped = y[c] >= np.float32(_CLIPPED * evidence.clip[c])
         if clipped.any():
-            light = fft.irfft2(fft.rfft2(clipped.astype(np.float32), grid) * transfer, grid)
-            counted *= light[: shape[0], : shape[1]] < _GLOW
-        sums = np.zeros((3, *worst.shape), dtype=np.float32)
+            counted *= spread(clipped)[: shape[0], : shape[1]] < _GLOW
         noise, error = evidence.noise[c], max(evidence.psf_errors[c], MODEL_ERROR)
-        _residual(
-            y[c],
-            x[c],
-            blurred.astype(np.float32, copy=False),
-            again.astype(np.float32, copy=False),
-            counted,
-            noise.shot,
-            noise.read,
-            error**2,
-            sums,
-        )
-        square, own, number = around(sums)
+        allowed = np.array([noise.shot, noise.read, error**2], dtype=np.float32)
+        blurred = spread(x[c])
+        sums = np.zeros((2, *worst.shape), dtype=np.float32)
+        _residual(y[c], x[c], blurred, blurred, counted, allowed, sums)
+        square, number = around(sums)
         number = np.maximum(number, np.float32(1.0))
-        figure = np.sqrt(square / np.maximum(number, own / np.float32(LIMITS[REBLUR] ** 2)))
-        np.maximum(worst, figure, out=worst)
+        if (square > limit * number).any():  # else it does not matter what the photo itself leaves
+            sums[:] = 0.0
+            _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed, sums)
+            number = np.maximum(number, around(sums)[0] / limit)
+        np.maximum(worst, np.sqrt(square / number), out=worst)
     return worst
 
 
 @jit
 def _residual(
-    y: Real,
-    x: Real,
-    blurred: Real,
-    again: Real,
-    counted: Real,
-    shot: float,
-    read: float,
-    error: float,
-    sums: Real,
+    y: Real, x: Real, blurred: Real, explained: Real, counted: Real, allowed: Real, sums: Real
 ) -> None:
-    """Sums over blocks of the squared residuals of x and of y over what they may be, and of what counts."""
+    """Sums over blocks of squares of what is not `explained` over what may be, and of what counts."""
     rows, cols = y.shape
+    lines = np.zeros((2, cols), np.float32)
     for i in range(rows):
         for j in range(cols):
-            left, change = y[i, j] - blurred[i, j], x[i, j] - blurred[i, j]
-            allowed = shot * max(y[i, j], np.float32(0.0)) + read + error * change * change
-            weight, own = counted[i, j] / np.float32(max(allowed, 1e-12)), y[i, j] - again[i, j]
-            sums[0, i // 8, j // 8] += weight * left * left
-            sums[1, i // 8, j // 8] += weight * own * own
-            sums[2, i // 8, j // 8] += counted[i, j]
+            left, change = y[i, j] - explained[i, j], x[i, j] - blurred[i, j]
+            variance = allowed[0] * max(y[i, j], np.float32(0.0)) + allowed[1] + allowed[2] * change * change
+            lines[0, j] += counted[i, j] * left * left / max(variance, np.float32(1e-12))
+            lines[1, j] += counted[i, j]
+        if i % 8 == 7 or i == rows - 1:
+            _into_blocks(lines, i, sums)
+            lines[:] = np.float32(0.0)
 
 
 def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
@@ -407,22 +430,34 @@ def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
 
 def around(totals: Real) -> Real:
     """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
-    for axis in (-2, -1):
-        totals = ndimage.correlate1d(totals, _WEIGHTS, axis=axis, mode="constant")
-    return totals
+    out = np.empty_like(totals)
+    for figures, into in zip(totals, out, strict=True):
+        smooth(figures, _WEIGHTS, into, wrapped=False)
+    return out
 
 
 def to_pixels(figures: Real, shape: tuple[int, int]) -> Plane:
     """Bilinear interpolation of figures of blocks; beyond the middles of the outer ones it is constant."""
-    down, across = (_between(extent, count) for extent, count in zip(shape, figures.shape, strict=True))
-    return np.asarray(down @ figures @ across.T, dtype=np.float32)
+    out = np.empty(shape, dtype=np.float32)
+    _interpolate(figures, out)
+    return out
 
 
-@lru_cache(maxsize=64)
-def _between(extent: int, count: int) -> Real:
-    """Weight of each block for each pixel, `(pixels, blocks)`."""
-    at = np.clip((np.arange(extent) - (SIDE - 1) / 2.0) / SIDE, 0.0, count - 1)
-    return np.maximum(1.0 - np.abs(at[:, None] - np.arange(count)[None, :]), 0.0).astype(np.float32)
+@jit
+def _interpolate(figures: Real, out: Real) -> None:
+    """See `to_pixels`; a product of matrices would do it, on threads that stand in each other's way."""
+    rows, cols = figures.shape
+    line = np.empty(cols, np.float32)
+    for i in range(out.shape[0]):
+        at = min(max((i - 3.5) / 8.0, 0.0), rows - 1.0)
+        a = min(int(at), max(rows - 2, 0))
+        t, b = np.float32(at - a), min(a + 1, rows - 1)
+        for j in range(cols):
+            line[j] = figures[a, j] + t * (figures[b, j] - figures[a, j])
+        for j in range(out.shape[1]):
+            at = min(max((j - 3.5) / 8.0, 0.0), cols - 1.0)
+            a = min(int(at), max(cols - 2, 0))
+            out[i, j] = line[a] + np.float32(at - a) * (line[min(a + 1, cols - 1)] - line[a])
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,6 @@ from lensmodel.core.types import (
     BayerPattern,
     Channel,
     FieldPosition,
-    Kernel,
     NoiseModel,
     Planes,
 )
@@ -60,7 +59,7 @@ class CorrectionJob:
 
     planes: Planes
     posteriors: Callable[[FieldPosition, Channel], PsfPosterior]
-    lateral: LateralColourShift | None
+    blur_at: Callable[[FieldPosition, Channel, float], UniformBlur]
     frame: Frame
     method: Deconvolver
     strength: float
@@ -93,34 +92,21 @@ class CorrectionJob:
         cols = (np.arange(shape[1]) + left) % 2
         return np.asarray(np.asarray(self.cfa)[rows[:, None], cols[None, :]] == channel)
 
-    def offset(self, position: FieldPosition, channel: Channel) -> tuple[float, float]:
-        """Lateral shift of a channel at a place, `(row, col)` in pixels."""
-        if self.lateral is None or channel == "g":
-            return 0.0, 0.0
-        outwards = self.lateral.displacement(position.r, channel)
-        return -outwards * math.sin(position.phi), outwards * math.cos(position.phi)
-
     def blur(self, cell: Cell, channel: Channel, share: float, corner: tuple[int, int]) -> UniformBlur:
         """Kernel of one channel in a cell, and its change within it, on a tile that begins at `corner`."""
-
-        def blur_at(position: FieldPosition) -> UniformBlur:
-            kernel = self.posteriors(position, channel).kernel
-            return UniformBlur(_mixed(kernel, share), self.offset(position, channel))
-
-        middle = blur_at(cell.position)
+        middle = self.blur_at(cell.position, channel, share)
         if self.cell_factor > 1:
             return middle  # used for this cell only
-        down, across = ((blur_at(before), blur_at(after), pixels) for before, after, pixels in cell.beside)
+        down, across = (
+            (self.blur_at(before, channel, share), self.blur_at(after, channel, share), pixels)
+            for before, after, pixels in cell.beside
+        )
         origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
         return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
 
     def weakened(self, photo: Planes, restored: Planes) -> Planes:
         """Blend the photo with its correction by the strength."""
         return restored if self.strength == 1.0 else photo + np.float32(self.strength) * (restored - photo)
-
-    def reach(self, position: FieldPosition, channel: Channel) -> int:
-        """How far the blur of a place reaches, in pixels."""
-        return UniformBlur(self.posteriors(position, channel).kernel, self.offset(position, channel)).reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,12 +132,14 @@ class _CellTile:
     photo: Planes
     inner: tuple[slice, slice, slice]
     posteriors: Sequence[PsfPosterior]
+    offsets: Sequence[tuple[float, float]]
     sensors: Sequence[Sensor]
 
     @classmethod
     def of(cls, job: CorrectionJob, cell: Cell) -> _CellTile:
         """Cut the tile of a cell out of a photo."""
-        reach = max(job.reach(cell.position, channel) for channel in CHANNELS)
+        blurs = [job.blur_at(cell.position, channel, 1.0) for channel in CHANNELS]
+        reach = max(blur.reach for blur in blurs)
         halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
         top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
         tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
@@ -176,7 +164,8 @@ class _CellTile:
             slice(cell.left - left, cell.right - left),
         )
         posteriors = [job.posteriors(cell.position, channel) for channel in CHANNELS]
-        return cls(cell, (top, left), tile, inner, posteriors, sensors)
+        offsets = [blur.offset for blur in blurs]
+        return cls(cell, (top, left), tile, inner, posteriors, offsets, sensors)
 
     @property
     def cell_pixels(self) -> Planes:
@@ -209,8 +198,7 @@ def _within(
 ) -> RestoredCell:
     """Restore a tile within bounds, checked; cut its halo off."""
     cell, sensors = tile.cell, tile.sensors
-    offsets = [job.offset(cell.position, channel) for channel in CHANNELS]
-    plans = plan(cell, tile.photo, tile.posteriors, offsets, sensors, SHARE * bounds.texture)
+    plans = plan(cell, tile.photo, tile.posteriors, tile.offsets, sensors, SHARE * bounds.texture)
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.plain):
@@ -264,11 +252,23 @@ def texture_share(
     return np.asarray(1.0 - denoise * (1.0 - t * t * (3.0 - 2.0 * t)), dtype=np.float32)
 
 
-def _mixed(kernel: Kernel, share: float) -> Kernel:
-    """Mix a kernel with a point, s k + (1 - s) delta.
+def blur_of(
+    posterior: PsfPosterior,
+    lateral: LateralColourShift | None,
+    position: FieldPosition,
+    channel: Channel,
+    share: float,
+) -> UniformBlur:
+    """Blur of one channel at a place: a share of its kernel, the rest a point, moved by lateral colour.
 
     Too wide a kernel costs far more than one that is too narrow. The residual of a wrong kernel is not noise:
     counted as noise, it would leave strong edges to the prior, which spreads their colour over what lies
     beside them.
     """
-    return kernel if share == 1.0 else as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))
+    kernel, offset = posterior.kernel, (0.0, 0.0)
+    if share < 1.0:
+        kernel = as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))
+    if lateral is not None and channel != "g":
+        outwards = lateral.displacement(position.r, channel)
+        offset = (-outwards * math.sin(position.phi), outwards * math.cos(position.phi))
+    return UniformBlur(kernel, offset)

@@ -152,8 +152,9 @@ def compact(clipped: Mask, reach: int) -> Mask:
     closed = ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped
     depth = ndimage.distance_transform_cdt(np.pad(closed, 1), "chessboard")[1:-1, 1:-1]
     labels, count = ndimage.label(closed, structure=np.ones((3, 3), dtype=np.int8))
-    broad = np.asarray(ndimage.maximum(depth, labels, np.arange(count + 1))) > reach
+    broad = np.zeros(count + 1, dtype=np.bool_)
     broad[0] = True
+    broad[labels[depth > reach]] = True
     return np.asarray(clipped & ~broad[labels])
 
 

@@ -16,7 +16,7 @@ from scipy import fft
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
-from lensmodel.core.types import ZONES, Plane, Planes, Zone
+from lensmodel.core.types import ZONES, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
@@ -70,7 +70,7 @@ class CellForecast:
         The error of a posterior mean is orthogonal to it, so the error falls by the mean square of the
         change; by no more than forecast, since what a change adds beyond that is not the scene.
         """
-        change = float(np.square(result - photo).mean(axis=(1, 2)).sum()) * _GRID[0] * _GRID[1]
+        change = _squared_distance(photo, result) / photo[0].size * _GRID[0] * _GRID[1]
         after = self.before - min(change, _MOST * self.before)
         return CellForecast(self.zone, self.before, max(after, self.after), self.psf_error)
 
@@ -139,7 +139,8 @@ def plan(
     before = after = 0.0
     shares: list[float] = []
     times = frequency_counts(_GRID)
-    for plane, posterior, offset, sensor in zip(tile, posteriors, offsets, sensors, strict=True):
+    measured = _ring_power(tile)
+    for c, (posterior, offset, sensor) in enumerate(zip(posteriors, offsets, sensors, strict=True)):
         point = UniformBlur(delta(1), offset).spectrum(_GRID)
         K = (
             point
@@ -147,8 +148,8 @@ def plan(
             else UniformBlur(posterior.kernel, offset).spectrum(_GRID)
         )
         power, D = np.maximum(K.real**2 + K.imag**2, _LEAST), posterior.variance
-        n = float(sensor.noise.variance(plane[::_EVERY, ::_EVERY]).mean())
-        S = scene_power(plane, power + D, n)
+        n = float(sensor.noise.variance(tile[c, ::_EVERY, ::_EVERY]).mean())
+        S = scene_power(measured[c], power + D, n)
         before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
         remaining = np.empty(len(_SHARES))
         _remaining(K, point, S, D, times, n, np.array(_SHARES), returned, remaining)
@@ -187,7 +188,9 @@ def _remaining(
         out[number] = total
 
 
-def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -> NDArray[np.float64]:
+def scene_power(
+    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
+) -> NDArray[np.float64]:
     """Power of the scene behind a blur, S = c |f|^-a, on the `rfft2` grid of `GRID`.
 
     Scaled so that white noise has its variance as power. c and a are fitted to rings of the photo's own
@@ -196,41 +199,39 @@ def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -
 
     Parameters
     ----------
-    plane : Plane
-        A part of the photo.
+    measured : ndarray, shape (rings,)
+        Mean power of a part of the photo in each ring.
     transferred : ndarray, shape (64, 33)
         Expected |H|² of its blur.
     noise : float
         Variance of its noise.
     """
-    measured = _ring_power(plane)
-    transmitted = _ring_means(transferred)
+    transmitted = _rings() @ transferred.ravel().astype(np.float64)
     power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)
     x, y = np.log(_MIDDLES), np.log(power)
     # rings with more noise than scene say little about the slope
     weight = 1.0 / (0.05 + (noise / np.maximum(measured, 1e-12)) ** 2)
-    mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
+    weight /= weight.sum()
+    mean_x, mean_y = weight @ x, weight @ y
     slope = float(weight @ ((x - mean_x) * (y - mean_y)) / (weight @ (x - mean_x) ** 2))
     slope = min(max(-slope, _SLOPES[0]), _SLOPES[1])
-    decay = frequency_squared(_GRID).astype(np.float64)
-    decay[0, 0] = np.inf
-    return np.asarray(math.exp(mean_y + slope * mean_x) * decay ** (-0.5 * slope))
+    return np.asarray(math.exp(mean_y + slope * mean_x) * np.exp(-0.5 * slope * _log_squared()))
 
 
-def _ring_power(plane: Plane) -> NDArray[np.float64]:
-    """Mean power of a plane in each ring, of blocks of the grid's shape; 1 for white noise of variance 1."""
-    missing = [max(g - n, 0) for g, n in zip(_GRID, plane.shape, strict=True)]
+def _ring_power(planes: Planes) -> NDArray[np.float64]:
+    """Mean power of each plane in each ring, `(planes, rings)`; 1 for white noise of variance 1."""
+    missing = [max(g - n, 0) for g, n in zip(_GRID, planes.shape[1:], strict=True)]
     if any(missing):
-        plane = np.pad(plane, [(0, m) for m in missing], "reflect")
+        planes = np.pad(planes, [(0, 0), *((0, m) for m in missing)], "reflect")
     rows, cols = (
         np.linspace(0, n - g, min(max(n // g, 1), _BLOCKS)).astype(int)
-        for n, g in zip(plane.shape, _GRID, strict=True)
+        for n, g in zip(planes.shape[1:], _GRID, strict=True)
     )
-    blocks = np.stack([plane[t : t + _GRID[0], l : l + _GRID[1]] for t in rows for l in cols])
-    blocks = (blocks - blocks.mean(axis=(1, 2), keepdims=True)) * _window()
+    blocks = np.stack([planes[:, t : t + _GRID[0], l : l + _GRID[1]] for t in rows for l in cols], axis=1)
+    blocks = (blocks - blocks.mean(axis=(2, 3), keepdims=True)) * _window()
     spectra = fft.rfft2(blocks)
-    power = (spectra.real**2 + spectra.imag**2).sum(axis=0, dtype=np.float64)
-    return _ring_means(power) / (len(blocks) * _GRID[0] * _GRID[1])
+    power = (spectra.real**2 + spectra.imag**2).mean(axis=1, dtype=np.float64) / (_GRID[0] * _GRID[1])
+    return np.asarray(power.reshape(len(planes), -1) @ _rings().T)
 
 
 @lru_cache(maxsize=1)
@@ -239,17 +240,20 @@ def _window() -> NDArray[np.float32]:
     return np.asarray(window / np.sqrt(np.mean(window**2)), dtype=np.float32)
 
 
-def _ring_means(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean of values on the grid in each ring."""
-    return np.array([float((ring * values).sum()) for ring in _rings()])
+@lru_cache(maxsize=1)
+def _log_squared() -> NDArray[np.float64]:
+    """Logarithm of |f|² on the grid; the mean has no power."""
+    squared = frequency_squared(_GRID).astype(np.float64)
+    squared[0, 0] = np.inf
+    return np.log(squared)
 
 
 @lru_cache(maxsize=1)
-def _rings() -> tuple[NDArray[np.float64], ...]:
+def _rings() -> NDArray[np.float64]:
     """Weights of each ring's frequencies, by how often the whole spectrum holds them; their sum is 1."""
     modulus, times = np.sqrt(frequency_squared(_GRID)), frequency_counts(_GRID)
     rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
-    return tuple(ring / ring.sum() for ring in rings)
+    return np.array([(ring / ring.sum()).ravel() for ring in rings])
 
 
 def zone_reports(
@@ -273,6 +277,17 @@ def zone_reports(
             reasons=() if held is None else tuple(sorted(held.checks, key=lambda name: -held.checks[name])),
         )
     return reports
+
+
+@jit
+def _squared_distance(a: Planes, b: Planes) -> float:
+    total = 0.0
+    for c in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            for j in range(a.shape[2]):
+                step = a[c, i, j] - b[c, i, j]
+                total += step * step
+    return total
 
 
 def _decibels(before: float, after: float) -> float:

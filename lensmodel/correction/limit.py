@@ -37,7 +37,7 @@ _EVEN: Final = 5
 """Side of the window in which glare is compared with light (chosen: pixel by pixel, noise would decide)."""
 _PLATEAU: Final = 3
 """Pixels beyond the blur's reach that hold the level beside an edge (chosen: about as many as its width)."""
-_SURE: Final = 0.25
+_SURE: Final = 0.24
 """Error of a kernel at which a result may leave the photo's range by the width of that range (chosen: the
 least that costs no gain behind a lens that is known to a quarter)."""
 _EDGE, _UNSURE = 0.06, 0.1
@@ -58,6 +58,7 @@ _HUE_REACH: Final = 3
 _PURER: Final = 0.03
 """By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
 out get purer, and three times this shows in a light grey)."""
+_AXES: Final = 3  # differences of two colours' shares of the light: six half planes of a hull
 _COLOURLESS: Final = 0.05
 """Share of the brightest light nearby that is added as grey: what is far darker shows no colour beside it
 (chosen)."""
@@ -114,12 +115,12 @@ def limited(
 ) -> Planes:
     r"""Hold a result within what the photo can have hidden.
 
-    Light, the mean of the colours as it is seen (the power 1 / 2.2), stays within the photo's range [l, h]
+    Light, the mean of the colours as it is seen (its square root), stays within the photo's range [l, h]
     within 2 pixels, widened by a span. With e the error of the kernel, p the peak of its line integral, that
     is the contrast that a thin line keeps, and [L, H] the range in the reach of the blur::
 
         on a line     from h to h + (1 / p - 1) (h - L), from l to l - (1 / p - 1) (H - l) of linear light, by
-                      no more than (.25 / e)² (h - l)
+                      no more than (.24 / e)² (h - l)
         at an edge    .06 max( (.1 / e)², 1 ) (H - L)
 
     It is an edge where a quarter of the window lies at the level that is exceeded. Within reach of lamps, of
@@ -127,9 +128,8 @@ def limited(
     within 2 pixels and below its most within 1. Beside areas of which one colour clipped, it stays within
     the photo's range in the blur's reach, widened by .06 or what the blur hides of a line. Broad clipped
     areas stay as they are, and so does, where e is .1, what may be glare of white ones, four times as bright
-    as saturation. Colour, the shares of red, green and blue in the light, is drawn towards
-    the photo's own at the same place until the shares and their differences lie in the photo's range within
-    3 pixels; the light stays the same.
+    as saturation. Colour, the shares of red, green and blue in the light, is drawn towards the photo's own
+    at the same place until their differences lie in the photo's range within 3 pixels; the light stays.
 
     Parameters
     ----------
@@ -152,26 +152,23 @@ def limited(
     dark = math.hypot(*(sensor.noise.sigma_at(0.0) for sensor in sensors))
     held = np.array(restored, dtype=np.float32, order="C")
     photo = np.ascontiguousarray(photo, dtype=np.float32)
+    light, wide = photo.mean(axis=0), min(reach, _MOST) + _PLATEAU
+    free, number = np.zeros(light.shape, dtype=np.bool_), np.empty((0, 0), dtype=np.float32)
     clip = np.array([min(sensor.clip, _FREE) for sensor in sensors], dtype=np.float32)
     clipped = photo >= clip[:, None, None]
-    broad = np.stack([plane & ~compact(plane, reach) for plane in clipped]) if clipped.any() else clipped
-    white = broad.sum(axis=0) > 1
-    if white.any():
-        doubt = np.float32(_BRIGHTER * min(error / _UNSURE, 1.0))
-        held += np.minimum(doubt * glare_share(photo, white, clip, blurs), 1.0) * (photo - held)
-    _limit(
-        photo,
-        held,
-        clip,
-        broad,
-        min(reach, _MOST) + _PLATEAU,
-        error >= _UNSURE,
-        np.float32(hidden),
-        np.float32(sure),
-        np.float32(edge),
-        np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0),
-        np.float32(_SIGMAS * dark + 1e-6),
-    )
+    if clipped.any():
+        broad = np.stack([plane & ~compact(plane, reach) for plane in clipped])
+        white = broad.sum(axis=0) > 1
+        if white.any():
+            doubt = np.float32(_BRIGHTER * min(error / _UNSURE, 1.0))
+            held += np.minimum(doubt * glare_share(photo, white, clip, blurs), 1.0) * (photo - held)
+        number, lamp, tinted = np.empty((3, *light.shape), dtype=np.float32)
+        _marks(photo, clip, broad, error >= _UNSURE, number, lamp, tinted)
+        _beside_clipped(photo, held, broad, lamp, tinted, wide, np.float32(min(hidden, _EDGE)), free)
+    darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
+    shares = (np.float32(hidden), np.float32(sure), np.float32(edge))
+    _hold_light(photo, held, light, free, wide, shares, darkest)
+    _hold_colour(photo, held, light, number, clip, np.float32(_SIGMAS * dark + 1e-6))
     if halo is not None and halo < _FREE:
         low, high = np.empty_like(photo), np.empty_like(photo)
         for c in range(len(photo)):
@@ -225,226 +222,281 @@ def extremes(below: Real, above: Real, reach: int, low: Real, high: Real) -> Non
 def _mean3(plane: Real, out: Real) -> None:
     """Mean over 3 x 3 pixels; rims repeat."""
     rows, cols = plane.shape
-    line = np.empty(cols, np.float32)
-    ninth = np.float32(1.0 / 9.0)
+    line, ninth = np.empty(cols, np.float32), np.float32(1.0 / 9.0)
     for i in range(rows):
         above, below = max(i - 1, 0), min(i + 1, rows - 1)
         for j in range(cols):
             line[j] = (plane[above, j] + plane[i, j] + plane[below, j]) * ninth
         for j in range(1, cols - 1):
             out[i, j] = line[j - 1] + line[j] + line[j + 1]
-        out[i, 0] = line[0] + line[0] + line[1]
-        out[i, cols - 1] = line[cols - 2] + line[cols - 1] + line[cols - 1]
+        out[i, 0] = line[0] + line[0] + line[min(1, cols - 1)]
+        out[i, cols - 1] = line[max(cols - 2, 0)] + line[cols - 1] + line[cols - 1]
 
 
 @jit
-def _seen(light: Number) -> Number:
-    return np.float32(max(light, np.float32(0.0)) ** np.float32(1.0 / 2.2))
+def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above: Real) -> None:
+    """Levels around every second pixel of every second row, as seen, and how much of an edge each makes.
 
-
-@jit
-def _span(
-    level: Real,
-    i: int,
-    j: int,
-    reach: int,
-    light: Number,
-    near: Number,
-    above: bool,
-    shares: tuple[float, float, float],
-) -> Number:
-    """By how much light as it is seen may leave the photo's range here: on a line, at an edge, or between."""
-    rows, cols = level.shape
-    bottom, top, number, total = level[i, j], level[i, j], 0, 0
-    for a in range(max(i - reach, 0), min(i + reach + 1, rows)):
-        for b in range(max(j - reach, 0), min(j + reach + 1, cols)):
-            bottom, top = min(bottom, level[a, b]), max(top, level[a, b])
-    if above:
-        deep = _seen(light + shares[0] * max(light - bottom, np.float32(0.0))) - _seen(light)
-    else:
-        deep = _seen(light) - _seen(light - shares[0] * max(top - light, np.float32(0.0)))
-    bottom, top = _seen(bottom), _seen(top)
-    far = top - bottom
-    mark = top - np.float32(_LEVEL) * far if above else bottom + np.float32(_LEVEL) * far
-    mark = mark ** np.float32(2.2)
-    for a in range(max(i - reach, 0), min(i + reach + 1, rows)):
-        for b in range(max(j - reach, 0), min(j + reach + 1, cols)):
-            total += 1
-            number += level[a, b] >= mark if above else level[a, b] <= mark
-    t = (np.float32(number) / np.float32(total) - np.float32(_LINE_SHARE)) / np.float32(
-        _EDGE_SHARE - _LINE_SHARE
-    )
-    t = min(max(t, np.float32(0.0)), np.float32(1.0))
-    line = min(deep, shares[1] * near)
-    return line + t * (min(shares[2] * far, line) - line)
-
-
-@jit
-def _limit(  # noqa: C901, PLR0912, PLR0915 - one pass over the tile
-    y: Real,
-    x: Real,
-    clip: Real,
-    broad: Mask,
-    wide: int,
-    unsure: bool,
-    hidden: Number,
-    sure: Number,
-    edge: Number,
-    darkest: Number,
-    dark: Number,
-) -> None:
-    """Limit `x` in place; see `limited`."""
-    rows, cols = y.shape[1:]
-    zero, one, third = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 3.0)
-    light, level = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    low, high = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    number = np.zeros((rows, cols), np.float32)  # clipped colours
-    lamp, tinted = np.zeros((rows, cols), np.float32), np.zeros((rows, cols), np.float32)
-    anything = coloured = False
-    slack = min(hidden, np.float32(_EDGE))
+    `bottom` and `top` are the least and most light within `reach` pixels; `below` and `above` are 1 where a
+    quarter of that window lies at this level, 0 where it is a line.
+    """
+    rows, cols = bottom.shape
+    wide = (reach + 1) // 2
+    level, seen = np.empty_like(light), np.empty((rows, cols), np.float32)
+    _mean3(light, level)
     for i in range(rows):
         for j in range(cols):
-            light[i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
+            seen[i, j] = np.sqrt(max(level[2 * i, 2 * j], np.float32(0.0)))
+    extremes(seen, seen, wide, bottom, top)
+    padded = np.empty((rows + 2 * wide, cols + 2 * wide), np.float32)
+    for i in range(rows + 2 * wide):
+        line = seen[min(max(i - wide, 0), rows - 1)]
+        padded[i, wide : wide + cols] = line
+        padded[i, :wide] = line[0]
+        padded[i, wide + cols :] = line[cols - 1]
+    low, high = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    dark, bright = np.empty(cols, np.int32), np.empty(cols, np.int32)
+    all_of_it = np.float32((2 * wide + 1) ** 2)
+    for i in range(rows):
+        for j in range(cols):
+            room = np.float32(_LEVEL) * (top[i, j] - bottom[i, j])
+            low[j], high[j] = bottom[i, j] + room, top[i, j] - room
+        dark[:] = 0
+        bright[:] = 0
+        for k in range(2 * wide + 1):
+            for l in range(2 * wide + 1):
+                for j in range(cols):
+                    value = padded[i + k, j + l]
+                    dark[j] += np.int32(value <= low[j])
+                    bright[j] += np.int32(value >= high[j])
+        scale, start = (
+            np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it,
+            np.float32(_LINE_SHARE) * all_of_it,
+        )
+        for j in range(cols):
+            below[i, j] = min(max((np.float32(dark[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
+            above[i, j] = min(max((np.float32(bright[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
+
+
+@jit
+def _hold_light(
+    y: Real,
+    x: Real,
+    light: Real,
+    free: Mask,
+    wide: int,
+    shares: tuple[Number, Number, Number],
+    darkest: Number,
+) -> None:
+    """Hold the light of `x` within that of `y` nearby, widened, in place, but where it is `free`."""
+    rows, cols = light.shape
+    zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
+    tiny = np.float32(1e-5)
+    hidden, sure, edge = shares
+    floor = np.sqrt(darkest)
+    seen = np.empty((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            seen[i, j] = np.sqrt(max(light[i, j], zero))
+    least, most = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    extremes(seen, seen, _REACH, least, most)
+    blocks = ((rows + 1) // 2, (cols + 1) // 2)
+    bottoms, tops = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
+    belows, aboves = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
+    _levels(light, wide, bottoms, tops, belows, aboves)
+    bottom, top = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    below, above = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            bottom[j], top[j] = bottoms[i // 2, j // 2], tops[i // 2, j // 2]
+            below[j], above[j] = belows[i // 2, j // 2], aboves[i // 2, j // 2]
+        for j in range(cols):
+            low, high = least[i, j], most[i, j]
+            now = np.sqrt(third * (max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero)))
+            near, at_edge = sure * (high - low), edge * (top[j] - bottom[j])
+            # a line that is brighter than all nearby by what blur hides of it, and one that is darker
+            line = np.sqrt(high * high + hidden * max(high * high - bottom[j] * bottom[j], zero)) - high
+            line = min(line, near)
+            up = line + above[j] * (min(at_edge, line) - line)
+            line = low - np.sqrt(max(low * low - hidden * max(top[j] * top[j] - low * low, zero), zero))
+            line = min(line, near)
+            down = line + below[j] * (min(at_edge, line) - line)
+            bound = min(max(now, low - down, floor * low), high + up)
+            share = bound / max(now, tiny)
+            share = np.float32(1.0) if free[i, j] else share * share
+            lost = now < tiny and share > zero and not free[i, j]
+            fill = bound * bound / max(light[i, j], np.float32(1e-9))
+            x[0, i, j] = y[0, i, j] * fill if lost else x[0, i, j] * share
+            x[1, i, j] = y[1, i, j] * fill if lost else x[1, i, j] * share
+            x[2, i, j] = y[2, i, j] * fill if lost else x[2, i, j] * share
+
+
+@jit
+def _marks(y: Real, clip: Real, broad: Mask, unsure: bool, number: Real, lamp: Real, tinted: Real) -> None:
+    """Count clipped colours, and mark what may be a lamp, and paint of which one colour clips."""
+    one = np.float32(1.0)
+    for i in range(number.shape[0]):
+        for j in range(number.shape[1]):
+            number[i, j] = lamp[i, j] = tinted[i, j] = np.float32(0.0)
             for c in range(3):
                 if y[c, i, j] >= clip[c]:
                     number[i, j] += one
                     if unsure or not broad[c, i, j] or number[i, j] > one:
                         lamp[i, j] = one
-                        anything = True
-            if number[i, j] == one and lamp[i, j] == zero:
+            if number[i, j] == one and lamp[i, j] == np.float32(0.0):
                 tinted[i, j] = one
-                coloured = True
-    _mean3(light, level)
-    near, around, unused = np.zeros_like(number), np.zeros_like(number), np.empty_like(number)
-    shape, wider = (3 if anything else 0, rows, cols), (3 if coloured else 0, rows, cols)
-    dimmest, brightest = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    bottom, top = np.empty(wider, np.float32), np.empty(wider, np.float32)
-    if coloured:
-        extremes(tinted, tinted, wide, unused, around)
-        beyond = wide - _PLATEAU - 1  # the reach of the blur
-        for c in range(3):
-            extremes(y[c], y[c], beyond, bottom[c], top[c])
-    if anything:
-        extremes(lamp, lamp, wide, unused, near)
-        for c in range(3):
-            extremes(y[c], y[c], _NEAREST, dimmest[c], unused)
-            extremes(y[c], y[c], _NEXT, unused, brightest[c])
-    extremes(light, light, _REACH, low, high)
-    for i in range(rows):
-        for j in range(cols):
-            least, most = low[i, j], high[i, j]
-            for c in range(3):
-                if broad[c, i, j]:
-                    x[c, i, j] = y[c, i, j]
-            if near[i, j] > zero:
-                for c in range(3):
-                    if not broad[c, i, j]:
-                        x[c, i, j] = min(max(x[c, i, j], dimmest[c, i, j]), brightest[c, i, j])
-                continue
-            if around[i, j] > zero:
-                for c in range(3):
-                    room = slack * (top[c, i, j] - bottom[c, i, j])
-                    x[c, i, j] = min(max(x[c, i, j], bottom[c, i, j] - room), top[c, i, j] + room)
-            now = third * (max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero))
-            if least <= now <= most:
-                continue
-            above = now > most
-            light_here, near_range = (most if above else least), _seen(most) - _seen(least)
-            span = _span(level, i, j, wide, light_here, near_range, above, (hidden, sure, edge))
-            if above:
-                bound = (_seen(most) + span) ** np.float32(2.2)
-                bound = min(now, bound)
-            else:
-                bound = max(_seen(least) - span, zero) ** np.float32(2.2)
-                bound = max(now, bound, darkest * least)
-            if bound != now:
-                if now > np.float32(1e-9):
-                    for c in range(3):
-                        x[c, i, j] = max(x[c, i, j], zero) * (bound / now)
-                else:
-                    share = bound / max(light[i, j], np.float32(1e-9))
-                    for c in range(3):
-                        x[c, i, j] = y[c, i, j] * share
-    _hold_colour(y, x, clip, number, light, dark)
 
 
 @jit
-def _shares(planes: Real, floor: Real, i: int, out: Real) -> None:
-    """Each colour's share of a row's light, and the differences of shares: six half planes of a hull."""
+def _beside_clipped(
+    y: Real, x: Real, broad: Mask, lamp: Real, tinted: Real, wide: int, slack: Number, near: Mask
+) -> None:
+    """Hold each colour beside clipped light within that of the photo, in place; mark where lamps are near."""
+    rows, cols = lamp.shape
+    unused, beside, around = np.empty_like(lamp), np.empty_like(lamp), np.empty_like(lamp)
+    dimmest, brightest = np.empty_like(lamp), np.empty_like(lamp)
+    bottom, top = np.empty_like(lamp), np.empty_like(lamp)
+    extremes(lamp, lamp, wide, unused, beside)
+    extremes(tinted, tinted, wide, unused, around)
+    for c in range(3):
+        extremes(y[c], y[c], _NEAREST, dimmest, unused)
+        extremes(y[c], y[c], _NEXT, unused, brightest)
+        extremes(y[c], y[c], wide - _PLATEAU - 1, bottom, top)  # in the reach of the blur
+        for i in range(rows):
+            for j in range(cols):
+                near[i, j] = beside[i, j] > np.float32(0.0)
+                room = slack * (top[i, j] - bottom[i, j])
+                if broad[c, i, j]:
+                    x[c, i, j] = y[c, i, j]
+                elif near[i, j]:
+                    x[c, i, j] = min(max(x[c, i, j], dimmest[i, j]), brightest[i, j])
+                elif around[i, j] > np.float32(0.0):
+                    x[c, i, j] = min(max(x[c, i, j], bottom[i, j] - room), top[i, j] + room)
+
+
+@jit
+def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
+    """Each colour's share of a row's light, and its coordinates, whose ranges are half planes of a hull."""
     zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
-    for j in range(planes.shape[2]):
+    for j in range(floor.size):
         r, g, b = max(planes[0, i, j], zero), max(planes[1, i, j], zero), max(planes[2, i, j], zero)
         grey = third * floor[j]
         total = np.float32(1.0) / (r + g + b + floor[j])
         r, g, b = (r + grey) * total, (g + grey) * total, (b + grey) * total
-        out[0, j], out[1, j], out[2, j] = r, g, b
-        out[3, j], out[4, j], out[5, j] = r - g, g - b, b - r
+        shares[0, j], shares[1, j], shares[2, j] = r, g, b
+        axes[0, j], axes[1, j], axes[2, j] = r - g, g - b, b - r
 
 
 @jit
-def _hold_colour(  # noqa: C901, PLR0912, PLR0915 - one pass over the tile
-    y: Real, x: Real, clip: Real, number: Real, light: Real, dark: Number
+def _hold_colour(  # noqa: C901 - one pass over the tile, row by row
+    y: Real, x: Real, light: Real, number: Real, clip: Real, dark: Number
 ) -> None:
     """Draw the colours of `x` into the range of those of `y` nearby, in place."""
     rows, cols = light.shape
     zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(_PURER)
-    low, high = np.empty((6, rows, cols), np.float32), np.empty((6, rows, cols), np.float32)
-    axes = np.empty((6, rows, cols), np.float32)
-    floors, least = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    extremes(light, light, _HUE_REACH, least, floors)
-    row = np.empty((6, cols), np.float32)
-    lost = False
-    for i in range(rows):
-        for j in range(cols):
-            floors[i, j] = max(dark, np.float32(3.0 * _COLOURLESS) * floors[i, j])
-            lost |= number[i, j] > one
-        _shares(y, floors[i], i, row)
-        axes[:, i] = row
-    above = axes.copy() if lost else axes
-    if lost:  # of two clipped colours the hue is not known
-        for i in range(rows):
+    lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
+    reach, side = _HUE_REACH, 2 * _HUE_REACH + 1
+    least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    extremes(light, light, reach, least, floors)
+    own, made = np.empty((3, cols), np.float32), np.empty((3, cols), np.float32)
+    here, there = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
+    # ranges along rows, of the rows that the next one needs: all rows at once do not fit into a cache
+    lows, highs = np.empty((side, _AXES, cols), np.float32), np.empty((side, _AXES, cols), np.float32)
+    low, high = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
+    padded = np.empty((2, cols + 2 * reach), np.float32)
+    share, kept = np.empty(cols, np.float32), np.zeros(cols, np.bool_)
+    for ahead in range(rows + reach):
+        if ahead < rows:
             for j in range(cols):
-                if number[i, j] > one:
-                    axes[:, i, j] = np.float32(np.inf)
-                    above[:, i, j] = np.float32(-np.inf)
-    for k in range(6):
-        extremes(axes[k], above[k], _HUE_REACH, low[k], high[k])
-    made = np.empty((6, cols), np.float32)
-    for i in range(rows):
-        _shares(x, floors[i], i, made)
-        _shares(y, floors[i], i, row)
+                floors[ahead, j] = max(dark, np.float32(3.0 * _COLOURLESS) * floors[ahead, j])
+            _axes(y, floors[ahead], ahead, own, here)
+            for k in range(_AXES):
+                _along(here[k], number, ahead, padded, lows[ahead % side, k], highs[ahead % side, k])
+        i = ahead - reach
+        if i < 0:
+            continue
+        low[:] = lows[i % side]
+        high[:] = highs[i % side]
+        for row in range(max(i - reach, 0), min(i + reach + 1, rows)):
+            for k in range(_AXES):
+                for j in range(cols):
+                    low[k, j] = min(low[k, j], lows[row % side, k, j])
+                    high[k, j] = max(high[k, j], highs[row % side, k, j])
+        _axes(x, floors[i], i, made, there)
+        _axes(y, floors[i], i, own, here)
+        if lost:
+            _of_white(y, x, number, clip, i, low, high, own, here, kept)
+        share[:] = one
+        for k in range(_AXES):
+            for j in range(cols):
+                step = there[k, j] - here[k, j]
+                room = high[k, j] - here[k, j] if step > zero else here[k, j] - low[k, j]
+                share[j] = min(share[j], (room + purer) / max(abs(step), np.float32(1e-6)))
         for j in range(cols):
-            if number[i, j] > one:
-                still = True
-                for c in range(3):
-                    if y[c, i, j] >= clip[c] and x[c, i, j] < clip[c]:
-                        still = False
-                if still:
-                    continue
-                if low[0, i, j] > high[0, i, j]:  # white all around
-                    for c in range(3):
-                        x[c, i, j] = max(x[c, i, j], y[c, i, j])
-                    continue
-                total = zero
-                for c in range(3):
-                    row[c, j] = np.float32(0.5) * (low[c, i, j] + high[c, i, j])
-                    total += row[c, j]
-                r, g, b = row[0, j] / total, row[1, j] / total, row[2, j] / total
-                row[0, j], row[1, j], row[2, j] = r, g, b
-                row[3, j], row[4, j], row[5, j] = r - g, g - b, b - r
-            t = one
-            for k in range(6):
-                step = made[k, j] - row[k, j]
-                if step > zero:
-                    room = high[k, i, j] + purer - row[k, j]
-                    if step > room:
-                        t = min(t, room / step)
-                elif step < zero:
-                    room = row[k, j] - low[k, i, j] + purer
-                    if -step > room:
-                        t = min(t, room / -step)
-            if t < one:
-                total = max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero) + floors[i, j]
-                for c in range(3):
-                    share = row[c, j] + max(t, zero) * (made[c, j] - row[c, j])
-                    x[c, i, j] = share * total - floors[i, j] * np.float32(1.0 / 3.0)
+            t = one if kept[j] else max(share[j], zero)
+            floor, grey = floors[i, j], floors[i, j] * np.float32(1.0 / 3.0)
+            total = max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero) + floor
+            r = (own[0, j] + t * (made[0, j] - own[0, j])) * total - grey
+            g = (own[1, j] + t * (made[1, j] - own[1, j])) * total - grey
+            b = (own[2, j] + t * (made[2, j] - own[2, j])) * total - grey
+            x[0, i, j] = r if t < one else x[0, i, j]
+            x[1, i, j] = g if t < one else x[1, i, j]
+            x[2, i, j] = b if t < one else x[2, i, j]
+
+
+@jit
+def _along(line: Real, number: Real, i: int, padded: Real, low: Real, high: Real) -> None:
+    """Range of a coordinate along a row; pixels of two clipped colours do not count."""
+    reach, cols = _HUE_REACH, line.size
+    padded[0, reach : reach + cols] = line
+    padded[1, reach : reach + cols] = line
+    if number.size > 0:
+        for j in range(cols):
+            if number[i, j] > np.float32(1.0):
+                padded[0, reach + j], padded[1, reach + j] = np.float32(np.inf), np.float32(-np.inf)
+    for j in range(reach):
+        for k in range(2):
+            padded[k, j], padded[k, reach + cols + j] = padded[k, reach], padded[k, reach + cols - 1]
+    low[:] = padded[0, :cols]
+    high[:] = padded[1, :cols]
+    for k in range(1, 2 * reach + 1):
+        for j in range(cols):
+            low[j] = min(low[j], padded[0, j + k])
+            high[j] = max(high[j], padded[1, j + k])
+
+
+@jit
+def _of_white(
+    y: Real,
+    x: Real,
+    number: Real,
+    clip: Real,
+    i: int,
+    low: Real,
+    high: Real,
+    own: Real,
+    axes: Real,
+    kept: Mask,
+) -> None:
+    """Give pixels of a row that lost their hue to clipping that of their surroundings to be drawn to."""
+    for j in range(number.shape[1]):
+        kept[j] = False
+        if number[i, j] <= np.float32(1.0):
+            continue
+        kept[j] = True
+        for c in range(3):
+            if y[c, i, j] >= clip[c] and x[c, i, j] < clip[c]:
+                kept[j] = False
+        if kept[j]:
+            continue
+        if low[0, j] > high[0, j]:  # white all around
+            kept[j] = True
+            for c in range(3):
+                x[c, i, j] = max(x[c, i, j], y[c, i, j])
+            continue
+        for k in range(_AXES):
+            axes[k, j] = np.float32(0.5) * (low[k, j] + high[k, j])
+        red, green = axes[0, j], axes[1, j]  # over green, and over blue
+        own[0, j] = np.float32(1.0 / 3.0) * (np.float32(1.0) + np.float32(2.0) * red + green)
+        own[1, j] = own[0, j] - red
+        own[2, j] = own[1, j] - green

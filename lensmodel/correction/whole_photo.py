@@ -25,8 +25,8 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.correction.audit import AuditReport, pooled
-from lensmodel.correction.blur import crop_to_support
-from lensmodel.correction.cell import CorrectionJob, LateralColourShift, RestoredCell, restore_cell
+from lensmodel.correction.blur import UniformBlur, crop_to_support
+from lensmodel.correction.cell import CorrectionJob, LateralColourShift, RestoredCell, blur_of, restore_cell
 from lensmodel.correction.compiled.tile import add
 from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver
 from lensmodel.correction.engine import keep_freed_memory, tell_of_compiling
@@ -42,6 +42,9 @@ PsfError = Callable[[FieldPosition, Channel], float] | float
 
 
 KERNEL_SIZE = 55  # pixels: the largest kernel that the paper estimates
+KEPT = 640
+"""Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
+megapixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,10 +181,16 @@ def correct_planes(
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
     solver = deconvolvers.create(method) if isinstance(method, str) else method
+    posteriors = _posteriors_of(field, psf_error)
+
+    @lru_cache(maxsize=KEPT)
+    def blur_at(position: FieldPosition, channel: Channel, share: float) -> UniformBlur:
+        return blur_of(posteriors(position, channel), lateral, position, channel, share)
+
     job = CorrectionJob(
         planes,
-        _posteriors_of(field, psf_error),
-        lateral,
+        posteriors,
+        blur_at,
         frame,
         solver,
         strength,
@@ -232,12 +241,9 @@ def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
 def _posteriors_of(
     field: PsfField, psf_error: PsfError | None
 ) -> Callable[[FieldPosition, Channel], PsfPosterior]:
-    """The posterior of the PSF of one channel at one place, cached.
+    """The posterior of the PSF of one channel at one place, cached."""
 
-    Each serves its own cell and its neighbours; the cache holds three rows of cells of 100 megapixels.
-    """
-
-    @lru_cache(maxsize=640)
+    @lru_cache(maxsize=KEPT)
     def posterior(position: FieldPosition, channel: Channel) -> PsfPosterior:
         error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
         return PsfPosterior.of_error(

@@ -116,8 +116,7 @@ class Bench:
             for planes in (scene + np.float32(lift), np.full_like(scene, lift))
         )
         clean = np.maximum(lifted.clean - dark.clean, 0.0)
-        mosaic, planes = self.camera.mosaic(clean, rng), self.camera.develop(clean, rng)
-        return replace(lifted, clean=clean, mosaic=mosaic, planes=planes)
+        return replace(lifted, clean=clean, mosaic=self.camera.mosaic(clean, rng))
 
     def row(self, kind: str, folder: Path, detail: int, size: int, channels: Sequence[Channel]) -> list[str]:
         """Measure in one way, and compare with the truth: places, errors, what was expected, CPU seconds."""

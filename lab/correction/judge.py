@@ -118,7 +118,7 @@ def taken(case: Case, zone: str, rng: np.random.Generator) -> tuple[FrameWindow,
     )
     light, sharp = (camera.balanced(planes[:, :height, :width]) for planes in (at.light, at.scene))
     truth = Truth(lens, camera, LensSettings(aperture=aperture), "", 1.0, BlurOptions(), 0)
-    shot = SimulatedPhoto(camera.mosaic(light, rng), light, light, sharp, truth)
+    shot = SimulatedPhoto(camera.mosaic(light, rng), light, sharp, truth)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "a.dng"
         write_photo(path, shot)

@@ -4,7 +4,6 @@ from lensmodel.photo.development import develop
 from lensmodel.photo.headers.sniffing import HEAD_BYTES, sniff
 from lensmodel.photo.inspection import inspect
 from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.raw import Demosaic
 from lensmodel.photo.tags.metadata import is_placeholder, read_metadata
 from lensmodel.photo.values import (
     ColorSpace,
@@ -22,7 +21,6 @@ from lensmodel.photo.writing import shown, upright, write_image
 __all__ = [
     "HEAD_BYTES",
     "ColorSpace",
-    "Demosaic",
     "Encoding",
     "FileKind",
     "LensIdentity",

@@ -20,7 +20,7 @@ from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
-from lensmodel.photo.raw import Demosaic, develop_raw, opened_raw, stored_levels
+from lensmodel.photo.raw import develop_raw, opened_raw, stored_levels
 from lensmodel.photo.siblings import suspects_of_siblings
 from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
 from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer, remarks_log
@@ -30,7 +30,6 @@ def develop(
     path: Path | str,
     *,
     limits: Limits | None = None,
-    demosaic: Demosaic = "default",
     on_info: Callable[[PhotoInfo], None] | None = None,
     siblings: Iterable[Path] = (),
 ) -> LinearPhoto:
@@ -46,8 +45,6 @@ def develop(
         The file.
     limits : Limits, optional
         How large it may be; checked before decoding.
-    demosaic : {"default", "ahd", "dht", "linear", "half"}
-        Demosaicing of RAW; "half" makes one pixel of each 2 x 2 cell, without interpolation.
     on_info : callable, optional
         Called with what `inspect` returns before anything is decoded; raising there refuses the photo.
     siblings : iterable of Path
@@ -68,8 +65,6 @@ def develop(
         One of its kinds, if the file cannot be decoded or holds no picture.
     ImageTooLargeError
         If it is larger than the limits allow.
-    InvalidInputError
-        If there is no such demosaicing.
 
     References
     ----------
@@ -82,7 +77,7 @@ def develop(
             with opened_raw(path) as raw:
                 info = _accepted(info_of(path, header, limits, raw), on_info)
                 others = suspects_of_siblings(path, info.metadata, siblings, limits)
-                developed = _develop_raw(raw, header, info, demosaic, others)
+                developed = _develop_raw(raw, header, info, others)
         else:
             info = _accepted(info_of(path, header, limits), on_info)
             developed = _develop_raster(path, header, info)
@@ -98,19 +93,16 @@ def _accepted(info: PhotoInfo, on_info: Callable[[PhotoInfo], None] | None) -> P
 
 
 def _develop_raw(
-    file: rawpy.RawPy, header: Header, info: PhotoInfo, demosaic: Demosaic, others: Sequence[Suspects]
+    file: rawpy.RawPy, header: Header, info: PhotoInfo, others: Sequence[Suspects]
 ) -> LinearPhoto:
-    raw = develop_raw(file, demosaic, header.white, others)
+    raw = develop_raw(file, header.white, others)
     _, height, width = raw.planes.shape
-    metadata, binned = info.metadata, max(round(info.width / width), 1)
-    if metadata.pixel_pitch_um is not None:
-        metadata = replace(metadata, pixel_pitch_um=binned * metadata.pixel_pitch_um)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
     steps = [] if header.coarseness else opcodes.read(header.opcodes_2)
     kept, lost = (steps, []) if raw.pipeline.startswith("raw/none") else opcodes.demosaiced(steps, raw.cfa)
     encoding = Encoding(
         bit_depth=raw.bits,
-        metadata=metadata.without_serials(),
+        metadata=info.metadata.without_serials(),
         white_balance=raw.white_balance,
         to_srgb=raw.to_srgb,
         xyz_to_camera=raw.xyz_to_camera,
@@ -123,7 +115,7 @@ def _develop_raw(
         frame=Frame(height, width),
         noise=raw.noise,
         clip=raw.clip,
-        info=replace(info, width=width, height=height, metadata=metadata),
+        info=replace(info, width=width, height=height),
         encoding=encoding,
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,

@@ -8,14 +8,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import (
-    InvalidInputError,
     LensModelError,
     RawDecodeError,
     TruncatedImageError,
@@ -31,26 +30,12 @@ from lensmodel.photo.values import LensIdentity, Matrix3, PhotoMetadata, PlaneNo
 
 log = logging.getLogger(__name__)
 
-Demosaic = Literal["default", "ahd", "dht", "linear", "half"]
+_NOISE_MIX: Final = np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]])
+"""Share of the variance of each colour's pixels (column) in each plane that AHD makes (row): measured on flat
+fields, as the tests do again.
 
-_ALGORITHMS: Final = {
-    "ahd": rawpy.DemosaicAlgorithm.AHD,
-    "dht": rawpy.DemosaicAlgorithm.DHT,
-    "linear": rawpy.DemosaicAlgorithm.LINEAR,
-    "half": rawpy.DemosaicAlgorithm.LINEAR,
-}
-_NOISE_MIX: Final = {
-    "ahd": np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]]),
-    "dht": np.array([[0.48, 0.42, 0.06], [0.06, 0.77, 0.06], [0.06, 0.42, 0.48]]),
-    "linear": np.diag([0.5625, 0.625, 0.5625]),
-    "half": np.diag([1.0, 0.5, 1.0]),
-}
-"""Share of the variance of each colour's pixels (column) in each demosaiced plane (row).
-
-For "linear" and "half" these are the sums of squared weights; for the others they were measured
-on flat fields, as the tests do again. The noise of the planes is not white: whatever the
-method, its power at low frequencies is about 3.7 times that of the sensor in red and blue and
-1.9 times in green, and at the highest it is about half.
+The noise of the planes is not white: its power at low frequencies is about 3.7 times that of the sensor in
+red and blue and 1.9 times in green, and at the highest it is about half.
 """
 
 _FULL: Final = 65535.0  # 16 bits
@@ -134,7 +119,6 @@ def exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
 
 def develop_raw(
     raw: rawpy.RawPy,
-    demosaic: Demosaic = "default",
     linear_white: tuple[int, ...] = (),
     others: Sequence[Suspects] = (),
 ) -> DevelopedRaw:
@@ -144,11 +128,6 @@ def develop_raw(
     1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
     states, of all channels or of each; `others` tell what other photos of the body show of its defects.
     """
-    method = "ahd" if demosaic == "default" else demosaic
-    if method not in _ALGORITHMS:
-        raise InvalidInputError(
-            f"no demosaicing {demosaic!r}; known: default, {', '.join(sorted(_ALGORITHMS))}"
-        )
     mosaic = Mosaic.of(raw)
     white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
     if mosaic is not None:
@@ -158,27 +137,27 @@ def develop_raw(
     defects = 0 if mosaic is None else mosaic.repair(others)
     balance = _white_balance(raw, mosaic)
     spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
-    planes = _developed(raw, method, white, balance, spans)
+    planes = _developed(raw, white, balance, spans)
     to_srgb, xyz_to_camera = _colour(raw, balance)
     return DevelopedRaw(
         planes=planes,
-        noise=_plane_noise(planes, sensor_noise, method, balance),
+        noise=_plane_noise(planes, sensor_noise, balance),
         sensor_noise=sensor_noise,
         clip=clip,
         white_balance=balance,
         to_srgb=None if to_srgb is None else matrix3(to_srgb),
         xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
         bits=max(1, white.bit_length()),
-        pipeline=f"raw/{_pipeline_step(mosaic, method)}/1",
-        cfa=None if mosaic is None or method == "half" else mosaic.bayer_pattern(),
+        pipeline=f"raw/{_pipeline_step(mosaic)}/1",
+        cfa=None if mosaic is None else mosaic.bayer_pattern(),
         defects=defects,
     )
 
 
-def _pipeline_step(mosaic: Mosaic | None, method: str) -> str:
+def _pipeline_step(mosaic: Mosaic | None) -> str:
     if mosaic is None:
         return "none"
-    return method if mosaic.is_bayer else "xtrans"  # for which LibRaw has one method only
+    return "ahd" if mosaic.is_bayer else "xtrans"
 
 
 def _spans(raw: rawpy.RawPy, white: tuple[int, ...]) -> NDArray[np.float64] | None:
@@ -193,7 +172,6 @@ def _spans(raw: rawpy.RawPy, white: tuple[int, ...]) -> NDArray[np.float64] | No
 
 def _developed(
     raw: rawpy.RawPy,
-    method: str,
     white: int,
     balance: tuple[float, float, float],
     spans: NDArray[np.float64] | None,
@@ -211,8 +189,7 @@ def _developed(
     if spans is not None:
         saturation = round(spans.max())
     developed = raw.postprocess(
-        demosaic_algorithm=_ALGORITHMS[method],
-        half_size=method == "half",
+        demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
         gamma=(1, 1),
         no_auto_bright=True,
         output_bps=16,
@@ -248,7 +225,7 @@ def _sensor_noise(mosaic: Mosaic | None, white: int) -> PlaneNoise | None:
 
 
 def _plane_noise(
-    planes: Planes, sensor: PlaneNoise | None, method: str, balance: tuple[float, float, float]
+    planes: Planes, sensor: PlaneNoise | None, balance: tuple[float, float, float]
 ) -> PlaneNoise:
     """Variance of each plane's pixels, from that of the sensor where it is known.
 
@@ -261,9 +238,8 @@ def _plane_noise(
         r, g, b = (estimate_noise(plane, step=1 / _FULL, codes=stored_levels(plane)) for plane in planes)
         return r, g, b
     weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
-    mix = _NOISE_MIX[method]
-    shot = (mix * weight) @ np.array([model.shot for model in sensor])
-    read = (mix * weight**2) @ np.array([model.read for model in sensor])
+    shot = (_NOISE_MIX * weight) @ np.array([model.shot for model in sensor])
+    read = (_NOISE_MIX * weight**2) @ np.array([model.read for model in sensor])
     r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
     return r, g, b
 

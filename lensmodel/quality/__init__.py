@@ -1,7 +1,7 @@
 """Sharpness and fidelity: slanted edges, MTF, PSNR by zone."""
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
-from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
+from lensmodel.quality.edge import EdgeResponse, crossing, slanted_edge
 from lensmodel.quality.edge_finder import find_edges
 from lensmodel.quality.images import best_shift, registered_zone_psnr, shifted, to_srgb
 from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
@@ -17,7 +17,6 @@ __all__ = [
     "measure_edges",
     "mtf50_from_kernel",
     "mtf_from_kernel",
-    "pixel_mtf",
     "registered_zone_psnr",
     "shifted",
     "slanted_edge",

@@ -53,9 +53,7 @@ class ZoneSharpness:
     overshoot: float  # largest of the zone, percent of the step
 
 
-def measure_edges(
-    plane: NDArray[np.floating], boxes: Sequence[Box], *, rendered: bool = False
-) -> tuple[EdgeMeasurement, ...]:
+def measure_edges(plane: NDArray[np.floating], boxes: Sequence[Box]) -> tuple[EdgeMeasurement, ...]:
     """Measure the slanted edges of a photo."""
     frame = Frame(*plane.shape)
     measured = []
@@ -74,7 +72,7 @@ def measure_edges(
                 box=box,
                 position=position,
                 direction=direction_of(response.normal, position),
-                response=response.compensated() if rendered else response,
+                response=response,
             )
         )
     if not measured:

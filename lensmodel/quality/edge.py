@@ -45,12 +45,8 @@ class EdgeResponse:
 
     frequencies: NDArray[np.float64]  # (n,), cycles/pixel along the normal of the edge, 0 to 1
     mtf: NDArray[np.float64]  # (n,), contrast, 1 at zero frequency
-    # lowest frequency in cycles/pixel where the contrast falls to half of that at zero, and to half of its
-    # largest value (robust to oversharpening); 1.0 where it does not fall so far
-    mtf50: float
-    mtf50p: float
+    mtf50: float  # lowest frequency where the contrast falls to a half; 1.0 where it does not fall so far
     mtf_max: float  # largest contrast up to 0.5 cycles/pixel; above 1 means oversharpened
-    mtf_nyquist: float  # contrast at 0.5 cycles/pixel
     # how far the edge profile rises above its bright level and falls below its dark one, in percent of the
     # step
     overshoot: float
@@ -65,29 +61,6 @@ class EdgeResponse:
         """Slant: angle in degrees between the edge and the nearer of row and column axis, 0 to 45."""
         folded = abs(math.degrees(self.normal)) % 90.0
         return min(folded, 90.0 - folded)
-
-    def contrast(self, frequencies: ArrayLike) -> NDArray[np.float64]:
-        """Contrast at any frequencies in cycles/pixel, linearly interpolated."""
-        return np.interp(np.asarray(frequencies, dtype=np.float64), self.frequencies, self.mtf)
-
-    def compensated(self) -> EdgeResponse:
-        """Return the response without the pixel box of an area-sampled target.
-
-        A chart that is rendered pixel by pixel has been integrated over the pixel once already::
-
-            mtf / (|sinc(f cos)| |sinc(f sin)|)
-        """
-        return _response(
-            self.frequencies,
-            self.mtf / np.maximum(pixel_mtf(self.frequencies, self.normal), 1.0 / _MAX_CORRECTION),
-            self,
-        )
-
-
-def pixel_mtf(frequencies: ArrayLike, angle: float) -> NDArray[np.float64]:
-    """Contrast that a square pixel leaves of a wave whose normal has this angle."""
-    f = np.asarray(frequencies, dtype=np.float64)
-    return np.abs(np.sinc(f * math.cos(angle)) * np.sinc(f * math.sin(angle)))
 
 
 def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float:
@@ -138,40 +111,17 @@ def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     normal = math.atan2(-d_row, d_col)
     dark, bright = _levels(distance, esf)
     step = bright - dark
-    empty = EdgeResponse(
+    return EdgeResponse(
         frequencies=frequencies,
         mtf=mtf,
-        mtf50=0.0,
-        mtf50p=0.0,
-        mtf_max=0.0,
-        mtf_nyquist=0.0,
+        mtf50=crossing(frequencies, mtf, 0.5),
+        mtf_max=float(mtf[frequencies <= 0.5 + 1e-9].max()),
         overshoot=max(float(esf.max()) - bright, 0.0) / step * 100.0,
         undershoot=max(dark - float(esf.min()), 0.0) / step * 100.0,
         normal=normal,
         step=step,
         esf_distance=distance,
         esf=esf,
-    )
-    return _response(frequencies, mtf, empty)
-
-
-def _response(frequencies: NDArray[np.float64], mtf: NDArray[np.float64], like: EdgeResponse) -> EdgeResponse:
-    inside = frequencies <= 0.5 + 1e-9
-    peak = float(mtf[inside].max())
-    beyond_peak = int(np.argmax(np.where(inside, mtf, 0.0)))
-    return EdgeResponse(
-        frequencies=frequencies,
-        mtf=mtf,
-        mtf50=crossing(frequencies, mtf, 0.5),
-        mtf50p=crossing(frequencies[beyond_peak:], mtf[beyond_peak:], 0.5 * peak),
-        mtf_max=peak,
-        mtf_nyquist=float(np.interp(0.5, frequencies, mtf)),
-        overshoot=like.overshoot,
-        undershoot=like.undershoot,
-        normal=like.normal,
-        step=like.step,
-        esf_distance=like.esf_distance,
-        esf=like.esf,
     )
 
 

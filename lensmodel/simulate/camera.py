@@ -28,7 +28,7 @@ from scipy.interpolate import CubicSpline
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes, StepHook, ignore_step
-from lensmodel.photo.dng import XYZ_TO_SRGB, ShotInfo, write_bayer_dng, write_linear_dng
+from lensmodel.photo.dng import XYZ_TO_SRGB, ShotInfo, write_bayer_dng
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
 logger = logging.getLogger(__name__)
@@ -119,12 +119,6 @@ class SimulatedCamera:
         light = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
         return self._numbers(self._noisy(light, rng))
 
-    def develop(self, planes: Planes, rng: np.random.Generator | None) -> Planes:
-        """Three full planes with noise, quantised and clipped at 1: a sensor without a mosaic."""
-        self._check(planes)
-        numbers = self._numbers(self._noisy(planes, rng)).astype(np.float32)
-        return (numbers - np.float32(self.black)) / np.float32(self.white - self.black)
-
     def _check(self, planes: Planes) -> None:
         expected = (len(CHANNELS), self.height, self.width)
         if planes.shape != expected:
@@ -165,8 +159,6 @@ class SimulatedPhoto:
     """A simulated photo and its truth."""
 
     mosaic: NDArray[np.uint16]  # (height, width), raw numbers
-    # (3, height, width), sensor values of all channels without a mosaic, with noise and clipping of their own
-    planes: Planes
     clean: Planes  # (3, height, width), the light on the sensor: before noise, quantisation and clipping
     # (3, height, width), the same without blur, lateral colour and vignetting: what a correction should reach
     sharp: Planes
@@ -230,7 +222,6 @@ def photograph(
     logger.info("simulated photo of %s at f/%s", lens.model, settings.aperture)
     return SimulatedPhoto(
         mosaic=camera.mosaic(clean, rng),
-        planes=camera.develop(clean, rng),
         clean=clean,
         sharp=camera.balanced(sharp * np.float32(exposure)),
         truth=truth,
@@ -491,22 +482,12 @@ def write_photo(
     path: str | Path,
     photo: SimulatedPhoto,
     *,
-    demosaiced: bool = False,
     taken_at: datetime | None = None,
     orientation: int = 1,
 ) -> None:
-    """Write a simulated photo as DNG: its mosaic, or its three full planes as a linear DNG."""
+    """Write the mosaic of a simulated photo as DNG."""
     camera = photo.truth.camera
     info = shot_info(photo, taken_at=taken_at, orientation=orientation)
-    if demosaiced:
-        write_linear_dng(
-            path,
-            np.clip(np.rint(photo.planes * np.float32(65535.0)), 0, 65535).astype(np.uint16),
-            color_matrix=camera.color_matrix,
-            as_shot_neutral=camera.as_shot_neutral,
-            shot=info,
-        )
-        return
     write_bayer_dng(
         path,
         photo.mosaic,

@@ -15,7 +15,6 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.core import codec
 from lensmodel.core.errors import (
-    InvalidInputError,
     RawDecodeError,
     TruncatedImageError,
     UnsupportedFormatError,
@@ -77,12 +76,6 @@ def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, p
     at_sites = np.take_along_axis(developed.planes, channel[None], axis=0)[0]
     inside = (slice(8, -8), slice(8, -8))
     np.testing.assert_allclose(at_sites[inside], ((mosaic - BLACK) / (WHITE - BLACK))[inside], atol=2e-4)
-
-
-def test_half_size_planes_have_no_mosaic_any_more(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
-
-    assert photo.develop(tmp_path / "x.dng", demosaic="half").cfa is None
 
 
 def test_the_brightest_pixel_does_not_become_the_white(tmp_path: Path) -> None:
@@ -167,14 +160,13 @@ def test_raw_stays_in_sensor_orientation(tmp_path: Path, orientation: int) -> No
     assert developed.encoding.orientation == orientation
 
 
-@pytest.mark.parametrize("demosaic", ["ahd", "dht"])
-def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path, demosaic: photo.Demosaic) -> None:
+def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path) -> None:
     neutral = np.array([0.4, 1.0, 0.6])
     rows, cols = np.mgrid[:128, :128]
     grey = 0.4 + 0.2 * np.sin(2 * np.pi * cols / 5.0) * np.cos(2 * np.pi * rows / 7.0)  # 0.24 cycles/pixel
     mosaic = raw_numbers(grey * neutral[np.tile([[0, 1], [1, 2]], (64, 64))])
     write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, as_shot_neutral=neutral)
-    planes = photo.develop(tmp_path / "x.dng", demosaic=demosaic).planes
+    planes = photo.develop(tmp_path / "x.dng").planes
 
     for plane, share in zip(planes[:, 16:-16, 16:-16], neutral, strict=True):
         truth = (grey * share)[16:-16, 16:-16]
@@ -182,38 +174,10 @@ def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path, demosai
         assert slope == pytest.approx(1.0, abs=0.12)
 
 
-def test_half_size_makes_one_pixel_of_each_cell(tmp_path: Path) -> None:
-    mosaic = raw_numbers(textured(64, 96))
-    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
-    developed = photo.develop(tmp_path / "x.dng", demosaic="half")
-
-    assert developed.planes.shape == (3, 32, 48)
-    assert (developed.frame.height, developed.info.width) == (32, 48)
-    red = (mosaic[::2, ::2].astype(float) - BLACK) / (WHITE - BLACK)
-    agree(developed.planes[0], red, atol=2e-4)
-
-
-def test_pixels_of_half_size_planes_are_twice_as_wide(tmp_path: Path) -> None:
-    mosaic, shot = raw_numbers(textured(64, 96)), ShotInfo(pixel_pitch_um=5.0)
-    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, shot=shot)
-    whole, half = (photo.develop(tmp_path / "x.dng", demosaic=how) for how in ("linear", "half"))
-
-    assert whole.info.metadata.pixel_pitch_um == pytest.approx(5.0)
-    assert half.info.metadata.pixel_pitch_um == pytest.approx(10.0)
-    assert half.encoding.metadata.pixel_pitch_um == pytest.approx(10.0)
-
-
 def test_the_pipeline_names_what_was_done(tmp_path: Path) -> None:
     write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
 
     assert photo.develop(tmp_path / "x.dng").pipeline == "raw/ahd/1"
-    assert photo.develop(tmp_path / "x.dng", demosaic="linear").pipeline == "raw/linear/1"
-
-
-def test_an_unknown_demosaicing_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
-    with pytest.raises(InvalidInputError, match="ahd, dht, half, linear"):
-        photo.develop(tmp_path / "x.dng", demosaic="magic")  # type: ignore[arg-type]
 
 
 def test_a_linear_dng_keeps_its_planes(tmp_path: Path) -> None:

@@ -112,17 +112,19 @@ def middle_of(shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
 def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0) -> Iterator[list[str]]:
     """Learn a lens from some photos and correct another one: a row for each number of photos."""
     samples: list[list[PsfSample]] = []
-    for number in range(max(counts)):
-        path = folder / f"{lens.number}-{number}.dng"
+    shots = [folder / f"{lens.number}-{number}.dng" for number in range(max(counts))]
+    for number, path in enumerate(shots):
         lens.shot(number, path)
+    for path in shots:
+        config = sampling.Config(lens.settings)
         try:
-            samples.append(sampling.samples_of_photo(path, sampling.Config(lens.settings), workers=1))
+            samples.append(sampling.samples_of_photo(path, config, workers=1, siblings=shots))
         except NotEnoughEvidenceError:
             samples.append([])
     truth = replace(lens, hot=0).shot(max(counts), folder / "clean.dng", crop)
     clean = photo.develop(folder / "clean.dng")
     lens.shot(max(counts), folder / "last.dng", crop)
-    developed = photo.develop(folder / "last.dng")
+    developed = photo.develop(folder / "last.dng", siblings=shots)
     for count in counts:
         known = [sample for own in samples[:count] for sample in own]
         if not known:

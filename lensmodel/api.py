@@ -210,7 +210,8 @@ def correct(
     quality : int
         Of a JPEG, 1..100.
     least_gain_db : float, optional
-        Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
+        Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`), which a forecast decides
+        before the work where it can; None always writes.
     sidecar : bool
         Write an XMP file beside the corrected photo too, `c.tif.xmp` of `c.tif`, which tells what was done.
     keep_location : bool
@@ -272,6 +273,7 @@ def correct(
         bounds=bounds,
         lateral=lateral_of(developed),
         photo="" if source is None else photo_id(source),
+        least_gain_db=least_gain_db,
         workers=workers or os.cpu_count() or 1,
         on_step=on_step,
     )

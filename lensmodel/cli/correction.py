@@ -176,7 +176,7 @@ def correct_one(
         raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
     if why is not None:
         display.note(f"{path}: {why}; it is corrected all the same, as you asked")
-    elif not identity.names_lens:
+    elif not identity.names_lens and options.least_gain_db is None:  # else it was sorted by its camera
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
     if settings.aperture is None and said.aperture is None:
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")

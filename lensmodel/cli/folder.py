@@ -1,8 +1,6 @@
 """`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains.
 
-A folder of photos, sorted by what took them: one copy of a lens, one focal length.
-
-What a run over a folder found out and need not find out again: a small JSON file beside its results.
+What a run found out and need not find out again is kept in a small JSON file beside its results.
 """
 
 from __future__ import annotations
@@ -27,11 +25,10 @@ from lensmodel import correction as corrections
 from lensmodel.cli import calibrate, correction, files
 from lensmodel.cli.console import Display, aligned, gain_words
 from lensmodel.core import processes
-from lensmodel.core.errors import LensModelError
+from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.types import LensSettings
-from lensmodel.correction.expected_gain import WORTH_DB
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
 from lensmodel.workflow import calibrating, sampling
@@ -41,6 +38,15 @@ from lensmodel.workflow.lens import Lens
 LEARN_FROM: Final = 8
 """Photos that a group is learned from: five are the advice (docs/guide.md), three more for other
 apertures (chosen); each takes about a minute."""
+
+SEEN_DB: Final = 0.3
+"""Expected gain of a photo below which it is left as it is (chosen): at 0.2 dB nobody saw a difference in
+photos enlarged three times."""
+
+_UNSURE: Final = 0.5
+"""Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)."""
+
+_SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
 
 PROFILES: Final = "lenses"
 ENDING: Final = ".lensprofile"
@@ -92,16 +98,15 @@ def run(
             corrections.deconvolvers.create(options.method)
         LensSettings(aperture=options.aperture)
     base = next(iter({**targets, **twice})).parent
-    options = replace(options, least_gain_db=WORTH_DB)
+    options = replace(options, least_gain_db=SEEN_DB)
     shots, failed = _read(list(targets.values()), display)
     results = [*correction.clashes(twice, display), *failed]
     lens_groups = groups(shots)
     by_path = {path: target for target, path in targets.items()}
     with processes.pool(None, options.workers) as pool, display.progress() as bars:
         work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display, pool)
-        for group in lens_groups:
-            work.learn(group, bars)
-        rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in lens_groups]
+        work.learn(lens_groups, bars)
+        rows = work.correct(lens_groups, by_path, bars, results, as_json=as_json)
     if as_json:
         display.document({"groups": [_document(row) for row in rows], "results": results})
     else:
@@ -140,28 +145,36 @@ class _Folder:
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
         self._calibrations: dict[Path, calibrating.Calibration] = {}
+        self._refused: dict[Path, LensModelError | OSError] = {}  # photos that taught nothing, and why
 
     def profile_of(self, group: PhotoGroup) -> Path:
         """Name the file of a group's lens profile."""
         return self._profiles / f"{group.name}{ENDING}"
 
-    def learn(self, group: PhotoGroup, bars: Progress) -> None:
-        """Learn a group's lens from its usable photos, at most as many as the options say."""
+    def learn(self, lens_groups: Sequence[PhotoGroup], bars: Progress) -> None:
+        """Learn the lenses of all groups from their usable photos, at most as many as the options say."""
+        most = [min(self._learning.most, group.scenes) for group in lens_groups]
+        task = bars.add_task("", total=sum(most))
+        for number, group in enumerate(lens_groups):
+            self._learn(group, most[number], bars, task, sum(most[:number]))
+        bars.remove_task(task)
+
+    def _learn(self, group: PhotoGroup, most: int, bars: Progress, task: TaskID, before: int) -> None:
         target = self.profile_of(group)
         if target not in self._calibrations:
             self._calibrations[target] = self._calibration(target)
-        calibrated = self._calibrations[target]
-        counted, most = 0, min(self._learning.most, group.scenes)
-        task = bars.add_task(f"learning {group.lens}", total=most)
+        calibrated, counted = self._calibrations[target], 0
         for shot in group.to_learn_from():
             if counted == most:
                 break
-            if self._learns(calibrated, shot, partial(_learning, bars, task, counted)):
+            on_event = partial(_learning, bars, task, before + counted)
+            if self._learns(calibrated, shot, group, on_event):
                 counted += 1
-                bars.update(task, completed=counted)
-        if not counted:
+        bars.update(task, completed=before + most)
+        if not counted and all(
+            isinstance(self._refused[shot.path], NotEnoughEvidenceError) for shot in group.shots
+        ):
             self._display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from")
-        bars.remove_task(task)
         self._learned[group.name, group.focal] = counted
 
     def _calibration(self, target: Path) -> calibrating.Calibration:
@@ -175,69 +188,94 @@ class _Folder:
         )
         return calibrate.calibration_of(target, options, self._pool)
 
-    def _learns(self, calibrated: calibrating.Calibration, shot: Shot, on_event: sampling.EventHook) -> bool:
+    def _learns(
+        self,
+        calibrated: calibrating.Calibration,
+        shot: Shot,
+        group: PhotoGroup,
+        on_event: sampling.EventHook,
+    ) -> bool:
         """Learn from one photo; return whether it counts, now or from an earlier run."""
         photo = sampling.photo_id(shot.path)
         learning, options = self._learning, self._options
         under = (
             f"{learning.estimator}, {learning.selector}, aperture {options.aperture}, any {options.any_lens}"
         )
-        refused = self._journal.verdict("not learned from", photo, under)
-        if refused is not None:
-            self._display.detail(f"{shot.path}: {refused}")
+        known = self._journal.verdict("not learned from", photo, under)
+        if known is not None:
+            self._refused[shot.path] = NotEnoughEvidenceError(known)
+            self._display.detail(f"{shot.path}: {known}")
             return False
         try:
-            calibrated.add(shot.path, on_event=on_event)
-        except LensModelError as error:
+            calibrated.add(shot.path, siblings=group.paths, on_event=on_event)
+        except NotEnoughEvidenceError as error:
             self._journal.note("not learned from", photo, under, str(error))
+            self._refused[shot.path] = error
             self._display.detail(f"{shot.path}: {error}")
             return False
-        except OSError as error:  # another time it may be readable
-            self._display.detail(f"{shot.path}: {files.reason(error)}")
+        except (LensModelError, OSError) as error:  # is found again at once, or may be mended meanwhile
+            self._refused[shot.path] = error
             return False
         return True
 
     def correct(
         self,
-        group: PhotoGroup,
+        lens_groups: Sequence[PhotoGroup],
         targets: Mapping[Path, Path],
         bars: Progress,
         results: list[dict[str, Any]],
         *,
         as_json: bool,
-    ) -> GroupResult:
-        """Correct the photos of a group that gain from it; leave the others."""
-        profile = self.profile_of(group)
-        lens = Lens(files.profile_at(profile)) if profile.exists() else None
-        states: Counter[str] = Counter()
-        gains: list[float] = []
-        task = bars.add_task(f"correcting {group.lens}", total=len(group.shots))
-        for number, shot in enumerate(group.shots):
-            bars.update(task, description=f"correcting {shot.path.name}")
-            target = targets[shot.path]
-            result = self._correct_shot(
-                shot, target, lens, partial(correction.show_share, bars, task, number)
-            )
-            states[result["state"]] += 1
-            self._say(shot.path, target, result, as_json=as_json)
-            if result["state"] == "corrected":
-                gains.append(result["expected_gain_db"])
-            results.append({"photo": str(shot.path), "output": str(target), **result})
-            bars.update(task, completed=number + 1)
+    ) -> list[GroupResult]:
+        """Correct the photos of all groups that gain from it; leave the others."""
+        task = bars.add_task("", total=sum(len(group.shots) for group in lens_groups))
+        rows, number = [], 0
+        for group in lens_groups:
+            profile = self.profile_of(group)
+            lens = Lens(files.profile_at(profile)) if profile.exists() else None
+            states: Counter[str] = Counter()
+            left: Counter[str] = Counter()
+            gains: list[float] = []
+            for shot in group.shots:
+                bars.update(task, description=f"correcting {shot.path.name}")
+                target = targets[shot.path]
+                share = partial(correction.show_share, bars, task, number)
+                result = self._correct_shot(shot, group, target, lens, share)
+                states[result["state"]] += 1
+                left[result.get("reason", "")] += 1
+                often = left[result.get("reason", "")] > _SAID
+                self._say(shot.path, target, result, as_json=as_json, often=often)
+                if result["state"] == "corrected":
+                    gains.append(result["expected_gain_db"])
+                results.append({"photo": str(shot.path), "output": str(target), **result})
+                number += 1
+                bars.update(task, completed=number)
+            learned = self._learned[group.name, group.focal]
+            rows.append(GroupResult(group, profile, learned, states, tuple(gains)))
         bars.remove_task(task)
-        return GroupResult(group, profile, self._learned[group.name, group.focal], states, tuple(gains))
+        return rows
 
     def _correct_shot(
-        self, shot: Shot, target: Path, lens: Lens | None, on_step: Callable[[int, int], None]
+        self,
+        shot: Shot,
+        group: PhotoGroup,
+        target: Path,
+        lens: Lens | None,
+        on_step: Callable[[int, int], None],
     ) -> dict[str, Any]:
+        refused = self._refused.get(shot.path)
+        if isinstance(refused, UnreadablePhotoError) or (
+            lens is None and refused is not None and not isinstance(refused, NotEnoughEvidenceError)
+        ):
+            return files.failed(refused)
         if lens is None:
-            return {"state": "left", "reason": "its lens could not be learned from these photos"}
+            return {"state": "left", "reason": "no photo of its lens shows enough to learn the blur from"}
         photo = sampling.photo_id(shot.path)
         samples = len(lens.profile.model.samples)
         options = self._options
         under = (
             f"{target.name}, {samples} samples, {options.method or 'standard'}, "
-            f"strength {options.strength:g}, {options.bounds}, aperture {options.aperture}"
+            f"strength {options.strength:g}, {options.bounds}, aperture {options.aperture}, least {SEEN_DB:g}"
         )
         known = self._journal.verdict("left", photo, under)
         if known is not None and not self._options.force:
@@ -245,20 +283,24 @@ class _Folder:
         settings = LensSettings(aperture=self._options.aperture)
         try:
             result = correction.correct_one(
-                shot.path, target, lens, settings, self._options, self._display, on_step
+                shot.path, target, lens, settings, self._options, self._display, on_step, group.paths
             )
         except (LensModelError, OSError) as error:
             return files.failed(error)
         if result["state"] == "left":
-            result["reason"] = "next to nothing would be gained"
+            result["reason"] = why_left(result, lossy=shot.lossy)
             self._journal.note("left", photo, under, result["reason"])
         return result
 
-    def _say(self, path: Path, target: Path, result: Mapping[str, Any], *, as_json: bool) -> None:
+    def _say(
+        self, path: Path, target: Path, result: Mapping[str, Any], *, as_json: bool, often: bool
+    ) -> None:
         if result["state"] == "failed":
             self._display.error(f"{path}: {result['reason']}")
         elif result["state"] == "left":
-            self._display.detail(f"{path}: left as it is, {result['reason']}")
+            (self._display.detail if often else self._display.note)(
+                f"{path}: left as it is: {result['reason']}"
+            )
         elif result["state"] == "kept":
             self._display.detail(f"{target} is there already and was left alone; --force replaces it")
         else:
@@ -266,6 +308,21 @@ class _Folder:
                 self._display.detail(f"{target}: {gain_words(result['expected_gain_db'])} expected")
             for line in correction.remarks(result):
                 self._display.detail(f"{path.name}, {line}")
+
+
+def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
+    """Say in a sentence why a photo is not worth correcting."""
+    zones = result["zones"].values()
+    error = sum(zone.cells * zone.psf_error for zone in zones) / max(sum(zone.cells for zone in zones), 1)
+    why = (
+        "not enough is known about its lens yet; take more photos that are full of detail"
+        if error > _UNSURE
+        else "the camera has sharpened and compressed it, and no more can be restored safely"
+        if lossy
+        else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
+    )
+    gain = gain_words(max(result["expected_gain_db"], 0.0))
+    return f"a correction would gain too little to be seen ({gain}): {why}"
 
 
 def _learning(bars: Progress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
@@ -331,13 +388,15 @@ class Shot:
     path: Path
     metadata: PhotoMetadata
     half_diagonal_mm: float = 0.0
+    lossy: bool = False
 
     @classmethod
     def of(cls, path: Path) -> Shot:
         """Read the header of a photo."""
         info = inspect(path)
         pitch = info.metadata.pixel_pitch_um or 0.0
-        return cls(path, info.metadata, math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0)
+        half = math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0
+        return cls(path, info.metadata, half, lossy=info.kind == "jpeg")
 
     @property
     def owner(self) -> tuple[str, ...]:
@@ -384,6 +443,11 @@ class PhotoGroup:
             return "unknown"
         low, high = f"{min(known):.3g}", f"{max(known):.3g}"
         return f"{low} mm" if low == high else f"{low}-{high} mm"
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files."""
+        return [shot.path for shot in self.shots]
 
     @property
     def scenes(self) -> int:

@@ -16,17 +16,20 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-_SURE_SIGMAS, _SIGMAS = 25.0, 10.0
-"""Least height above the neighbours of the colour, in standard deviations of the noise, in one photo and in
-each of several (chosen): less does no harm, and faint stars stay."""
+_SIGMAS: Final = {"sure": 25.0, "likely": 10.0, "possible": 10.0}
+"""Least height above the neighbours of the colour, in standard deviations of the noise (chosen), of what one
+photo shows for sure, of what it makes likely, and of what needs a second photo: less does no harm."""
 
-_SURE_CONTRAST, _CONTRAST = 5.0, 1.5
-"""Least height relative to how much the neighbours of the colour differ, in one photo and in each of several
-(chosen): texture stays below."""
+_CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
+"""Least height relative to how much the neighbours of the colour differ (chosen): texture stays below."""
 
-_SURE_BESIDE, _BESIDE = 0.05, 0.25
-"""Largest share of the height by which the pixels beside it may stand out, in one photo and in several
-(chosen): of a point of light through the sharpest lenses they get a fifth, of the weakest colour a tenth."""
+_BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
+"""Largest share of the height by which the pixels beside it may stand out (chosen): of a point of light
+through the sharpest lenses they get a fifth, of the weakest colour a tenth."""
+
+_MANY: Final = 3.0
+"""Where so many times more are sure than likely, the likely ones are defects too (chosen): of photos without
+defects none is sure, and up to two dozen are likely."""
 
 _MOST: Final = 2e-3
 """Share of the pixels above which what was found is a picture after all, such as a sky of stars (chosen)."""
@@ -59,7 +62,8 @@ class Suspects:
     """What one photo tells of the defects of its sensor."""
 
     sure: Places  # are defects
-    possible: Places  # are defects if they stand out in another picture too; `sure` among them
+    likely: Places  # are defects as far as this photo tells; `sure` among them
+    possible: Places  # are defects if they stand out in another picture too; `likely` among them
     small: NDArray[np.float32]  # the picture, small: tells one scene from another
     shape: tuple[int, int]
 
@@ -130,21 +134,27 @@ def suspects(values: NDArray[np.uint16], near: Neighbours) -> Suspects:
     height = np.abs(flat[places] - middle)
     apart = np.sort(np.abs(ring - middle), axis=0)
     sigma = np.maximum(noise.at(middle), 1.4826 * apart[_NEIGHBOURS // 2])
-    kept = np.maximum(_SIGMAS * sigma, _CONTRAST * apart[-2]) < height
-    places, sign, height, sigma, apart = (array[kept] for array in (places, sign, height, sigma, apart[-1]))
+    kept = np.maximum(_SIGMAS["possible"] * sigma, _CONTRAST["possible"] * apart[-2]) < height
+    places, sign, height, sigma, apart = (
+        array[..., kept] for array in (places, sign, height, sigma, apart[-2:])
+    )
     beside = near.touching(places)
     level = np.median(flat[near.of(beside.ravel())].astype(np.float32), axis=0).reshape(beside.shape)
     bumps = sign * (flat[beside] - level)
-    possible = np.median(np.abs(bumps), axis=0) < _BESIDE * height + 2.0 * sigma
-    sure = (
-        (np.maximum(_SURE_SIGMAS * sigma, _SURE_CONTRAST * apart) < height)
-        & (bumps.mean(axis=0) < _SURE_BESIDE * height)
-        & (np.abs(bumps).max(axis=0) < _SURE_BESIDE * height + 4.0 * sigma)
-    )
-    found = [np.sort(places[chosen]) for chosen in (sure, sure | possible)]
-    if len(found[0]) > _MOST * values.size:
-        found = [places[:0], places[:0]]
-    return Suspects(found[0], found[1], _small(values, near.period), values.shape)
+
+    def alone(kind: str, differ: NDArray[np.floating], most: NDArray[np.floating], more: float) -> Places:
+        chosen = np.maximum(_SIGMAS[kind] * sigma, _CONTRAST[kind] * differ) < height
+        chosen &= (bumps.mean(axis=0) < _BESIDE[kind] * height) | (kind == "possible")
+        return np.sort(places[chosen & (most < _BESIDE[kind] * height + more * sigma)])
+
+    most, median = np.abs(bumps).max(axis=0), np.median(np.abs(bumps), axis=0)
+    sure, likely = (alone(kind, apart[1], most, 4.0) for kind in ("sure", "likely"))
+    possible = np.union1d(likely, alone("possible", apart[0], median, 2.0))
+    if len(sure) <= _MANY * len(np.setdiff1d(likely, sure)):
+        likely = sure
+    if len(sure) > _MOST * values.size:
+        sure = likely = possible = places[:0]
+    return Suspects(sure, likely, possible, _small(values, near.period), values.shape)
 
 
 def defects_of(own: Suspects, others: Sequence[Suspects] = ()) -> Places:
@@ -153,6 +163,8 @@ def defects_of(own: Suspects, others: Sequence[Suspects] = ()) -> Places:
     for photo in (own, *(other for other in others if other.shape == own.shape)):
         same = next((scene for scene in scenes if _correlation(scene[0].small, photo.small) > _ALIKE), None)
         scenes.append([photo]) if same is None else same.append(photo)
+    if len(scenes) == 1:
+        return own.likely
     by_scene = [np.unique(np.concatenate([photo.possible for photo in scene])) for scene in scenes]
     places, counts = np.unique(np.concatenate(by_scene), return_counts=True)
     sure = [photo.sure for scene in scenes for photo in scene]
@@ -204,7 +216,9 @@ def _standing_out(values: NDArray[np.uint16], near: Neighbours, noise: _Noise) -
     index = near.inside(*(np.arange(-_REACH, side + _REACH) for side in values.shape))
     wide, period = values[np.ix_(*index)], near.period
     planes = {site: np.ascontiguousarray(wide[site[0] :: period, site[1] :: period]) for site in near.alike}
-    least = (_NEARLY * _SIGMAS * noise.at(np.arange(1 << 16, dtype=np.float64))).astype(np.float32)
+    least = (_NEARLY * _SIGMAS["possible"] * noise.at(np.arange(1 << 16, dtype=np.float64))).astype(
+        np.float32
+    )
     found = []
     for (row, col), offsets in near.alike.items():
         site = values[row::period, col::period]
@@ -221,7 +235,7 @@ def _standing_out(values: NDArray[np.uint16], near: Neighbours, noise: _Noise) -
             np.minimum(second_low, np.maximum(low, one), out=second_low)
             np.minimum(low, one, out=low)
         spread = (second - np.minimum(second, second_low)).astype(np.float32)
-        need = np.maximum(np.float32(_CONTRAST / 2.0) * spread, least[second])
+        need = np.maximum(np.float32(_CONTRAST["possible"] / 2.0) * spread, least[second])
         above = site - np.minimum(site, second)
         below = second_low - np.minimum(second_low, site)
         rows, cols = np.nonzero(np.maximum(above, below) > need)

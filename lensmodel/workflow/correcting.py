@@ -45,6 +45,7 @@ def correct_photo(
     roi: tuple[int, int, int, int] | None = None,
     photo: str = "",
     known: ModelField | None = None,
+    least_gain_db: float | None = None,
     workers: int = 1,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
@@ -79,6 +80,7 @@ def correct_photo(
         bounds=bounds,
         layers=layers,
         plain=plain,
+        least_gain_db=least_gain_db,
         stored=correction.StoredColour.of_photo(developed),
         roi=roi,
         workers=workers,

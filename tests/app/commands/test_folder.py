@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import lensmodel
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from running import SMALL, write_photo
 
 from lensmodel.cli.folder import Shot, groups
@@ -22,6 +24,7 @@ from lensmodel.photo.tags.xmp import read_xmp
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.workflow.sampling import photo_id
 
+REPORTS = Path(__file__).parents[2] / "data" / "reports"
 AUTO = (
     "correct",
     "holiday",
@@ -246,3 +249,69 @@ def test_every_aperture_is_learned_from_before_any_is_twice() -> None:
     (group,) = groups(shots(*(replace(ZOOM, aperture=float(n)) for n in np.array(apertures))))
 
     assert [shot.metadata.aperture for shot in group.to_learn_from()] == [2.8, 4.0, 8.0, 2.8, 2.8]
+
+
+# --- why a photo teaches nothing ----------------------------------------------------------------
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+def _of_four_colours(path: Path) -> None:
+    data = path.read_bytes()
+    at = data.index(b"\x8e\x82\x01\x00\x04\x00\x00\x00") + 8  # the value of CFAPattern
+    path.write_bytes(data[:at] + bytes((0, 1, 3, 2)) + data[at + 4 :])
+
+
+def _without_aperture(path: Path) -> None:
+    write_photo(path, 1, shape=SMALL, aperture=None)
+
+
+def _quad_bayer(path: Path) -> None:
+    path.write_bytes((REPORTS / "quad-bayer.dng").read_bytes())
+
+
+def _picture_without_aperture(path: Path) -> None:
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)).save(
+        path, "JPEG"
+    )
+
+
+def _cut_picture(path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x829D] = IFDRational(28, 10)
+    pixels = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path, "JPEG", exif=exif)
+    _cut(path)
+
+
+USELESS = {
+    "a.dng": (_without_aperture, "does not say its aperture"),
+    "b.dng": (_cut, "cut off"),
+    "c.dng": (_of_four_colours, "colours"),
+    "d.dng": (_quad_bayer, "4 x 4"),
+    "e.jpg": (_picture_without_aperture, "does not say its aperture"),
+    "f.jpg": (_cut_picture, "ends before its picture"),
+}
+
+
+@pytest.mark.parametrize("name", USELESS)
+def test_what_teaches_nothing_for_another_reason_than_its_detail_fails_with_that_reason(
+    name: str, tmp_path: Path
+) -> None:
+    spoil, reason = USELESS[name]
+    (tmp_path / "holiday").mkdir()
+    path = tmp_path / "holiday" / name
+    if name.endswith("dng"):
+        write_photo(path, 1, shape=SMALL)
+    spoil(path)
+
+    done = lensmodel(*AUTO, "--json", cwd=tmp_path)
+
+    assert done.returncode == 1
+    assert reason in done.stderr
+    assert "no photo shows enough" not in done.stderr
+    (result,) = json.loads(done.stdout)["results"]
+    assert result["state"] == "failed"
+    assert reason in result["reason"]

@@ -551,3 +551,28 @@ def test_a_cell_of_which_next_to_nothing_is_left_to_correct_stays_as_it_was(
     np.testing.assert_allclose(made.planes, seen, rtol=1e-6)  # faded cells add up to rounding
     assert made.nothing_to_correct
     assert all(zone.expected_gain_db == 0.0 for zone in made.zones.values())
+
+
+@pytest.mark.parametrize("worth", [True, False])
+def test_a_photo_that_gains_too_little_is_found_by_some_cells_and_stays_as_it_was(worth: bool) -> None:
+    frame = Frame(720, 960)
+    lens = Soft()
+    seen, _ = photo(lens, BASE, frame)
+    steps: list[int] = []
+
+    made = correct_planes(
+        seen,
+        lens,
+        frame,
+        noise=BASE,
+        method="fast",
+        pitch=64,
+        least_gain_db=0.3 if worth else 99.0,
+        on_step=lambda done, _: steps.append(done),
+    )
+
+    gained = correct_planes(seen, lens, frame, noise=BASE, method="fast", pitch=64).expected_gain_db
+    assert made.expected_gain_db == pytest.approx(gained, rel=0.2)
+    assert made.nothing_to_correct == (not worth)
+    assert bool(steps) == worth
+    assert np.array_equal(made.planes, seen) == (not worth)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -84,12 +85,18 @@ _LEAST_ERROR: Final = 1e-8  # mean square, full scale is 1 (chosen): 80 dB, so t
 
 
 def fidelity(
-    image: Planes, reference: Planes, frame: Frame, *, srgb: bool = True
+    image: Planes,
+    reference: Planes,
+    frame: Frame,
+    *,
+    srgb: bool = True,
+    corners: Sequence[tuple[int, int]] | None = None,
 ) -> dict[str, dict[Zone, float]]:
     """PSNR in dB by zone, each block of 128 pixels at its best shift; of sRGB-encoded pictures SSIM too.
 
     A blind method leaves the place of the picture free, and the centre of mass of a PSF is not its core: the
-    truth of each block, which has no noise, is moved to where it lies best.
+    truth of each block, which has no noise, is moved to where it lies best. Blocks are those at `corners`, or
+    all over the frame.
 
     Returns
     -------
@@ -102,7 +109,7 @@ def fidelity(
         wanted,
         frame,
         lambda a, b: [block_error(a, b), *([_ssim_map(a, b)[CORE]] if srgb else [])],
-        blocks(frame, EVERY),
+        blocks(frame, EVERY) if corners is None else corners,
     )
     psnrs = {zone: psnr_of(float(mean[0])) for zone, mean in means.items()}
     return {"psnr": psnrs, **({"ssim": {z: float(mean[1]) for z, mean in means.items()}} if srgb else {})}

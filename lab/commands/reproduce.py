@@ -14,7 +14,7 @@ from lensmodel.cli.files import refuse_existing
 from lensmodel.cli.options import Force, Quiet, Verbose, choice
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
-Size = Literal["quick", "small", "default", "full"]
+Size = Literal["quick", "default"]
 PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")
 """What is in the folder of a finished reproduction, beside pictures and stored results."""
 
@@ -32,50 +32,31 @@ def reproduce(
         choice(
             "--size",
             get_args(Size),
-            "quick: four lenses on small photos, minutes. small: all lenses on a megapixel, hours. "
-            "default: large frames, other files and the rivals too. full: two apertures a lens, up to twenty "
-            "photos and scenes that hurt, all night.",
+            "quick: four lenses on small photos, minutes. default: ten lenses on frames of five "
+            "megapixels, up to ten photos, an hour or two.",
         ),
     ] = "default",
-    only: Annotated[
+    lens: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
-    ] = None,
-    grids: Annotated[
-        list[Path] | None,
         typer.Option(
-            metavar="FILE",
-            help="PSFs of a ray-traced lens, made by `python -m lab.traced make`; again for more. "
-            "Default: the two of the repository.",
+            metavar="LENS",
+            help="Seed of a lens of third order, or a file of PSFs of a ray-traced one, made by `python -m "
+            "lab.population grid`; again for more. Default: those of the size.",
         ),
     ] = None,
-    scenes: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of sharp photographs; its test half is used. Default: the folder sharp of "
-            f"${DATA_VARIABLE} where that is set, else the library's five."
-        ),
-    ] = None,
-    results: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Where figures of each lens and number of photos are kept and taken from, so that several "
-            "runs on several machines make one page. Default: cache in the output folder.",
-        ),
-    ] = None,
-    default_only: Annotated[
+    compare: Annotated[
         bool,
         typer.Option(
-            "--default-only",
-            help="Only the default correction, beside the true PSF: what the bars ask for, in less time.",
+            "--compare",
+            help="Also the paper's own way, a general profile, a printed target, blind rivals and the "
+            "programs that are installed: hours.",
         ),
     ] = False,
     assert_bars: Annotated[
         bool,
         typer.Option(
             "--assert-bars",
-            help="Fail where a bar is missed, and name each: the lens and zone of a fall too.",
+            help="Fail where a bar is missed, and name each.",
         ),
     ] = False,
     force: Force = False,
@@ -84,15 +65,15 @@ def reproduce(
 ) -> None:
     """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
 
-    Each lens learns from Bayer DNG files as a user's does; what it answers and corrects is measured
-    against the truth. Finished results are kept: a run that was stopped goes on, and a change of code
-    or settings computes anew. A finished page is replaced only with --force.
+    Each lens learns from Bayer DNG files as a user's does, and from a TIFF and a JPEG; what it answers and
+    corrects is measured against the truth. Finished results are kept: a run that was stopped goes on, and
+    a change of code or settings computes anew. A finished page is replaced only with --force.
 
     Examples:
 
         lensmodel reproduce --size quick -o reproduction
 
-        lensmodel reproduce --only 1003 --results figures-so-far -o sitting
+        lensmodel reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses
 
     Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
     """
@@ -103,15 +84,9 @@ def reproduce(
     from lab.reproduce.job import run_reproduction  # noqa: PLC0415 - same
     from lab.reproduce.page import collected, write_json, write_page  # noqa: PLC0415 - same
 
-    plan = planned(
-        cast("Size", size),
-        scenes=scenes or _external(),
-        grids=grids,
-        only=only or (),
-        default_only=default_only,
-    )
+    plan = planned(cast("Size", size), scenes=_external(), lenses=lens or (), compare=compare)
     work = WorkLines(quiet=shown.quiet)
-    result = run_reproduction(plan, output, results=results, on_work=work, workers=os.cpu_count() or 1)
+    result = run_reproduction(plan, output, on_work=work, workers=os.cpu_count() or 1)
     result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
     written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))

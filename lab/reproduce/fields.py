@@ -114,17 +114,16 @@ def general_words(case: Case) -> str:
 def general_field(case: Case) -> PsfField:
     """Return what is known of the lens of a case without any photo of it.
 
-    Third order: the mean of lenses of the same kind, drawn from development seeds (below 100), as far
-    stopped down. Ray-traced: the lens itself made symmetric, which is kinder than other copies are.
+    Third order: the mean of lenses of the same kind, drawn from development seeds (below 100).
+    Ray-traced: the lens itself made symmetric, which is kinder than other copies are.
     """
     if case.grid is not None:
         return SymmetricField(case.truth())
     kind = case.seed % len(LENS_KINDS)
-    at_long_end = case.focal_mm > case.lens.focal_mm[0]
     fields = []
     for lens in (draw_lens(kind + len(LENS_KINDS) * i) for i in range(COPIES)):
-        focal = lens.focal_mm[-1 if at_long_end else 0]
-        settings = LensSettings(aperture=lens.widest(focal) * 2.0 ** (case.stops / 2.0), focal_mm=focal)
+        focal = lens.focal_mm[0]
+        settings = LensSettings(aperture=lens.widest(focal), focal_mm=focal)
         fields.append(SimulatedField(lens, settings, case.camera.pitch_um))
     return MeanField(fields)
 

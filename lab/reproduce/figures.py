@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -40,10 +39,9 @@ def version() -> str:
     return total.hexdigest()[:8]
 
 
-def draw(plan: Reproduction, case: Case, folder: Path, *, workers: int = 1) -> dict[str, Any]:
-    """Draw both figures into a folder and return their names and figures."""
-    whole = {c.name: c for c in plan.cases if c.is_whole and c.stops < 0.1}
-    return {"fig2": _fig2(list(whole.values()), folder), "fig4": _fig4(plan, case, folder, workers)}
+def draw(plan: Reproduction, photos: Path, folder: Path, *, workers: int = 1) -> dict[str, Any]:
+    """Draw both figures into a folder, the second of the first case; return their names and figures."""
+    return {"fig2": _fig2(plan.cases, folder), "fig4": _fig4(plan, photos, folder, workers)}
 
 
 def names(drawn: Mapping[str, Any]) -> list[str]:
@@ -91,17 +89,17 @@ def _sheet(rows: Sequence[Sequence[NDArray[np.uint8]]], gap: int = 4) -> NDArray
     return sheet
 
 
-def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int) -> dict[str, Any]:
+def _fig4(plan: Reproduction, photos: Path, folder: Path, workers: int) -> dict[str, Any]:
     """Confidence map with the patches, the PSF of each patch, and the regressed field."""
-    with TemporaryDirectory(prefix="lensmodel-figure-") as work:
-        shots = take(case, plan.files(), Path(work), first=1)
-        developed = develop(shots.learn[0])
-        config = sampling.Config(estimator=plan.estimator)
-        chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method)
-        try:
-            samples = sampling.samples_of_photo(shots.learn[0], config, workers=workers)
-        except LensModelError as error:
-            return {"failed": str(error)}
+    case = plan.cases[0]
+    shots = take(case, plan.files(), photos, photos=1)
+    developed = develop(shots.learn[0])
+    config = sampling.Config()
+    chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method)
+    try:
+        samples = sampling.samples_of_photo(shots.learn[0], config, workers=workers)
+    except LensModelError as error:
+        return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]
     frame, settings = developed.frame, case.settings
     model = LensModel.fit(samples)

@@ -1,24 +1,22 @@
 """The photos of a case: frames composed of sharp photographs, as DNG files with noise.
 
-No part of a photograph serves twice for one lens. Where a case's path is not raw, the files are what our own
-development makes of these DNG files.
+The photographs of the held-out photo serve in no other. Where there are few of them, those that the lens is
+learned from serve again, mirrored and in another place of the frame. Photos are kept, and taken again only if
+lens, frame or photographs change. TIFF and JPEG files are what our own development makes of the DNG files.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 from PIL import Image
 
 from lab.cases import list_photos, photo_half
-from lab.scenes import HARD_SCENES
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic, save_array
 from lensmodel.core.types import Planes
@@ -28,12 +26,16 @@ from lensmodel.simulate import edge_chart, load_scene, photograph, write_photo
 if TYPE_CHECKING:
     from lab.reproduce.cases import Case
 
+Container: TypeAlias = Literal["dng", "tiff", "jpeg"]
+
 MARGIN: Final = 28
 """Pixels that a scene reaches beyond the frame on every side: half a kernel."""
 
 JPEG_QUALITY: Final = 92  # of 100 (chosen): that of a fine JPEG of a camera
 
-_GRIDS: Final = {1: (1, 1), 2: (1, 2), 4: (2, 2)}  # rows and columns of so many
+SUFFIXES: Final[dict[Container, str]] = {"dng": ".dng", "tiff": ".tif", "jpeg": ".jpg"}
+
+_GRIDS: Final = ((1, 1), (1, 2), (2, 2))  # rows and columns of photographs in a frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,6 @@ class Layout:
 
     rows: int  # grid of photographs in one frame
     cols: int
-    pieces: int  # parts that one photograph is cut into; each part serves as if it were a photograph
     tile: tuple[int, int]  # (height, width) that is cut from the middle of each
 
     @property
@@ -50,12 +51,6 @@ class Layout:
         """Largest (height, width) of a frame that still has its margin; even."""
         height, width = self.rows * self.tile[0] - 2 * MARGIN, self.cols * self.tile[1] - 2 * MARGIN
         return height // 2 * 2, width // 2 * 2
-
-    def words(self) -> str:
-        """Say it in words."""
-        whole = self.rows * self.cols
-        source = "a photograph" if self.pieces == 1 else f"a part (one of {self.pieces}) of a photograph"
-        return f"each frame is {source}" if whole == 1 else f"each frame is composed of {whole} photographs"
 
 
 def scene_files(folder: Path | None) -> tuple[Path, ...]:
@@ -69,52 +64,54 @@ def scene_files(folder: Path | None) -> tuple[Path, ...]:
     return tested
 
 
-def layout_for(files: Sequence[Path], frames: int, wanted: tuple[int, int] | None = None) -> Layout:
-    """Decide how to make `frames` frames without using anything twice."""
-    share = len(files) // frames
-    if share == 0 and 2 * len(files) < frames:
-        raise InvalidInputError(
-            f"{frames} frames need at least {(frames + 1) // 2} photographs, there are {len(files)}: "
-            "ask for fewer photos a lens or give a folder with more photographs"
-        )
-    pieces = 1 if share else 2
-    layouts = [_layout(files, pieces, _GRIDS[n]) for n in _GRIDS if n <= max(share, 1)]
-    if wanted is None:
-        return layouts[-1]
-    for layout in layouts:
-        if layout.rows * layout.tile[0] >= wanted[0] and layout.cols * layout.tile[1] >= wanted[1]:
+def layout_for(files: Sequence[Path], wanted: tuple[int, int] | None = None) -> Layout:
+    """Decide how to make frames that cover `wanted` rows and columns; the largest where it is None.
+
+    Raises
+    ------
+    InvalidInputError
+        If the photographs are too few to keep those of one frame apart, or too small.
+    """
+    grids = [(rows, cols) for rows, cols in _GRIDS if 2 * rows * cols <= len(files)]
+    if not grids:
+        raise InvalidInputError(f"two photographs are needed at least, there are {len(files)}")
+    layouts = [_layout(files, grid) for grid in grids]
+    for layout in layouts if wanted else layouts[-1:]:
+        rows, cols = wanted or (0, 0)
+        if layout.rows * layout.tile[0] >= rows and layout.cols * layout.tile[1] >= cols:
             return layout
-    raise InvalidInputError(
-        f"the photographs do not cover {frames} frames of {wanted[0]} x {wanted[1]}: give larger ones"
-    )
+    raise InvalidInputError(f"the photographs do not cover frames of {wanted}: give larger ones, or more")
 
 
-def _layout(files: Sequence[Path], pieces: int, grid: tuple[int, int]) -> Layout:
-    rows, cols = grid
-    sizes = np.array([_turned_size(path, pieces, upright=cols > rows) for path in files])
+def _layout(files: Sequence[Path], grid: tuple[int, int]) -> Layout:
+    sizes = np.array([_turned_size(path, upright=grid[1] > grid[0]) for path in files])
     height, width = (int(n) // 2 * 2 for n in sizes.min(axis=0))
-    return Layout(rows, cols, pieces, (height, width))
+    return Layout(*grid, (height, width))
 
 
-def frame_scene(files: Sequence[Path], layout: Layout, order: Sequence[int], number: int) -> Planes:
-    """Compose frame `number` from photographs in the given order.
+def frame_scene(files: Sequence[Path], layout: Layout, number: int | None) -> Planes:
+    """Compose a frame from photographs in the given order.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    layout : Layout
+    number : int or None
+        Of the photos that are learned from; None is the photo that is held out.
 
     Returns
     -------
     Planes, shape (3, rows * tile height, cols * tile width)
     """
     per = layout.rows * layout.cols
-    parts = [_part(files, layout, index) for index in order[number * per : (number + 1) * per]]
+    if number is None:
+        parts = [_part(path, layout, 0) for path in files[:per]]
+    else:
+        others = files[per:]
+        indices = range(number * per, (number + 1) * per)
+        parts = [_part(others[i % len(others)], layout, i // len(others)) for i in indices]
     rows = [parts[i * layout.cols : (i + 1) * layout.cols] for i in range(layout.rows)]
     return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1))
-
-
-def content_of(files: Sequence[Path]) -> str:
-    """Hash of the photographs' bytes, in order."""
-    total = hashlib.sha256()
-    for path in files:
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()[:16]
 
 
 def centred_cut(scene: Planes, height: int, width: int) -> Planes:
@@ -132,29 +129,29 @@ def centred_cut(scene: Planes, height: int, width: int) -> Planes:
     return np.ascontiguousarray(scene[:, cut[0], cut[1]])
 
 
-def _part(files: Sequence[Path], layout: Layout, index: int) -> Planes:
-    scene = load_scene(files[index // layout.pieces])
-    if layout.pieces == 2:
-        scene = _turned(scene, upright=False)
-        half = scene.shape[2] // 2
-        first = index % 2 == 0
-        scene = scene[:, :, :half] if first else scene[:, :, -half:]
-    scene = _turned(scene, upright=layout.tile[0] > layout.tile[1])
+def content_of(files: Sequence[Path]) -> str:
+    """Hash of the photographs' bytes, in order."""
+    total = hashlib.sha256()
+    for path in files:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:16]
+
+
+def _part(path: Path, layout: Layout, use: int) -> Planes:
+    """The middle of a photograph; mirrored in another way each time that it is used."""
+    scene = load_scene(path)
+    if (scene.shape[1] > scene.shape[2]) != (layout.tile[0] > layout.tile[1]):
+        scene = np.rot90(scene, axes=(1, 2))
     height, width = layout.tile
     top, left = (scene.shape[1] - height) // 2, (scene.shape[2] - width) // 2
-    return scene[:, top : top + height, left : left + width]
+    return scene[:, top : top + height, left : left + width][
+        :, :: -1 if use & 2 else 1, :: -1 if use & 1 else 1
+    ]
 
 
-def _turned(scene: Planes, *, upright: bool) -> Planes:
-    is_upright = scene.shape[1] > scene.shape[2]
-    return scene if is_upright == upright else np.rot90(scene, axes=(1, 2))
-
-
-def _turned_size(path: Path, pieces: int, *, upright: bool) -> tuple[int, int]:
+def _turned_size(path: Path, *, upright: bool) -> tuple[int, int]:
     with Image.open(path) as image:
         short, long = sorted(image.size)
-    if pieces == 2:
-        short, long = sorted((short, long // 2))
     return (long, short) if upright else (short, long)
 
 
@@ -163,25 +160,19 @@ class Shots:
     """Files of the photos of one case."""
 
     learn: tuple[Path, ...]  # in the order in which the lens learns from them
-    held_out: Path  # never used for calibration; the chart is None where the case has none
-    chart: Path | None
+    held_out: Path  # never used for calibration
+    chart: Path
     sharp: Path  # npy, the light that a perfect lens would have put on the sensor for `held_out`
 
     @classmethod
     def of(cls, case: Case, folder: Path) -> Shots:
         """Name the files of a case in a folder."""
-        suffix = case.conditions.suffix
         return cls(
-            tuple(folder / f"photo-{i:02d}{suffix}" for i in range(case.photos[-1])),
-            folder / f"held-out{suffix}",
-            folder / f"chart{suffix}" if case.conditions.with_chart else None,
+            tuple(folder / f"photo-{i:02d}.dng" for i in range(case.photos[-1])),
+            folder / "held-out.dng",
+            folder / "chart.dng",
             folder / "held-out-sharp.npy",
         )
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All photos, in the order in which they are taken."""
-        return (*self.learn, self.held_out, *(() if self.chart is None else (self.chart,)))
 
     def truth(self) -> Planes:
         """Load the truth behind `held_out`: camera colours, not white-balanced."""
@@ -189,59 +180,40 @@ class Shots:
         return planes
 
 
-def take(
-    case: Case,
-    files: Sequence[Path],
-    folder: Path,
-    *,
-    first: int | None = None,
-    workers: int = 1,
-) -> Shots:
-    """Take the photos of a case that are not there yet; only the `first` so many if that is given."""
+def take(case: Case, files: Sequence[Path], folder: Path, *, photos: int | None = None) -> Shots:
+    """Take the photos of a case that are not there yet; the first `photos` alone if that is given."""
     folder.mkdir(parents=True, exist_ok=True)
-    shots = Shots.of(case, folder)
-    missing = [number for number, path in enumerate(shots.files[:first]) if not path.exists()]
-    if workers <= 1 or len(missing) == 1:
-        for number in missing:
-            _take(case, tuple(files), folder, number)
-        return shots
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for job in as_completed(
-            [pool.submit(_take, case, tuple(files), folder, number) for number in missing]
-        ):
-            job.result()
+    shots, camera = Shots.of(case, folder), case.camera
+    order = np.random.default_rng(case.seed).permutation(len(files))
+    mixed = [files[i] for i in order]
+    wanted: list[tuple[Path, int | None]] = [(path, i) for i, path in enumerate(shots.learn[:photos])]
+    wanted += [] if photos else [(shots.held_out, None), (shots.chart, None)]
+    for path, number in wanted:
+        if path.exists():
+            continue
+        if path == shots.chart:
+            scene = edge_chart(camera.frame, guard=guard_of(case)).scene
+        else:
+            scene = centred_cut(frame_scene(mixed, case.layout, number), case.height, case.width)
+        seed = [case.seed, len(SUFFIXES) if path == shots.chart else 0 if number is None else number + 10]
+        photo = photograph(scene, case.lens, case.settings, camera, np.random.default_rng(seed))
+        if path == shots.held_out:
+            with atomic(shots.sharp) as file:
+                save_array(file, photo.sharp)
+        write_photo(path, photo)  # last, and whole or not at all: a photo that is there is complete
     return shots
 
 
-def _take(case: Case, files: tuple[Path, ...], folder: Path, number: int) -> None:
-    shots, camera = Shots.of(case, folder), case.camera
-    frames = len(shots.learn) + 1  # the held-out photo is the last of them
-    if number < frames:
-        order = case.order(len(files) * case.layout.pieces)
-        scene = centred_cut(frame_scene(files, case.layout, order, number), case.height, case.width)
-    else:
-        scene = edge_chart(camera.frame, guard=guard_of(case)).scene
-    rng = np.random.default_rng([case.seed, number])
-    if number < frames and case.conditions.scene:
-        drawn = HARD_SCENES[case.conditions.scene]
-        scene = np.ascontiguousarray(drawn(scene, np.random.default_rng([case.seed, number, 1])))
-    photo = photograph(scene, case.lens, case.settings, camera, rng)
-    if number == frames - 1:
-        with atomic(shots.sharp) as file:
-            save_array(file, photo.sharp)
-    # last, and whole or not at all: a photo that is there is complete
-    path, container = shots.files[number], case.conditions.container
-    if container == "dng":
-        write_photo(path, photo)
-        return
-    raw = path.with_suffix(".raw.dng")
-    write_photo(raw, photo)
-    developed = develop(raw)
-    kind: Literal["jpeg", "tiff16"] = "jpeg" if container == "jpeg" else "tiff16"
-    write_image(
-        path, developed.planes, developed.encoding, format=kind, color_space="srgb", quality=JPEG_QUALITY
-    )
-    raw.unlink()
+def in_container(path: Path, container: Container) -> Path:
+    """Return a photo as another kind of file, developed by the library in sRGB; made where it is missing."""
+    made = path.with_suffix(SUFFIXES[container])
+    if not made.exists():
+        developed = develop(path)
+        kind: Literal["jpeg", "tiff16"] = "jpeg" if container == "jpeg" else "tiff16"
+        write_image(
+            made, developed.planes, developed.encoding, format=kind, color_space="srgb", quality=JPEG_QUALITY
+        )
+    return made
 
 
 def guard_of(case: Case) -> int:

@@ -4,14 +4,15 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
 
     <key>/truth.json                  as photographed, with the true PSF, denoised only
     <key>/learned-<n>.json            after n photos
+    <key>/path-<container>.json       learned and corrected as another kind of file
     <key>/paper-<n>.json              the same the paper's own way from end to end
     <key>/measured.json               with PSFs measured on a target
     <key>/general.json                with a general profile of the lens model
     <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
     <key>/program-<name>-<version>.json  corrected by a program of others
 
-They hold figures only, some ten kilobytes a lens: carried to another machine they serve a run there. Photos
-and models of an unfinished case lie in `work` of the output folder, pictures in `pictures`.
+They hold figures only, some ten kilobytes a lens. Photos lie in `photos` of the output folder, models of an
+unfinished case in `work`, pictures in `pictures`.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias, cast
 
 import numpy as np
 from PIL import Image
@@ -31,10 +32,10 @@ from PIL import Image
 from lab.cases import photo_half
 from lab.code_version import version_of
 from lab.reproduce import figures, measure, programs
-from lab.reproduce.cases import BASE, HARD_METHODS, Case, Reproduction, fingerprint, key_of
+from lab.reproduce.cases import Case, Reproduction, fingerprint, key_of, photos_of
 from lab.reproduce.fields import PointField, Remembered, general_field, general_words, measured_field
-from lab.reproduce.frames import Shots, take
-from lab.reproduce.learners import Answer, Learner, LibraryLearner, corrected_with, paper_way
+from lab.reproduce.frames import Container, Shots, in_container, take
+from lab.reproduce.learners import Answer, Learner, LibraryLearner, Roi, corrected_with, paper_way
 from lab.rivals import rivals
 from lab.store import Unit, read, stored
 from lensmodel.core.errors import LensModelError
@@ -48,6 +49,10 @@ CROP_PX: Final = 128  # side of a crop in a strip (chosen)
 CONTROL: Final = "standard"
 """Method whose denoising alone is the control."""
 
+PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")
+"""Kinds of files that each lens is learned from and corrected in too, one photo of each."""
+
+_SEVERAL: Final = ("learned", "paths", "paper", "rivals", "programs")
 _ALONE: Final = ("truth", "measured", "general")
 NewLearner: TypeAlias = Callable[[Path, Preset, int], Learner]
 """From a folder that keeps what was learned, the way of learning, and a number of processes."""
@@ -65,9 +70,7 @@ def run_reproduction(
     folder: Path,
     *,
     on_work: OnWork,
-    results: Path | None = None,
     workers: int = 1,
-    with_figures: bool = True,
     learner: NewLearner = LibraryLearner,
 ) -> dict[str, Any]:
     """Run what is missing and return everything.
@@ -75,29 +78,32 @@ def run_reproduction(
     Returns
     -------
     dict
-        Plain values: `code`, `plan`, `scenes`, `cases`, `hard` (scenes and paths that hurt), `figures`.
+        Plain values: `code`, `plan`, `scenes`, `cases`, `figures`.
     """
     version = fingerprint()
-    cache, shown = results or folder / "cache", folder / "pictures"
+    cache, shown = folder / "cache", folder / "pictures"
     shown.mkdir(parents=True, exist_ok=True)
     keys = [key_of(case, plan, version) for case in plan.cases]
     jobs = [
-        CaseJob(case, plan, cache / key, folder / "work" / key, shown, workers, learner)
+        CaseJob(
+            case, plan, cache / key, folder / "photos" / photos_of(case, plan), folder / "work" / key, shown,
+            workers, learner,
+        )
         for case, key in zip(plan.cases, keys, strict=True)
-    ]
-    done, total = 0, sum(len(job.files) for job in jobs) + with_figures
+    ]  # fmt: skip
+    done, total = 0, sum(len(job.files) for job in jobs) + plan.compare
 
     def told(words: str, *, fresh: bool) -> None:
         nonlocal done
         done += 1
         on_work(words, done, total, fresh=fresh)
 
-    finished = [_with_pictures_there(job.run(told), shown) for job in jobs]
+    finished = [job.run(told) for job in jobs]
     with suppress(OSError):  # not there, or another run's work is in it
         (folder / "work").rmdir()
     drawn: Unit = {}
-    if with_figures:
-        make = partial(figures.draw, plan, plan.cases[0], shown, workers=workers)
+    if plan.compare:
+        make = partial(figures.draw, plan, jobs[0].photos, shown, workers=workers)
         drawn, fresh = stored(cache / keys[0] / f"figures-{figures.version()}.json", make)
         if not fresh and not all((shown / name).exists() for name in figures.names(drawn)):
             drawn, fresh = make(), True
@@ -107,33 +113,17 @@ def run_reproduction(
         "code": version,
         "plan": {
             "size": plan.size,
-            "estimator": plan.estimator,
             "methods": list(plan.methods),
-            "rivals": {name: rivals.create(name).source for name in plan.rivals},
+            "rivals": {name: rivals.create(name).source for name in plan.rivals} if plan.compare else {},
             "programs": list(plan.programs),
             "own_scenes": plan.scenes is None,
-            "paper_kernel": max(
-                (paper_way(case).kernel_size for case in plan.cases if plan.paper and case.is_whole),
-                default=None,
-            ),
+            "paper_kernel": paper_way(plan.cases[0]).kernel_size if plan.compare else None,
         },
         "scenes": [path.stem for path in files],
         "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],
-        "cases": [one for one in finished if one["condition"] == BASE],
-        "hard": [one for one in finished if one["condition"] != BASE],
+        "cases": finished,
         "figures": drawn,
     }
-
-
-def _with_pictures_there(unit: Unit, shown: Path) -> Unit:
-    """Leave out the names of pictures that another run made and that were not carried along."""
-    kept = {
-        key: _with_pictures_there(value, shown) if isinstance(value, dict) else value
-        for key, value in unit.items()
-    }
-    if "pictures" in kept:
-        kept["pictures"] = {k: v for k, v in kept["pictures"].items() if (shown / v).exists()}
-    return kept
 
 
 def rivals_version() -> str:
@@ -148,15 +138,11 @@ class CaseJob:
     case: Case
     plan: Reproduction
     folder: Path
+    photos: Path
     work: Path
     shown: Path
     workers: int
     learner: NewLearner
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Non-blind methods of this case."""
-        return self.plan.methods if self.case.condition == BASE else HARD_METHODS
 
     @cached_property
     def truth(self) -> Remembered:
@@ -167,13 +153,12 @@ class CaseJob:
     def files(self) -> dict[tuple[str, str], Path]:
         """Where each result of the case is stored, by part and name in it."""
         plan, folder, counts = self.plan, self.folder, [str(n) for n in self.case.photos]
-        whole = self.case.is_whole  # what is compared with is done once for each lens
         found = {("truth", ""): folder / "truth.json"}
         found |= {("learned", n): folder / f"learned-{n}.json" for n in counts}
-        found |= {("paper", n): folder / f"paper-{n}.json" for n in counts if whole and plan.paper}
-        for part, wanted in (("measured", plan.target), ("general", plan.general)):
-            found |= {(part, ""): folder / f"{part}.json"} if whole and wanted else {}
-        if whole:
+        found |= {("paths", name): folder / f"path-{name}.json" for name in PATHS}
+        if plan.compare:
+            found |= {("paper", n): folder / f"paper-{n}.json" for n in counts}
+            found |= {(part, ""): folder / f"{part}.json" for part in ("measured", "general")}
             code = rivals_version()
             found |= {("rivals", name): folder / f"rival-{name}-{code}.json" for name in plan.rivals}
             code = programs.version()
@@ -184,22 +169,22 @@ class CaseJob:
     def run(self, told: Callable[..., None]) -> Unit:
         """Compute what is missing, and return all of it."""
         case, complete = self.case, all(path.exists() for path in self.files.values())
-        if not complete:
-            shots = take(case, self.plan.files(), self.work / "photos", workers=self.workers)
         makers: dict[str, Callable[[str], Unit]] = {}
         if not complete:
+            shots = take(case, self.plan.files(), self.photos)
+            self.work.mkdir(parents=True, exist_ok=True)
             own, paper = PRESETS["default"], paper_way(case)
-            own = replace(own, estimator=self.plan.estimator)
             makers = {
                 "truth": lambda _: self._truth(shots),
                 "learned": partial(self._learned, self._learning("models", own), shots, own_way=False),
+                "paths": lambda name: self._path(cast("Container", name), own, shots),
                 "paper": partial(self._learned, self._learning("paper", paper), shots, own_way=True),
                 "measured": lambda _: self._measured(shots),
                 "general": lambda _: self._by_field(general_field(case), 0.0, shots, "general"),
                 "rivals": lambda name: self._rival(name, shots),
                 "programs": lambda name: self._program(name, shots),
             }
-        units: dict[str, dict[str, Unit]] = {part: {} for part in ("learned", "paper", "rivals", "programs")}
+        units: dict[str, dict[str, Unit]] = {part: {} for part in _SEVERAL}
         for (part, name), path in self.files.items():
             words, fresh = f"{case.title}: {part} {name}".rstrip(), True
             try:
@@ -218,12 +203,8 @@ class CaseJob:
             "family": case.family,
             "unseen": case.unseen,
             "source": case.source,
-            "general_profile": general_words(case) if ("general", "") in self.files else "",
-            "condition": case.condition,
-            "condition_title": case.conditions.title,
+            "general_profile": general_words(case) if self.plan.compare else "",
             "settings": {k: v for k, v in asdict(case).items() if k not in {"layout", "grid"}},
-            "stops": case.stops,
-            "frames": case.layout.words(),
             **{part: units.pop(part, {}).get("") for part in _ALONE},
             **units,
         }
@@ -232,24 +213,39 @@ class CaseJob:
         return _Learning(partial(self.learner, self.work / name, way, self.workers))
 
     def _truth(self, shots: Shots) -> Unit:
-        case, photo = self.case, develop(shots.held_out)
-        chart = None if shots.chart is None else develop(shots.chart)
-        before = measure.state(None if chart is None else chart.planes, photo.planes, shots, case)
-        if self._raw:
-            before["light"] = measure.light(photo.planes, shots, case)
+        case, photo, chart = self.case, develop(shots.held_out), develop(shots.chart)
+        before = measure.state(chart.planes, photo.planes, shots, case)
+        before["light"] = measure.light(photo.planes, shots, case)
         unit: Unit = {
             "before": before,
             "true": {},
             "pictures": {
                 "before": self._picture("before", photo.planes),
-                "scene": self._picture("scene", self._as_photo(shots.truth())),
+                "scene": self._picture("scene", shots.truth()),
             },
         }
-        for method in self.methods:
+        for method in self.plan.methods:
             unit["true"][method], name = self._corrected(chart, photo, self.truth, method, shots, "true")
             unit["pictures"] |= name
-        unit["control"], _ = self._corrected(chart, photo, PointField(), CONTROL, shots, None)
+        unit["control"] = None
+        if self.plan.compare:
+            unit["control"], _ = self._corrected(chart, photo, PointField(), CONTROL, shots, None)
         return unit
+
+    def _path(self, container: Container, way: Preset, shots: Shots) -> Unit:
+        """What becomes of the first and the held-out photo as files of another kind, learned from the one."""
+        learned, asked = (in_container(path, container) for path in (shots.learn[0], shots.held_out))
+        photo, method = develop(asked), self.plan.methods[0]
+        learner, refused, _ = self._learning(container, way).of([learned])
+        true = corrected_with(photo, self.truth, method, self._tiles, workers=self.workers)
+        after = photo.planes if refused else learner.corrected(asked, method, self._tiles).planes
+        states = {"before": photo.planes, "true": true, "after": after}
+        made = {name: measure.state(None, v, shots, self.case, raw=False) for name, v in states.items()}
+        return {
+            **made,
+            "refused": refused,
+            "pictures": {container: self._picture(container, after, raw=False)},
+        }
 
     def _measured(self, shots: Shots) -> Unit:
         """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
@@ -267,7 +263,7 @@ class CaseJob:
             field = rivals.create(name).field([develop(shots.learn[0])])
         except LensModelError as error:
             unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
-            return {**unit, "methods": dict.fromkeys(self.methods, self._before)}
+            return {**unit, "methods": dict.fromkeys(self.plan.methods, self._before)}
         return self._by_field(field, time.monotonic() - began, shots, name)
 
     def _by_field(self, psfs: PsfField, seconds: float, shots: Shots, label: str) -> Unit:
@@ -281,16 +277,15 @@ class CaseJob:
             "methods": {},
             "pictures": {},
         }
-        chart = None if shots.chart is None else develop(shots.chart)
-        photo = develop(shots.held_out)
-        for method in self.methods:
+        chart, photo = develop(shots.chart), develop(shots.held_out)
+        for method in self.plan.methods:
             unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, label)
             unit["pictures"] |= made
         return unit
 
     def _corrected(
         self,
-        chart: LinearPhoto | None,
+        chart: LinearPhoto,
         photo: LinearPhoto,
         field: PsfField,
         method: str,
@@ -298,18 +293,23 @@ class CaseJob:
         label: str | None,
     ) -> tuple[Unit, dict[str, str]]:
         """Correct and measure chart and photo with a field; the name of the picture, if it has a label."""
-        edges = None if chart is None else corrected_with(chart, field, method, workers=self.workers)
-        after = corrected_with(photo, field, method, workers=self.workers)
+        edges, after = (
+            corrected_with(seen, field, method, parts, workers=self.workers)
+            for seen, parts in ((chart, measure.chart_tiles(self.case)), (photo, self._tiles))
+        )
         name = {} if label is None else {f"{label}-{method}": self._picture(f"{label}-{method}", after)}
-        before = None if chart is None else chart.planes
-        return measure.state(edges, after, shots, self.case, before=before), name
+        return measure.state(edges, after, shots, self.case, before=chart.planes), name
+
+    @property
+    def _tiles(self) -> list[Roi]:
+        return measure.tiles(self.case.camera.frame)
 
     def _program(self, name: str, shots: Shots) -> Unit:
         """What a program of others makes of chart and photo, at its best setting."""
         peer, gains = programs.named(name), self.case.camera.white_balance
         setting, after = programs.best_setting(peer, develop(shots.held_out).planes, shots.truth(), gains)
-        chart = None if shots.chart is None else develop(shots.chart).planes
-        edges = None if chart is None else programs.corrected_by(peer, chart, setting, gains)
+        chart = develop(shots.chart).planes
+        edges = programs.corrected_by(peer, chart, setting, gains)
         label = programs.label_of(name)
         return {
             "setting": setting,
@@ -320,7 +320,7 @@ class CaseJob:
     def _learned(self, learning: _Learning, shots: Shots, number: str, *, own_way: bool) -> Unit:
         """What is known after so many photos, and what corrections with it come to."""
         case, n = self.case, int(number)
-        methods = (PRESETS["paper"].method,) if own_way else self.methods
+        methods = (PRESETS["paper"].method,) if own_way else self.plan.methods
         label = f"way-paper-n{n}" if own_way else f"n{n}"
         learner, refused, seconds = learning.of(shots.learn[:n])
         unit: Unit = {
@@ -333,15 +333,14 @@ class CaseJob:
         if n == len(refused):  # no model: a user gets no correction, so the photos stay as they are
             return {**unit, "psf": None, "methods": dict.fromkeys(methods, self._before)}
         unit["methods"] = {}
-        chart = None if shots.chart is None else develop(shots.chart).planes
+        chart = develop(shots.chart).planes
         for method in methods:
-            after = learner.corrected(shots.held_out, method)
-            edges = None if shots.chart is None else learner.corrected(shots.chart, method).planes
+            after = learner.corrected(shots.held_out, method, self._tiles)
+            edges = learner.corrected(shots.chart, method, measure.chart_tiles(case)).planes
             state = measure.state(edges, after.planes, shots, case, before=chart)
             state["nothing_to_correct"] = after.nothing_to_correct
-            if self._raw:
-                light = self._before["light"]
-                state["forecast"] = measure.forecast(light, after.planes, after.expected_db, shots, case)
+            light = self._before["light"]
+            state["forecast"] = measure.forecast(light, after.planes, after.expected_db, shots, case)
             unit["methods"][method] = state
             unit["pictures"][f"{label}-{method}"] = self._picture(f"{label}-{method}", after.planes)
         answers = learner.answers(measure.places(), case.settings, measure.PSF_SIZE)
@@ -353,18 +352,9 @@ class CaseJob:
         state: Unit = read(self.folder / "truth.json")["before"]
         return state
 
-    @property
-    def _raw(self) -> bool:
-        return self.case.conditions.container == "dng"
-
-    def _as_photo(self, planes: Planes) -> Planes:
-        """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
-        gains = np.asarray(self.case.camera.white_balance, dtype=np.float32)[:, None, None]
-        return planes if self._raw else planes * gains
-
-    def _picture(self, label: str, planes: Planes) -> str:
+    def _picture(self, label: str, planes: Planes, *, raw: bool = True) -> str:
         name = f"{self.folder.name}-{label}.png"
-        gains = self.case.camera.white_balance if self._raw else (1.0, 1.0, 1.0)
+        gains = self.case.camera.white_balance if raw else (1.0, 1.0, 1.0)
         crops = figures.strip(as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name

@@ -9,6 +9,8 @@ from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
+import numpy as np
+
 from lab.reproduce.cases import Case
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import PsfField
@@ -21,6 +23,8 @@ from lensmodel.workflow import correcting, sampling
 from lensmodel.workflow.sampling import PRESETS, Preset
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
+Roi: TypeAlias = tuple[int, int, int, int]
+"""Row, column, height and width of a part of a frame."""
 
 _SMALL_FRAME: Final = 2e6
 """Pixels below which the paper's way estimates kernels of the default's size (chosen): its 55 pixels are of
@@ -37,11 +41,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPhoto:
-    """A photo as the lens model corrects it."""
+    """A photo as the lens model corrects it: its parts, in what it was."""
 
     planes: Planes  # in the camera's colours, linear, not white-balanced
-    # gain in PSNR of linear light that the correction expects of itself, by zone; None where it is not sure
-    # enough to tell
+    # gain in PSNR of linear light that the correction expects of itself, by zone, mean over the parts; None
+    # where it is not sure enough to tell
     expected_db: Mapping[str, float | None] = dataclass_field(default_factory=dict)
     nothing_to_correct: bool = False  # whether the correction said so, and left every pixel as it was
 
@@ -58,8 +62,8 @@ class Learner(Protocol):
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
         """Return the PSFs at some places."""
 
-    def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
-        """Correct a photo that takes no part in learning, with what is known now."""
+    def corrected(self, photo: Path, method: str, parts: Sequence[Roi]) -> CorrectedPhoto:
+        """Correct parts of a photo that takes no part in learning, with what is known now."""
 
 
 def paper_way(case: Case) -> Preset:
@@ -126,21 +130,27 @@ class LibraryLearner:
         found = [model.query(place, settings.with_channel(channel), size) for place, channel in places]
         return [Answer(answer.kernel, answer.predicted_error) for answer in found]
 
-    def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
-        """Correct a photo; see `Learner`."""
+    def corrected(self, photo: Path, method: str, parts: Sequence[Roi]) -> CorrectedPhoto:
+        """Correct parts of a photo; see `Learner`."""
         developed = develop(photo)
-        done = correcting.correct_photo(
-            developed,
-            self._known(),
-            sampling.settings_of(developed),
-            method=method,
-            lateral=correcting.lateral_of(developed),
-            workers=self._workers,
-        )
-        expected: dict[str, float | None] = {
-            zone: report.expected_gain_db for zone, report in done.zones.items()
+        model, settings = self._known(), sampling.settings_of(developed)
+        field = correcting.psfs_for(developed, model, settings, method=method)
+        lateral = correcting.lateral_of(developed)
+        planes, said, nothing = developed.planes.copy(), dict[str, list[float | None]](), True
+        for roi in parts:
+            done = correcting.correct_photo(
+                developed, model, settings, method=method, lateral=lateral, known=field, roi=roi,
+                workers=self._workers,
+            )  # fmt: skip
+            planes[_inside(roi)] = done.planes
+            nothing &= done.nothing_to_correct
+            for zone, report in done.zones.items():
+                said.setdefault(zone, []).append(report.expected_gain_db)
+        expected = {
+            zone: None if None in told else float(np.mean([v for v in told if v is not None]))
+            for zone, told in said.items()
         }
-        return CorrectedPhoto(done.planes, expected, done.nothing_to_correct)
+        return CorrectedPhoto(planes, expected, nothing)
 
     def _known(self) -> LensModel:
         if self._model is None:
@@ -148,21 +158,24 @@ class LibraryLearner:
         return self._model
 
 
-def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, workers: int = 1) -> Planes:
-    """Correct a photo with a PSF field taken as right, as learners do with theirs."""
+def corrected_with(
+    developed: LinearPhoto, field: PsfField, method: str, parts: Sequence[Roi], *, workers: int = 1
+) -> Planes:
+    """Correct parts of a photo with a PSF field taken as right, as learners do with theirs."""
     planes, cfa = developed.planes, developed.cfa
     lateral: LateralColour | None = correcting.lateral_of(developed)
     if method == "paper" and lateral is not None:
         # the same way as `correcting.correct_photo` goes, so that only the PSFs differ
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
-    return correct_planes(
-        planes,
-        field,
-        developed.frame,
-        method=method,
-        noise=developed.correction_noise,
-        clip=developed.clip,
-        lateral=lateral,
-        cfa=cfa,
-        workers=workers,
-    ).planes
+    made = planes.copy()
+    for roi in parts:
+        made[_inside(roi)] = correct_planes(
+            planes, field, developed.frame, method=method, noise=developed.correction_noise,
+            clip=developed.clip, lateral=lateral, cfa=cfa, roi=roi, workers=workers,
+        ).planes  # fmt: skip
+    return made
+
+
+def _inside(roi: Roi) -> tuple[slice, slice, slice]:
+    row, col, height, width = roi
+    return slice(None), slice(row, row + height), slice(col, col + width)

@@ -13,16 +13,22 @@ from lab.images import fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
 from lab.reproduce.frames import Shots, guard_of
-from lab.reproduce.learners import Answer, Place
+from lab.reproduce.learners import Answer, Place, Roi
 from lensmodel import quality
-from lensmodel.core.geometry import zone_of
+from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, distance
 from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
+from lensmodel.quality.images import BLOCK, BORDER
 from lensmodel.simulate import edge_chart
 
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
 NEAR: Final = 1.5
 """A predicted error within this factor of the true one counts as right."""
+
+TILE: Final = 256
+"""Pixels: side of the parts of a frame that are compared (chosen: four blocks and their borders)."""
+
+_EDGES: Final = 6  # of the chart, in its order
 
 FAIR_OVERSHOOT: Final = 5.0
 """Percent of the step: corrections are compared at no more than that."""
@@ -64,14 +70,35 @@ def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, d
     return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
 
 
+def tiles(frame: Frame) -> list[Roi]:
+    """The parts of a frame that are corrected and compared: centre, two half way out, the four corners.
+
+    A correction of all of a large frame takes minutes and tells no more.
+    """
+    side = min(TILE, frame.height // 3 // 2 * 2, frame.width // 3 // 2 * 2)
+    bottom, right = frame.height - side, frame.width - side
+    inner = [(bottom // 2, right // 2), (bottom // 4, right // 4), (3 * bottom // 4, 3 * right // 4)]
+    corners = [(row, col) for row in (0, bottom) for col in (0, right)]
+    return [(row // 2 * 2, col // 2 * 2, side, side) for row, col in inner + corners]
+
+
+def chart_tiles(case: Case) -> list[Roi]:
+    """The edges of the chart that are corrected and measured: two in the centre, four towards one corner."""
+    return [(row // 2 * 2, col // 2 * 2, height // 2 * 2 + 2, width // 2 * 2 + 2)
+            for row, col, height, width in _edge_boxes(case)]  # fmt: skip
+
+
+def _edge_boxes(case: Case) -> list[Roi]:
+    return [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges[:_EDGES]]
+
+
 def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
     """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
 
     The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
     pixel, not a constant 1, whose MTF50 would lie at infinity.
     """
-    boxes = [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges]
-    found = quality.by_zone(quality.measure_edges(chart[channel], boxes))
+    found = quality.by_zone(quality.measure_edges(chart[channel], _edge_boxes(case)))
     return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
 
 
@@ -82,14 +109,22 @@ def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
     return row
 
 
-def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[Zone, float]]:
-    """PSNR and SSIM of the held-out photo against the sharp scene; see `fidelity`.
+def pictures(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dict[str, dict[Zone, float]]:
+    """PSNR and SSIM of the held-out photo against the sharp scene in `tiles`; see `fidelity`.
 
     Photos of the raw path are white-balanced for it; others are already.
     """
     gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
-    seen = photo * gains if case.conditions.container == "dng" else photo
-    return fidelity(seen, shots.truth() * gains, case.camera.frame)
+    seen = photo * gains if raw else photo
+    return fidelity(seen, shots.truth() * gains, case.camera.frame, corners=_blocks(case))
+
+
+def _blocks(case: Case) -> list[tuple[int, int]]:
+    every = []
+    for row, col, height, width in tiles(case.camera.frame):
+        rows, cols = ({*range(0, n - BLOCK, BLOCK - 2 * BORDER), n - BLOCK} for n in (height, width))
+        every += [(row + r, col + c) for r in sorted(rows) for c in sorted(cols)]
+    return every
 
 
 def forecast(
@@ -106,11 +141,18 @@ def forecast(
 
 def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
     """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
-    return dict(fidelity(photo, shots.truth(), case.camera.frame, srgb=False)["psnr"].items())
+    made = fidelity(photo, shots.truth(), case.camera.frame, srgb=False, corners=_blocks(case))
+    return dict(made["psnr"].items())
 
 
 def state(
-    chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, before: Planes | None = None
+    chart: Planes | None,
+    photo: Planes,
+    shots: Shots,
+    case: Case,
+    *,
+    before: Planes | None = None,
+    raw: bool = True,
 ) -> dict[str, Any]:
     """Everything about one version of the chart, if there is one, and of the held-out photo.
 
@@ -120,7 +162,7 @@ def state(
     if chart is not None and before is not None:
         for zone, value in fair_mtf50(chart, before, case).items():
             found[zone]["mtf50_fair"] = value
-    return {"edges": found, **pictures(photo, shots, case)}
+    return {"edges": found, **pictures(photo, shots, case, raw=raw)}
 
 
 def fair_mtf50(chart: Planes, before: Planes, case: Case) -> dict[str, float | None]:

@@ -16,9 +16,6 @@ TOLERATED_DB: Final = 0.05  # dB of a zone (chosen): less counts as equal
 MEASURABLE_DB: Final = 0.2
 """A gain of the true PSF below this says nothing of a lens."""
 
-NOTHING_DB: Final = 0.3
-"""Where the true PSF gains less than this in every zone, there is nothing to correct (chosen: a bar)."""
-
 FEWER: Final = "2"
 MORE: Final = "5"
 """Numbers of photos that are compared: the larger may be worse in nothing."""
@@ -61,14 +58,11 @@ def shown(state: str) -> str:
 
 
 def groups(result: Result) -> dict[str, Result]:
-    """Split the lenses by family, aperture and frame: means over different ones would compare nothing."""
+    """Split the lenses by family: means over both would compare nothing."""
     found: dict[str, list[Result]] = {}
     for case in result["cases"]:
-        settings = case["settings"]
-        stops = "wide open" if case["stops"] < 0.1 else f"{case['stops']:.0f} stops down"
-        label = f"{case['family']}, {stops}, frames of {settings['width']} x {settings['height']}"
-        found.setdefault(label, []).append(case)
-    return {label: {**result, "cases": cases} for label, cases in found.items()}
+        found.setdefault(case["family"], []).append(case)
+    return {family: {**result, "cases": cases} for family, cases in found.items()}
 
 
 def counts(result: Result) -> list[int]:
@@ -115,17 +109,6 @@ def summary(result: Result) -> dict[str, Any]:
             for n in counts(result)
         },
         "forecast_off": {method: _forecast_off(result, method) for method in methods},
-    }
-
-
-def nothing_said(result: Result, method: str) -> dict[str, dict[str, int]]:
-    """Count lenses said to have nothing to correct, by number of photos; see `said_nothing`."""
-    return {
-        str(n): said_nothing(
-            (case, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
-            for case in _having(result, n)
-        )
-        for n in counts(result)
     }
 
 
@@ -231,45 +214,35 @@ def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
     }
 
 
-def hard_rows(result: Result) -> list[dict[str, Any]]:
-    """One row a scene or path that hurts and family: gains in PSNR by zone, and zones that fell.
+def paths(result: Result) -> dict[str, dict[str, Any]]:
+    """What other kinds of files gain, by their names.
 
     Returns
     -------
-    list of dict
-        `condition`, `title`, `family`, `lenses`, `refused` (photos that were not learned from); `gain`,
-        `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
-        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
-        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`; `nothing` of
-        `said_nothing`.
+    dict
+        `lenses`; `refused` (photos that were not learned from); `gain` and `true`: mean gain in dB of PSNR by
+        zone of the correction learned from one photo, and of the true PSF; `share`: of the gain that raw
+        photos have from one, of all lenses together; `counts` of `counted`.
     """
-    every: dict[tuple[str, str], list[Result]] = {}
-    for case in result.get("hard", ()):
-        every.setdefault((case["condition"], case["family"]), []).append(case)
-    return [_hard_row(cases) for cases in every.values()]
-
-
-def _hard_row(cases: Sequence[Result]) -> dict[str, Any]:
-    after = [(case, *case["learned"].values()) for case in cases]
-    method = next(iter(after[0][1]["methods"]))
-    done = [(case, unit["methods"][method]) for case, unit in after]
-    rows = [(c, z, state, c["truth"]["true"][method]) for c, state in done for z in ZONES]
-    return {
-        "condition": cases[0]["condition"],
-        "title": cases[0]["condition_title"],
-        "family": cases[0]["family"],
-        "lenses": len(cases),
-        "refused": sum(len(unit["refused"]) for _, unit in after),
-        "gain": _zones(lambda z: mean(gain(c, state, z) for c, state in done)),
-        "ssim": _zones(lambda z: mean(gain(c, state, z, "ssim") for c, state in done)),
-        "control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in cases)),
-        "true": _zones(lambda z: mean(gain(c, c["truth"]["true"][method], z) for c in cases)),
-        "kept": _zones(partial(_column_mean, [kept(c, 1, method) for c in cases])),
-        "share": _zones(partial(_column_mean, [shares(c, 1, method) for c in cases])),
-        "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
-        "counts": counted(rows),
-        "nothing": said_nothing((case, state, case["truth"]["true"][method]) for case, state in done),
-    }
+    method = result["plan"]["methods"][0]
+    found: dict[str, dict[str, Any]] = {}
+    for name in sorted({name for case in result["cases"] for name in case["paths"]}):
+        cases = [case for case in result["cases"] if name in case["paths"]]
+        units = [case["paths"][name] for case in cases]
+        own = [{"truth": {"before": unit["before"]}} for unit in units]
+        gained = {z: mean(gain(o, u["after"], z) for o, u in zip(own, units, strict=True)) for z in ZONES}
+        raw = {z: mean(gain(c, c["learned"]["1"]["methods"][method], z) for c in cases) for z in ZONES}
+        found[name] = {
+            "lenses": len(cases),
+            "refused": sum(len(unit["refused"]) for unit in units),
+            "gain": gained,
+            "true": {z: mean(gain(o, u["true"], z) for o, u in zip(own, units, strict=True)) for z in ZONES},
+            "share": {z: None if not (r := raw[z]) else (gained[z] or 0.0) / r for z in ZONES},
+            "counts": counted(
+                (o, z, u["after"], u["true"]) for o, u in zip(own, units, strict=True) for z in ZONES
+            ),
+        }
+    return found
 
 
 def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
@@ -280,7 +253,7 @@ def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
     }
     return {
         BEFORE: case["truth"]["before"],
-        DENOISED: case["truth"]["control"],
+        **({DENOISED: case["truth"]["control"]} if case["truth"]["control"] else {}),
         **{name: unit["state"] for name, unit in case.get("programs", {}).items()},
         **learned,
         **{name: found for name, unit in others(case).items() if (found := _of(unit, name, method))},
@@ -385,29 +358,6 @@ def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int
         found["clearly_worse"] += psnr < -TOLERATED_DB
         found["ssim_worse"] += ssim < 0.0
         found["unimproved"] += possible >= MEASURABLE_DB and (psnr <= 0.0 or ssim <= 0.0)
-    return found
-
-
-def said_nothing(rows: Iterable[tuple[Result, Result, Result]]) -> dict[str, int]:
-    """Count lenses said to have nothing to correct, of rows `(case, corrected, with the true PSF)`.
-
-    Returns
-    -------
-    dict
-        `lenses` that were corrected, not those of which no photo counted; `said`; `wrongly`, of these, though
-        the true PSF gains 0.3 dB or more of PSNR in some zone; `unsaid`, not said though it gains less.
-    """
-    found = dict.fromkeys(("lenses", "said", "wrongly", "unsaid"), 0)
-    for case, corrected, true in rows:
-        said = corrected.get("nothing_to_correct")
-        gains = [g for zone in ZONES if (g := gain(case, true, zone)) is not None]
-        if said is None or not gains:
-            continue
-        nothing = max(gains) < NOTHING_DB
-        found["lenses"] += 1
-        found["said"] += bool(said)
-        found["wrongly"] += bool(said) and not nothing
-        found["unsaid"] += nothing and not said
     return found
 
 

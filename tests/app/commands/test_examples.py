@@ -101,7 +101,7 @@ SHORTER = {"calibrate": ["--estimator", "default"]}
 
 NOT_RUN = {
     "reproduce --size quick -o reproduction",  # tests/lab/reproduce runs one lens from end to end
-    "reproduce --only 1003 --results figures-so-far -o sitting",
+    "reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses",
     "bench",  # its three parts are run one by one
     "bench blind --cases 12",
     "bench blind --photos sharp --scenes 80 --half all --cases 200",

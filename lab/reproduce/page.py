@@ -103,8 +103,8 @@ def _conditions(result: Mapping[str, Any]) -> str:
         f"Size {plan['size']}: {len(cases)} simulated lenses ({families}), each wide open. {scenes}; "
         "those of the photo that is corrected serve in no other, the rest again, mirrored and elsewhere. "
         f"Frames of {sizes}, of which the center, two squares half way out and the corners are compared. "
-        "The photos are Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping and lateral "
-        f"colour. {paper}{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
+        "The photos are Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping "
+        f"and lateral colour. {paper}{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
         "The true PSF and the control go through the same correction. "
         f"Code {result['code']}."
     )

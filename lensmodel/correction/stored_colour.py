@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.jit import jit
 from lensmodel.core.types import CHANNELS, Planes
 from lensmodel.photo import LinearPhoto
-from lensmodel.photo.colour import curves_of, decode, encode, inverse
+from lensmodel.photo.colour import curves_of, inverse
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 """Weights of r, g, b in luma: ITU-R BT.601, as JFIF 1.02 requires."""
@@ -92,15 +93,17 @@ class StoredColour:
         Planes
             Within what the file can hold.
         """
-        before = self._values(photo)
-        change = self._values(restored) - before
+        before, change = np.empty(photo.shape, np.float32), np.empty(photo.shape, np.float32)
+        _values(photo, self.tables, before)
+        _values(restored, self.tables, change)
+        change -= before
         for axis in (-2, -1):
             change = ndimage.convolve1d(change, _FINEST, axis=axis, mode="nearest")
         luma = np.tensordot(_LUMA, change, axes=1)
         # the same linear filter on all three differences: their weighted sum stays zero, and luma what it is
-        values = before + luma + self.shown(change - luma)
-        np.clip(values, np.float32(0.0), np.float32(1.0), out=values)
-        return np.stack([decode(v, curve) for v, curve in zip(values, self.curves, strict=True)])
+        chroma = self.shown(change - luma)
+        _light(before, luma, chroma, self.curves)
+        return before
 
     def shown(self, chroma: NDArray[np.float32]) -> NDArray[np.float32]:
         """Chroma `(..., rows, cols)` as finely as the file shows it."""
@@ -109,5 +112,31 @@ class StoredColour:
                 chroma = ndimage.convolve1d(chroma, _PAIRED, axis=axis, mode="nearest")
         return chroma
 
-    def _values(self, planes: Planes) -> Planes:
-        return np.stack([encode(plane, table) for plane, table in zip(planes, self.tables, strict=True)])
+
+Tables = tuple[NDArray[np.float32], ...]
+
+
+@jit
+def _values(planes: Planes, tables: Tables, out: Planes) -> None:
+    """File values of linear light, as `photo.colour.encode` finds them."""
+    for c in range(planes.shape[0]):
+        table = tables[c]
+        last = np.float32(table.size - 1)
+        for i in range(planes.shape[1]):
+            for j in range(planes.shape[2]):
+                light = min(max(planes[c, i, j], np.float32(0.0)), np.float32(1.0))
+                out[c, i, j] = table[np.int32(np.sqrt(light) * last + np.float32(0.5))]
+
+
+@jit
+def _light(values: Planes, luma: NDArray[np.float32], chroma: Planes, curves: Tables) -> None:
+    """Linear light of file values and their changes, between the codes of the curves, in place."""
+    for c in range(values.shape[0]):
+        curve = curves[c]
+        last = np.float32(curve.size - 1)
+        for i in range(values.shape[1]):
+            for j in range(values.shape[2]):
+                value = values[c, i, j] + luma[i, j] + chroma[c, i, j]
+                at = min(max(value, np.float32(0.0)), np.float32(1.0)) * last
+                k = min(np.int32(at), np.int32(curve.size - 2))
+                values[c, i, j] = curve[k] + (at - np.float32(k)) * (curve[k + 1] - curve[k])

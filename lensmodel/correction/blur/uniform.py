@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel, otf
+from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel, Plane
 from lensmodel.correction.blur.operator import support_radius
 from lensmodel.correction.compiled.common import through, transfer
@@ -34,36 +34,6 @@ class Drift:
     down: tuple[UniformBlur, UniformBlur, float]
     across: tuple[UniformBlur, UniformBlur, float]
     origin: tuple[float, float]
-
-    def spectra(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer functions of k_down and k_across on the `rfft2` grid of `shape`, `(2, rows, cols)`.
-
-        Parameters
-        ----------
-        shape : tuple of int
-            Rows and columns of the plane.
-
-        Returns
-        -------
-        ndarray of complex64, shape (2, rows, cols // 2 + 1)
-        """
-        rates = [
-            _change(before, after, shape) / np.float32(max(pixels, 1.0))
-            for before, after, pixels in (self.down, self.across)
-        ]
-        return np.stack(rates).astype(np.complex64)
-
-
-def _change(before: UniformBlur, after: UniformBlur, shape: tuple[int, int]) -> NDArray[np.complexfloating]:
-    """Difference of two transfer functions; one transform if neither blur is shifted."""
-    if before.offset != (0.0, 0.0) or after.offset != (0.0, 0.0):
-        return np.asarray(after.transfer(shape) - before.transfer(shape))
-    side = max(before.kernel.shape[0], after.kernel.shape[0])
-    grid = np.zeros(shape, dtype=np.float32)
-    for blur, sign in ((before, -1.0), (after, 1.0)):
-        low = (side - blur.kernel.shape[0]) // 2
-        grid[low : side - low, low : side - low] += (sign * blur.kernel).astype(np.float32)
-    return np.asarray(fft.rfft2(np.roll(grid, (-(side // 2), -(side // 2)), axis=(0, 1))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,28 +92,22 @@ class UniformBlur:
         ndarray of complex64, shape (rows, cols // 2 + 1)
         """
         if shape not in self._spectra:
-            if self.offset == (0.0, 0.0):
-                K = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
-                transfer(self.kernel.astype(np.float32), K, shape[1])
-            else:
-                K = self.transfer(shape).astype(np.complex64)
+            K = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
+            transfer(self.taps, K, shape[1])
             self._spectra[shape] = K
         return self._spectra[shape]
 
-    def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
-        """Transfer function on the `rfft2` grid of `shape`, not cached.
+    @property
+    def taps(self) -> NDArray[np.float32]:
+        """The kernel at its offset, by Keys' cubic convolution (IEEE Trans. ASSP 29, 1981), `(side, side)`.
 
-        Parameters
-        ----------
-        shape : tuple of int
-            Rows and columns, no smaller than the kernel.
-
-        Returns
-        -------
-        ndarray of complex128, shape (rows, cols // 2 + 1)
+        A phase alone would be a sinc, whose tails cross the picture: where the kernel is next to a point,
+        undoing them drew nets of dots around every edge.
         """
-        spectrum = otf(self.kernel, shape)
-        return spectrum * _phase(self.offset, shape) if self.offset != (0.0, 0.0) else spectrum
+        if self.offset == (0.0, 0.0):
+            return self.kernel.astype(np.float32)
+        rows, cols = (_moved(self.kernel.shape[0], shift, self.reach) for shift in self.offset)
+        return np.asarray(rows @ self.kernel @ cols.T, dtype=np.float32)
 
     def forward(self, latent: Plane) -> Plane:
         """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`.
@@ -240,32 +204,21 @@ class UniformBlur:
         return latent[cut : latent.shape[0] - cut, cut : latent.shape[1] - cut]
 
 
-def _phase(offset: tuple[float, float], shape: tuple[int, int]) -> NDArray[np.complex128]:
-    """Spectrum of a shift by `offset`, by Keys' cubic convolution (IEEE Trans. ASSP 29, 1981).
-
-    A phase alone would be a sinc, whose tails cross the picture: where the kernel is next to a point, undoing
-    them drew nets of dots around every edge.
-    """
-    rows = _shifted(offset[0], fft.fftfreq(shape[0]))
-    cols = _shifted(offset[1], fft.rfftfreq(shape[1]))
-    return np.asarray(rows[:, None] * cols[None, :])
-
-
-def _shifted(offset: float, frequency: NDArray[np.floating]) -> NDArray[np.complex128]:
-    """Spectrum of a shift along one axis: four taps, or one where it is by whole pixels."""
-    whole = math.floor(offset)
-    x = offset - whole
+def _moved(side: int, shift: float, reach: int) -> NDArray[np.float64]:
+    """Matrix that moves samples by `shift`, onto 2 reach + 1 of the same middle: four taps, or one."""
+    whole = math.floor(shift)
+    x = shift - whole
     taps = (
         ((2.0 - x) * x - 1.0) * x / 2.0,
         ((3.0 * x - 5.0) * x * x + 2.0) / 2.0,
         ((4.0 - 3.0 * x) * x + 1.0) * x / 2.0,
         (x - 1.0) * x * x / 2.0,
     )
-    spectrum = sum(
-        tap * np.exp(-2j * np.pi * frequency * (whole - 1 + number)) for number, tap in enumerate(taps)
-    )
-    at_nyquist = np.abs(frequency) == 0.5  # real there, because the picture is real
-    return np.asarray(np.where(at_nyquist, np.real(spectrum), spectrum))
+    margin = reach - side // 2
+    moved = np.zeros((2 * reach + 1, side))
+    for number, tap in enumerate(taps):
+        moved += tap * np.eye(2 * reach + 1, side, -(margin + whole - 1 + number))
+    return moved
 
 
 def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:

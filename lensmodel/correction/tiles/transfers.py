@@ -26,10 +26,6 @@ def transfers(
     alone and takes the change to the other side, as data. That converges only where the change is
     smaller than K, so it is limited to half of K at `reach` pixels from the middle.
     """
-    if any(blur.offset != (0.0, 0.0) for blur in blurs):
-        steady = np.zeros((0, 2, 0, 0), dtype=np.complex64)
-        spectra = np.stack([blur.spectrum(shape) for blur in blurs])
-        return spectra, _rates(blurs, shape, reach) if drifting else steady
     taps = _taps(blurs, drifting=drifting)
     half = shape[1] // 2 + 1
     K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
@@ -42,33 +38,25 @@ def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32
     """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
     drifts = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
     drifting = drifting and len(drifts) == len(blurs)
-    kernels = [blur.kernel for blur in blurs]
+    kernels = [blur.taps for blur in blurs]
+    ends = [
+        [(before.taps, after.taps, max(pixels, 1.0)) for before, after, pixels in pair] for pair in drifts
+    ]
+    sides = [kernel.shape[0] for kernel in kernels]
     if drifting:
-        kernels += [end.kernel for pair in drifts for ends in pair for end in ends[:2]]
-    side = max(kernel.shape[0] for kernel in kernels)
+        sides += [end.shape[0] for pair in ends for both in pair for end in both[:2]]
+    side = max(sides)
     taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
 
-    def place(channel: int, index: int, kernel: NDArray[np.float64], factor: float) -> None:
+    def place(channel: int, index: int, kernel: NDArray[np.float32], factor: float) -> None:
         low = (side - kernel.shape[0]) // 2
         taps[channel, index, low : side - low, low : side - low] += factor * kernel
 
-    for c, blur in enumerate(blurs):
-        place(c, 0, blur.kernel, 1.0)
+    for c, kernel in enumerate(kernels):
+        place(c, 0, kernel, 1.0)
     if drifting:
-        for c, pair in enumerate(drifts):
+        for c, pair in enumerate(ends):
             for index, (before, after, pixels) in enumerate(pair, start=1):
-                place(c, index, before.kernel, -1.0 / max(pixels, 1.0))
-                place(c, index, after.kernel, 1.0 / max(pixels, 1.0))
+                place(c, index, before, -1.0 / pixels)
+                place(c, index, after, 1.0 / pixels)
     return taps
-
-
-def _rates(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> NDArray[np.complex64]:
-    damped = []
-    for blur in blurs:
-        if blur.drift is None:
-            return np.zeros((0, 2, 0, 0), dtype=np.complex64)
-        rates = blur.drift.spectra(shape)
-        change = np.float32(reach) * np.abs(rates).sum(axis=0)
-        allowed = np.float32(0.5) * np.abs(blur.spectrum(shape))
-        damped.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
-    return np.stack(damped).astype(np.complex64)

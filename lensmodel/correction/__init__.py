@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lensmodel.correction.blur import crop_to_support
 from lensmodel.correction.deconvolver import (
     ColourDeconvolver,
     Deconvolver,
@@ -16,17 +17,21 @@ from lensmodel.correction.methods.catalogue import deconvolvers
 from lensmodel.correction.methods.direct import DirectFilter
 from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.posterior import PosteriorField, PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.lattice import Roi
-from lensmodel.correction.whole_photo import Corrected, PsfError, correct_planes
+from lensmodel.correction.whole_photo import KERNEL_SIZE, Corrected, PsfError, correct_planes
 
 __all__ = [
+    "KERNEL_SIZE",
     "Bounds",
     "ColourDeconvolver",
     "Corrected",
     "Deconvolver",
     "DirectFilter",
+    "PosteriorField",
     "PsfError",
+    "PsfPosterior",
     "Restored",
     "RichardsonLucy",
     "Roi",
@@ -37,6 +42,7 @@ __all__ = [
     "WarpableMethod",
     "ZoneReport",
     "correct_planes",
+    "crop_to_support",
     "deconvolvers",
     "restore_planes",
 ]

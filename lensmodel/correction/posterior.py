@@ -15,14 +15,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import otf
-from lensmodel.core.types import Kernel
+from lensmodel.core.types import Channel, FieldPosition, Kernel
 
 GRID: Final = (64, 64)
 """Shape of the grid whose `rfft2` frequencies variances are given on."""
@@ -55,6 +55,31 @@ class PsfPosterior:
         times = _times()
         scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
         return cls(kernel, (scale * shape).astype(np.float32), error)
+
+    @classmethod
+    def of_rings(cls, kernel: Kernel, error: float, rings: NDArray[np.floating]) -> PsfPosterior:
+        """A kernel whose relative L2 error is known, and that of its transfer function by frequency.
+
+        Parameters
+        ----------
+        rings : ndarray, shape (n,)
+            Root mean square of |H - E[H]| in n rings from 0 to half a cycle per pixel. Between their middles
+            it is interpolated, and at the frequency 0, where all kernels are 1, it is 0.
+        """
+        if kernel.shape[0] > WIDEST:
+            return cls.of_error(kernel, error)
+        middles = (np.arange(len(rings)) + 0.5) * 0.5 / len(rings)
+        at = np.hypot(np.fft.fftfreq(GRID[0])[:, None], np.fft.rfftfreq(GRID[1])[None, :])
+        told = np.interp(at, np.concatenate([[0.0], middles]), np.concatenate([[0.0], np.square(rings)]))
+        return cls(kernel, told.astype(np.float32), error)
+
+
+@runtime_checkable
+class PosteriorField(Protocol):
+    """A posterior of the PSF for every place and channel."""
+
+    def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
+        """Return what is known of the PSF at a field position, its kernel cut to its support."""
 
 
 @lru_cache(maxsize=1)

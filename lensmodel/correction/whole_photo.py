@@ -33,7 +33,7 @@ from lensmodel.correction.engine import keep_freed_memory, tell_of_compiling
 from lensmodel.correction.expected_gain import ZoneReport, zone_reports
 from lensmodel.correction.limit import Bounds
 from lensmodel.correction.methods.catalogue import deconvolvers
-from lensmodel.correction.posterior import PsfPosterior
+from lensmodel.correction.posterior import PosteriorField, PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.tiles.lattice import Cell, Roi, cells, usual_pitch
 
@@ -92,7 +92,7 @@ class Corrected:
 
 def correct_planes(
     planes: Planes,
-    field: PsfField,
+    field: PsfField | PosteriorField,
     frame: Frame,
     *,
     noise: Sequence[NoiseModel],
@@ -124,7 +124,7 @@ def correct_planes(
     ----------
     planes : Planes, shape (3, height, width)
         Linear light, saturation 1; may be memory-mapped.
-    field : PsfField
+    field : PsfField or PosteriorField
         The lens.
     frame : Frame
         Size of the photo.
@@ -137,8 +137,8 @@ def correct_planes(
     strength : float
         0 leaves the photo as it is, 1 applies what the noise allows.
     psf_error : float, callable or None
-        Expected relative L2 error of the PSF: the larger, the more of a point is mixed into it, and the less
-        is allowed beside edges. None is 0.
+        Expected relative L2 error of the PSFs of a `PsfField`: the larger, the more of a point is mixed into
+        them, and the less is allowed beside edges. None is 0.
     lateral : LateralColourShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
@@ -261,16 +261,17 @@ def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
 
 
 def _posteriors_of(
-    field: PsfField, psf_error: PsfError | None
+    field: PsfField | PosteriorField, psf_error: PsfError | None
 ) -> Callable[[FieldPosition, Channel], PsfPosterior]:
     """The posterior of the PSF of one channel at one place, cached."""
 
     @lru_cache(maxsize=KEPT)
     def posterior(position: FieldPosition, channel: Channel) -> PsfPosterior:
+        if isinstance(field, PosteriorField):
+            return field.posterior_at(position, channel)
         error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
-        return PsfPosterior.of_error(
-            crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error)
-        )
+        kernel = crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
+        return PsfPosterior.of_error(kernel, float(error))
 
     return posterior
 

@@ -304,10 +304,14 @@ class ModelField:
             positions, self.settings.with_channel(channel), size, pitch_um=self.pitch_um
         )
 
+    def answer_at(self, position: FieldPosition, channel: Channel, size: int) -> PsfAnswer:
+        """Return the kernel of odd side `size` at a field position, with what is expected of its error."""
+        settings = self.settings.with_channel(channel)
+        return self.model.query(position, settings, size, pitch_um=self.pitch_um)
+
     def error_at(self, position: FieldPosition, channel: Channel) -> float:
         """Return the relative L2 error that is expected of the kernel at a field position."""
-        settings = self.settings.with_channel(channel)
-        return self.model.query(position, settings, pitch_um=self.pitch_um).predicted_error
+        return self.answer_at(position, channel, 15).predicted_error
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Final
 from lensmodel import correction
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError, OutsideSupportError
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import LensSettings, StepHook, ignore_step
+from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, ModelField
 from lensmodel.model.answer import PAPER
 from lensmodel.model.bodies import ALIKE, circle_mm
@@ -68,13 +68,12 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correction.correct_planes(
         planes,
-        field,
+        field if plain else _Posteriors(field),
         developed.frame,
         method=solver,
         strength=strength,
         noise=developed.correction_noise,
         clip=developed.clip,
-        psf_error=None if plain else field.error_at,
         lateral=lateral,
         cfa=cfa,
         bounds=bounds,
@@ -86,6 +85,20 @@ def correct_photo(
         workers=workers,
         on_step=on_step,
     )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Posteriors:
+    """What a model knows of the PSFs of a lens, as the correction needs it."""
+
+    field: ModelField
+
+    def posterior_at(self, position: FieldPosition, channel: Channel) -> correction.PsfPosterior:
+        answer = self.field.answer_at(position, channel, correction.KERNEL_SIZE)
+        kernel = correction.crop_to_support(answer.kernel)
+        if answer.ring_error is None or answer.answered_by != "network":
+            return correction.PsfPosterior.of_error(kernel, answer.predicted_error)
+        return correction.PsfPosterior.of_rings(kernel, answer.predicted_error, answer.ring_error)
 
 
 def _way(

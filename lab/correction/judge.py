@@ -31,8 +31,8 @@ from lensmodel.core.psf import PsfField, as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.correction import StoredColour, correct_planes
 from lensmodel.photo import LinearPhoto, develop, write_image
-from lensmodel.simulate import BlurOptions, CameraLens, SimulatedCamera, draw_lens, write_photo
-from lensmodel.simulate.camera import SimulatedPhoto, Truth
+from lensmodel.simulate import CameraLens, SimulatedCamera, draw_lens, write_photo
+from lensmodel.simulate.camera import SimulatedPhoto
 
 PITCH_UM: Final = 4.5
 KERNEL: Final = 55
@@ -117,8 +117,8 @@ def taken(case: Case, zone: str, rng: np.random.Generator) -> tuple[FrameWindow,
         height=height, width=width, full_well_electrons=case.full_well, read_noise=case.read
     )
     light, sharp = (camera.balanced(planes[:, :height, :width]) for planes in (at.light, at.scene))
-    truth = Truth(lens, camera, LensSettings(aperture=aperture), "", 1.0, BlurOptions(), 0)
-    shot = SimulatedPhoto(camera.mosaic(light, rng), light, sharp, truth)
+    settings = LensSettings(aperture=aperture)
+    shot = SimulatedPhoto(camera.mosaic(light, rng), light, sharp, lens, camera, settings)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "a.dng"
         write_photo(path, shot)

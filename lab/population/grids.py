@@ -16,7 +16,6 @@ from lab.traced.grid import GridField
 
 _AT_ONCE: Final = 64  # places whose rays are traced together
 _INSIDE: Final = 1.001  # half diagonals: designs are traced no farther out than the corner
-_CORNER_LIGHT: Final = 0.5  # transmission at the corner over that in the centre, falling with r^2 (chosen)
 
 
 def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField:
@@ -58,7 +57,6 @@ def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField
     for i, j in np.argwhere(radius > _INSIDE):
         near = inside[np.argmin(np.hypot(*(inside - (i, j)).T))]
         kernels[:, i, j], centers[:, i, j] = kernels[:, near[0], near[1]], centers[:, near[0], near[1]]
-    light = np.clip(1.0 - (1.0 - _CORNER_LIGHT) * radius**2, 0.3, 1.0).astype(np.float32)
     facts = {
         "design": lens.design,
         "source": PRESCRIPTIONS[lens.design].source,
@@ -68,4 +66,4 @@ def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField
         "pitch_um": lens.pitch_um,
         "half_diagonal_mm": lens.half_diagonal_mm,
     }
-    return GridField(axis, kernels, centers, light, facts)
+    return GridField(axis, kernels, centers, facts)

@@ -39,14 +39,13 @@ class GridField:
     # and has its centre of mass on the middle pixel.
     kernels: NDArray[np.float16]
     centers_px: NDArray[np.float32]  # (3, n, n, 2), where they lie against green, (right, up): lateral colour
-    light: NDArray[np.float32]  # (n, n), transmission of the pupil over that in the centre
     facts: Mapping[str, Any]  # design, source, copy, `f_number`, `focal_mm`, `pitch_um`, `half_diagonal_mm`
     _known: dict[tuple[float, float, Channel], Kernel] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         n = self.axis.size
-        shapes = (self.kernels.shape[:3], self.centers_px.shape, self.light.shape)
-        if shapes != ((3, n, n), (3, n, n, 2), (n, n)) or self.kernels.ndim != 5:
+        shapes = (self.kernels.shape[:3], self.centers_px.shape)
+        if shapes != ((3, n, n), (3, n, n, 2)) or self.kernels.ndim != 5:
             raise InvalidInputError(f"a grid of {n} nodes a side does not have the shapes {shapes}")
 
     @property
@@ -78,11 +77,6 @@ class GridField:
             kernel = np.tensordot(right, np.tensordot(up, nodes, axes=(0, 0)), axes=(0, 0))
             self._known[key] = _centred(as_kernel(np.maximum(kernel, 0.0)))
         return resized(self._known[key], size)
-
-    def transmission(self, h: tuple[float, float]) -> float:
-        """Light at field vector `h` over that in the centre."""
-        right, up = self._weights(h)
-        return float(np.clip(up @ self.light.astype(np.float64) @ right, 0.0, 1.0))
 
     @cached_property
     def lateral(self) -> Mapping[Channel, tuple[float, float]]:
@@ -120,7 +114,6 @@ class GridField:
                 axis=self.axis,
                 kernels=self.kernels,
                 centers_px=self.centers_px,
-                light=self.light,
                 facts=np.array(json.dumps(dict(self.facts), sort_keys=True)),
             )
 
@@ -134,7 +127,6 @@ def read_grid(path: str | Path) -> GridField:
             stored["axis"],
             stored["kernels"],
             stored["centers_px"],
-            stored["light"],
             json.loads(str(stored["facts"])),
         )
 
@@ -198,10 +190,6 @@ class GridLens:
             )
         kernel = grid.kernel_at_field(h, settings.channel, size)
         return kernel if offset == (0.0, 0.0) else _moved(kernel, offset)
-
-    def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
-        """Light that the rims let through at field vector `h`, over that in the centre."""
-        return self._grid(settings).transmission(h)
 
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""

@@ -166,9 +166,9 @@ class TracedLens:
                     light = amplitude**2 / (amplitude**2).sum()
                     tilt = np.stack(np.broadcast_arrays(np.ones_like(path), L[None, :], M[:, None]))
                     slope = _without(longer - path, tilt, light)
-                    vote = weight * share / points
-                    above -= vote * float((light * slope * _without(path, tilt, light)).sum())
-                    below += vote * float((light * slope * slope).sum())
+                    part = weight * share / points
+                    above -= part * float((light * slope * _without(path, tilt, light)).sum())
+                    below += part * float((light * slope * slope).sum())
         return above / below
 
     def pupils(

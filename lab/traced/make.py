@@ -11,7 +11,7 @@ import numpy as np
 
 from lab.traced.designs import designs
 from lab.traced.grid import GridField
-from lab.traced.image import kernel_of, transmission
+from lab.traced.image import kernel_of
 from lab.traced.lens import TracedLens
 from lensmodel.core.psf import distance
 from lensmodel.core.types import CHANNELS, FieldPosition, StepHook, ignore_step
@@ -62,7 +62,6 @@ def make_grid(
     count = axis.size
     kernels = np.zeros((len(CHANNELS), count, count, size, size), dtype=np.float16)
     centers = np.zeros((len(CHANNELS), count, count, 2), dtype=np.float32)
-    light = np.zeros((count, count), dtype=np.float32)
     radius = np.hypot(*np.meshgrid(axis, axis))
     traced = [(int(i), int(j)) for i, j in np.argwhere(radius <= 1.0 + 1.5 * step)]
     stop, limits = lens.stop_radius(n), lens.limits
@@ -80,16 +79,12 @@ def make_grid(
             kernels[c, i, j] = kernel.astype(np.float16)
             middles.append(np.array(middle))
         centers[:, i, j] = (np.array(middles) - middles[1]) / pitch_um
-        green = pupils["g"]
-        light[i, j] = transmission(green[len(green) // 2][0], stop, limits)
         on_step(done, len(traced))
     known = np.array(traced)
     for i, j in np.argwhere(radius > 1.0 + 1.5 * step):
         near = known[np.argmin(np.hypot(*(known - (i, j)).T))]
         for values in (kernels, centers):
             values[:, i, j] = values[:, near[0], near[1]]
-        light[i, j] = light[near[0], near[1]]
-    light /= light[reach, reach]
     facts = {
         **asdict(lens.copy),
         "source": designs.create(lens.copy.design).source,
@@ -99,9 +94,8 @@ def make_grid(
         "pitch_um": pitch_um,
         "half_diagonal_mm": lens.copy.half_diagonal_mm,
         "path_misfit_waves": misfit,
-        "corner_light_reached": float(light[reach, -2]),
     }
-    return GridField(axis, kernels, centers, light, facts)
+    return GridField(axis, kernels, centers, facts)
 
 
 def interpolation_error(

@@ -1,8 +1,6 @@
-"""What only a look at the window's own pixels tells: spectrum, periods, blocks, blobs.
+"""What speaks against a window: its own spectrum, periods, blocks and blobs, and defocus beside the others.
 
-Tell blur of the scene and of the hand from blur of the lens, as far as one photo allows.
-
-Whether the chosen patches of a photo are enough, and spread out enough, to tell about its lens.
+And whether the chosen patches of a photo are enough, and spread out enough, to tell about its lens.
 """
 
 from __future__ import annotations
@@ -292,11 +290,6 @@ SHARP_PX: Final = 0.6
 """Edges of a sharp photo measure about this wide; a smaller width carries no information."""
 MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
 
-MOTION_LIMIT: Final = 0.45
-"""Relative elongation above which `select` warns: that of a lens averages out over the field, a scene of one
-direction has some (chosen)."""
-MIN_FOR_MOTION: Final = 6  # windows: twice the three unknowns of the fit (chosen)
-
 
 def width_envelope(windows: Windows) -> NDArray[np.float64]:
     """Smallest consistent edge width at each window's r.
@@ -368,30 +361,6 @@ def defocus_excess(windows: Windows) -> NDArray[np.float64]:
     limit = envelope * ENVELOPE_RATIO * (1.0 + CORNER_ALLOWANCE * windows.r**2)
     worst = np.fmax(windows.width, windows.widest / QUARTER_ALLOWANCE)
     return np.nan_to_num(worst / limit)
-
-
-def motion(windows: Windows) -> tuple[float, float]:
-    """Elongation of the blur that all windows share in image axes, and its direction in degrees.
-
-    The blur of a lens turns with the field, that of the hand does not. The relative elongation
-    vectors (over twice the angle) are fitted by a constant plus a term that turns with phi::
-
-        e_i = c + k r_i² (cos 2 phi_i, -sin 2 phi_i)
-    """
-    known = np.any(windows.elongation != 0.0, axis=1)
-    if int(known.sum()) < MIN_FOR_MOTION:
-        return 0.0, 0.0
-    e = windows.elongation[known]
-    square, double = windows.r[known] ** 2, 2.0 * windows.phi[known]
-    # Image axes have rows growing downwards, phi grows towards row 0: hence the minus.
-    turning = np.stack([square * np.cos(double), -square * np.sin(double)], axis=1)
-    ones, zeros = np.ones_like(square), np.zeros_like(square)
-    basis = np.concatenate(
-        [np.stack([ones, zeros, turning[:, 0]], axis=1), np.stack([zeros, ones, turning[:, 1]], axis=1)]
-    )
-    target = np.concatenate([e[:, 0], e[:, 1]])
-    fit = np.linalg.lstsq(basis, target, rcond=None)[0]
-    return math.hypot(fit[0], fit[1]), -math.degrees(math.atan2(fit[1], fit[0])) / 2.0
 
 
 LEAST_PATCHES: Final = 6

@@ -210,7 +210,7 @@ def select(
     patches = tuple(_patch(windows, i, float(score[i]) * weight, cell) for i, cell in chosen)
     counts = Counter(reason for reason in reasons.tolist() if reason)
     logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), dict(counts))
-    return Selection(patches, _rejections(windows, reasons), dict(counts), _warnings(windows.take(taken)))
+    return Selection(patches, _rejections(windows, reasons))
 
 
 def _block_side(frame: Frame, size: int) -> int:
@@ -281,18 +281,6 @@ def _rejections(windows: Windows, reasons: NDArray[np.str_]) -> tuple[Rejection,
         Rejection(int(windows.rows[i]), int(windows.cols[i]), windows.size, str(reasons[i]))  # type: ignore[arg-type]  # only reasons are stored
         for i in at
     )
-
-
-def _warnings(chosen: Windows) -> tuple[str, ...]:
-    amount, direction = checks.motion(chosen)
-    if amount <= checks.MOTION_LIMIT:
-        return ()
-    text = (
-        "motion: the blur of all patches is elongated in the same direction "
-        f"({direction:.0f} degrees from horizontal), which looks like camera shake; "
-        "use a photo taken from a tripod or with a shorter exposure"
-    )
-    return (text,)
 
 
 def _nothing_usable(counts: Counter[str]) -> str:

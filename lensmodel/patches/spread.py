@@ -187,8 +187,7 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
             f"none of {len(rejected)} windows is usable ({', '.join(reasons)}); "
             "take a scene with fine detail all over, at a lower ISO"
         )
-    counts = {reason: sum(r.reason == reason for r in rejected) for reason in ("flat", "clipped")}
-    return Selection(tuple(patches), tuple(rejected), counts)
+    return Selection(tuple(patches), tuple(rejected))
 
 
 def _cells(

@@ -7,8 +7,8 @@ What is known of every candidate window of a photo, as arrays.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
@@ -69,9 +69,6 @@ class Selection:
     patches: tuple[Patch, ...]  # ordered by cell, the best of each cell first
     # at most `MAX_REJECTIONS` of them, spread evenly over the photo and the reasons
     rejected: tuple[Rejection, ...]
-    # how many windows every reason holds for, complete
-    counts: Mapping[str, int] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()  # what concerns the photo as a whole, in words for the user
 
 
 ORIENTATIONS: Final = 8

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -27,7 +25,7 @@ from lensmodel.photo.tags.exif_block import (
     laid_out,
     main_directory,
 )
-from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.photo.values import PhotoMetadata
 
 BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -41,64 +39,8 @@ XYZ_TO_SRGB: Final = (
 _STRIP_OFFSETS: Final = 273  # tag, TIFF 6.0, section 8
 _OPCODE_LISTS: Final = (51009, 51022)  # OpcodeList2 and 3: DNG 1.6, chapter 7
 _CFA, _LINEAR_RAW = 32803, 34892  # PhotometricInterpretation of TIFF/EP and of DNG 1.6, chapter 3
+UNKNOWN: Final = PhotoMetadata()
 _D65: Final = 21  # CalibrationIlluminant1 of DNG 1.6, chapter 4, in the numbers of Exif's LightSource
-
-
-@dataclass(frozen=True, slots=True)
-class ShotInfo:
-    """What a photo says about how it was taken; None or an empty text is left out of the file."""
-
-    camera_maker: str = ""  # the camera
-    camera_model: str = ""
-    body_serial: str = ""
-    lens_maker: str = ""  # the lens (EXIF 0xA433 to 0xA435)
-    lens_model: str = ""
-    lens_serial: str = ""
-    aperture: float | None = None  # the f-number
-    focal_mm: float | None = None  # focal length in millimetres
-    focal_range_mm: tuple[float, float] | None = None  # shortest and longest focal length of the lens
-    # smallest f-number at the shortest and longest focal length
-    widest_aperture: tuple[float, float] | None = None
-    focus_m: float | None = None  # subject distance in metres; infinity is allowed
-    iso: int | None = None  # photographic sensitivity
-    exposure_s: float | None = None  # exposure time in seconds
-    taken_at: datetime | None = None  # when the photo was taken
-    pixel_pitch_um: float | None = None  # written as the focal plane resolution
-    orientation: int = 1  # EXIF orientation, 1 to 8
-    description: str = ""  # free text
-    baseline_exposure: float | None = None  # stops by which a raw converter is asked to brighten the picture
-    artist: str | None = None
-    copyright: str | None = None
-    rating: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.orientation not in range(1, 9):
-            raise InvalidInputError(f"EXIF orientation must be 1 to 8, got {self.orientation}")
-        for name in ("aperture", "focal_mm", "exposure_s", "pixel_pitch_um"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(f"{name} must be positive or None, got {value}")
-        if self.focus_m is not None and not self.focus_m > 0:
-            raise InvalidInputError(f"focus_m must be positive metres or None, got {self.focus_m}")
-
-    @property
-    def metadata(self) -> PhotoMetadata:
-        """What is written of it into any file."""
-        return PhotoMetadata(
-            camera_maker=self.camera_maker,
-            camera_model=self.camera_model,
-            lens=LensIdentity(self.lens_maker, self.lens_model),
-            aperture=self.aperture,
-            focal_mm=self.focal_mm,
-            focus_m=self.focus_m,
-            iso=self.iso,
-            exposure_s=self.exposure_s,
-            taken_at=self.taken_at,
-            pixel_pitch_um=self.pixel_pitch_um,
-            artist=self.artist,
-            copyright=self.copyright,
-            rating=self.rating,
-        )
 
 
 def write_bayer_dng(
@@ -110,7 +52,9 @@ def write_bayer_dng(
     pattern: str = "RGGB",
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
-    shot: ShotInfo | None = None,
+    metadata: PhotoMetadata = UNKNOWN,
+    description: str = "",
+    baseline_exposure: float | None = None,
 ) -> None:
     """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all.
 
@@ -128,8 +72,12 @@ def write_bayer_dng(
         CIE XYZ (D65) to camera colours (DNG ColorMatrix1).
     as_shot_neutral : sequence of float
         Camera colours of a grey scene: one over the white balance multipliers.
-    shot : ShotInfo, optional
-        Metadata.
+    metadata : PhotoMetadata
+        What is known of camera, lens and exposure; serials and orientation are written, too.
+    description : str
+        Free text.
+    baseline_exposure : float, optional
+        Stops by which a raw converter is asked to brighten the picture.
 
     Raises
     ------
@@ -140,9 +88,8 @@ def write_bayer_dng(
         raise InvalidInputError(f"a mosaic is uint16 with even sides, got {mosaic.dtype} {mosaic.shape}")
     if pattern not in BAYER_PATTERNS:
         raise InvalidInputError(f"pattern must be one of {', '.join(BAYER_PATTERNS)}, got {pattern!r}")
-    shot = shot or ShotInfo()
     colours = bytes("RGB".index(letter) for letter in pattern)
-    tags = _common_tags(1, _CFA, shot)
+    tags = _common_tags(1, _CFA, metadata, description, baseline_exposure)
     tags.shorts(33421, 2, 2)  # CFARepeatPatternDim
     tags.raw(33422, BYTE, colours)  # CFAPattern
     tags.raw(50710, BYTE, b"\x00\x01\x02")  # CFAPlaneColor: red, green, blue
@@ -150,7 +97,7 @@ def write_bayer_dng(
     _colour_tags(
         tags, 1, black=black, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral
     )
-    _write(Path(path), tags, {EXIF_POINTER: _exif(shot)}, mosaic)
+    _write(Path(path), tags, {EXIF_POINTER: _exif(metadata)}, mosaic)
 
 
 def write_linear_dng(
@@ -160,7 +107,9 @@ def write_linear_dng(
     white: int = 65535,
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
-    shot: ShotInfo | None = None,
+    metadata: PhotoMetadata = UNKNOWN,
+    description: str = "",
+    baseline_exposure: float | None = None,
     xmp: bytes = b"",
     opcodes_2: bytes = b"",
     opcodes_3: bytes = b"",
@@ -175,7 +124,7 @@ def write_linear_dng(
     planes : ndarray, shape (3, H, W), uint16
         Camera colours, linear, not white balanced, black at 0: LibRaw 0.22 takes a black level of
         linear images off the values but not off the white level.
-    white, color_matrix, as_shot_neutral, shot
+    white, color_matrix, as_shot_neutral, metadata, description, baseline_exposure
         See `write_bayer_dng`.
     xmp : bytes
         A packet to put in.
@@ -191,20 +140,25 @@ def write_linear_dng(
     """
     if planes.ndim != 3 or planes.shape[0] != 3 or planes.dtype != np.uint16:
         raise InvalidInputError(f"planes are uint16 of shape (3, H, W), got {planes.dtype} {planes.shape}")
-    shot = shot or ShotInfo()
-    tags = _common_tags(3, _LINEAR_RAW, shot)
+    tags = _common_tags(3, _LINEAR_RAW, metadata, description, baseline_exposure)
     _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
     if xmp:
         tags.raw(700, BYTE, xmp)
     for tag, opcodes in zip(_OPCODE_LISTS, (opcodes_2, opcodes_3), strict=True):
         if opcodes:
             tags.raw(tag, UNDEFINED, opcodes)
-    below = {EXIF_POINTER: _exif(shot), GPS_POINTER: gps or Directory()}
+    below = {EXIF_POINTER: _exif(metadata), GPS_POINTER: gps or Directory()}
     _write(Path(path), tags, below, planes.transpose(1, 2, 0))
 
 
-def _common_tags(samples: int, photometric: int, shot: ShotInfo) -> Directory:
-    tags = main_directory(shot.metadata, shot.orientation, shot.description)
+def _common_tags(
+    samples: int,
+    photometric: int,
+    metadata: PhotoMetadata,
+    description: str,
+    baseline_exposure: float | None,
+) -> Directory:
+    tags = main_directory(metadata, metadata.orientation, description)
     tags.longs(254, 0)  # NewSubfileType: the full image
     tags.shorts(258, *(16,) * samples)
     tags.shorts(259, 1)  # not compressed
@@ -214,12 +168,12 @@ def _common_tags(samples: int, photometric: int, shot: ShotInfo) -> Directory:
     tags.raw(50706, BYTE, bytes((1, 4, 0, 0)))  # DNGVersion
     tags.raw(50707, BYTE, bytes((1, 1, 0, 0)))  # DNGBackwardVersion
     # Most models carry their maker already; programs look cameras up by this name.
-    named = shot.camera_model.lower().startswith(shot.camera_maker.lower())
-    unique = shot.camera_model if named else f"{shot.camera_maker} {shot.camera_model}"
+    maker, model = metadata.camera_maker or "", metadata.camera_model or ""
+    unique = model if model.lower().startswith(maker.lower()) else f"{maker} {model}"
     tags.text(50708, unique.strip() or "Unknown")  # UniqueCameraModel
-    if shot.baseline_exposure is not None:
-        tags.signed_rationals(50730, [shot.baseline_exposure])
-    tags.text(50735, shot.body_serial)  # CameraSerialNumber
+    if baseline_exposure is not None:
+        tags.signed_rationals(50730, [baseline_exposure])
+    tags.text(50735, metadata.body_serial)  # CameraSerialNumber
     return tags
 
 
@@ -247,12 +201,10 @@ def _colour_tags(
     tags.shorts(50778, _D65)  # CalibrationIlluminant1
 
 
-def _exif(shot: ShotInfo) -> Directory:
-    tags = exif_directory(shot.metadata)
-    tags.text(0xA431, shot.body_serial)
-    if shot.focal_range_mm is not None:
-        tags.rationals(0xA432, *shot.focal_range_mm, *(shot.widest_aperture or (0.0, 0.0)))
-    tags.text(0xA435, shot.lens_serial)
+def _exif(metadata: PhotoMetadata) -> Directory:
+    tags = exif_directory(metadata)
+    tags.text(0xA431, metadata.body_serial)
+    tags.text(0xA435, metadata.lens.serial)
     return tags
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
@@ -32,7 +32,7 @@ from lensmodel.photo.colour import (
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.dng import ShotInfo, write_linear_dng, write_strip
+from lensmodel.photo.dng import write_linear_dng, write_strip
 from lensmodel.photo.tags.exif_block import (
     BYTE,
     EXIF_POINTER,
@@ -288,32 +288,12 @@ def _write_png(
 def _write_dng(
     path: Path, planes: Planes, encoding: Encoding, description: str, xmp: bytes, gps: Directory | None
 ) -> None:
-    metadata = encoding.metadata
     rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
     to_camera = encoding.xyz_to_camera
     if to_camera is None:
         # To XYZ under D50, and back from D65, which is what the DNG tag means.
         to_xyz = np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding, rgb_icc)
         to_camera = matrix3(np.linalg.inv(to_xyz).astype(np.float64))
-    shot = ShotInfo(
-        camera_maker=metadata.camera_maker or "",
-        camera_model=metadata.camera_model or "",
-        lens_maker=metadata.lens.maker or "",
-        lens_model=metadata.lens.model or "",
-        aperture=metadata.aperture,
-        focal_mm=metadata.focal_mm,
-        focus_m=metadata.focus_m,
-        iso=None if metadata.iso is None else round(metadata.iso),
-        exposure_s=metadata.exposure_s,
-        taken_at=metadata.taken_at,
-        pixel_pitch_um=metadata.pixel_pitch_um,
-        orientation=encoding.orientation,
-        description=description,
-        baseline_exposure=encoding.baseline_exposure,
-        artist=metadata.artist,
-        copyright=metadata.copyright,
-        rating=metadata.rating,
-    )
     r, g, b = encoding.white_balance
     numbers = np.empty(planes.shape, dtype=np.uint16)
     for row in range(0, planes.shape[1], _ROWS):
@@ -324,7 +304,9 @@ def _write_dng(
         numbers,
         color_matrix=to_camera,
         as_shot_neutral=(1 / r, 1 / g, 1 / b),
-        shot=shot,
+        metadata=replace(encoding.metadata.without_serials(), orientation=encoding.orientation),
+        description=description,
+        baseline_exposure=encoding.baseline_exposure,
         xmp=xmp,
         opcodes_2=encoding.opcodes_2,
         opcodes_3=encoding.opcodes_3,

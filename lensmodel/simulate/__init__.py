@@ -4,10 +4,8 @@ from lensmodel.simulate.camera import (
     BlurOptions,
     SimulatedCamera,
     SimulatedPhoto,
-    Truth,
     blurred,
     photograph,
-    shot_info,
     write_photo,
 )
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
@@ -27,7 +25,6 @@ __all__ = [
     "SimulatedField",
     "SimulatedLens",
     "SimulatedPhoto",
-    "Truth",
     "blurred",
     "demo_data_path",
     "demo_scene",
@@ -36,7 +33,6 @@ __all__ = [
     "edge_chart",
     "load_scene",
     "photograph",
-    "shot_info",
     "slanted_edge_scene",
     "srgb_to_linear",
     "write_photo",

@@ -1,21 +1,15 @@
-"""A sensor, and the photo that it takes through a simulated lens.
-
-Spatially varying blur of a scene by exact kernels.
+"""A sensor, and the photo that it takes through a simulated lens: blur by exact kernels, noise, a raw file.
 
 Independent of `lensmodel.correction` and its operators on purpose: what those are tested against must not
 come from them.
-
-Simulated photos as files that any raw converter reads.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -28,12 +22,11 @@ from scipy.interpolate import CubicSpline
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes, StepHook, ignore_step
-from lensmodel.photo.dng import XYZ_TO_SRGB, ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
+from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
 logger = logging.getLogger(__name__)
-
-PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 _BITS: Final = (8, 16)  # of the raw files that cameras write
 
@@ -62,8 +55,10 @@ class SimulatedCamera:
             raise InvalidInputError(
                 f"a Bayer frame needs even sides of 16 or more, got {self.height} x {self.width}"
             )
-        if self.pattern not in PATTERNS:
-            raise InvalidInputError(f"pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}")
+        if self.pattern not in BAYER_PATTERNS:
+            raise InvalidInputError(
+                f"pattern must be one of {', '.join(BAYER_PATTERNS)}, got {self.pattern!r}"
+            )
         if not _BITS[0] <= self.bits <= _BITS[1] or not 0 <= self.black < self.white < 2**self.bits:
             raise InvalidInputError(
                 f"levels must satisfy 0 <= black < white < 2^bits with 8 to 16 bits, got black {self.black}, "
@@ -140,29 +135,17 @@ class SimulatedCamera:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
-    """What is known about a simulated photo."""
-
-    lens: CameraLens  # what it was taken with
-    camera: SimulatedCamera
-    settings: LensSettings
-    scene_sha256: str  # of the scene's float32 bytes
-    exposure: float  # scene values were multiplied by it
-    options: BlurOptions  # focus error, which effects were simulated, and the grid of kernels
-    # width of the margin that had to be mirrored because the scene ended: with 0, borders are honest
-    mirrored_px: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedPhoto:
-    """A simulated photo and its truth."""
+    """A simulated photo, and what it was taken with."""
 
     mosaic: NDArray[np.uint16]  # (height, width), raw numbers
     clean: Planes  # (3, height, width), the light on the sensor: before noise, quantisation and clipping
     # (3, height, width), the same without blur, lateral colour and vignetting: what a correction should reach
     sharp: Planes
-    truth: Truth
+    lens: CameraLens
+    camera: SimulatedCamera
+    settings: LensSettings
 
 
 def photograph(
@@ -208,23 +191,15 @@ def photograph(
     frame = camera.frame
     clean = blurred(scene, lens, settings, frame, options, on_step=on_step)
     clean = camera.balanced(clean * np.float32(exposure))
-    sharp, _ = with_margin(scene, frame, 0)
-    _, mirrored = with_margin(scene, frame, options.size // 2)
-    truth = Truth(
-        lens=lens,
-        camera=camera,
-        settings=settings,
-        scene_sha256=hashlib.sha256(np.ascontiguousarray(scene, dtype=np.float32).tobytes()).hexdigest(),
-        exposure=exposure,
-        options=options,
-        mirrored_px=mirrored,
-    )
+    sharp = _with_margin(scene, frame, 0)
     logger.info("simulated photo of %s at f/%s", lens.model, settings.aperture)
     return SimulatedPhoto(
         mosaic=camera.mosaic(clean, rng),
         clean=clean,
         sharp=camera.balanced(sharp * np.float32(exposure)),
-        truth=truth,
+        lens=lens,
+        camera=camera,
+        settings=settings,
     )
 
 
@@ -242,8 +217,7 @@ class BlurOptions:
     size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
     step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
     defocus: float = 0.0  # focus error of this photo, waves at the open aperture
-    lateral: bool = True  # whether to simulate lateral colour, and the loss of light by the cat's eye
-    vignetting: bool = False
+    lateral: bool = True  # whether to simulate lateral colour
 
     def __post_init__(self) -> None:
         if self.size < 3 or self.size % 2 == 0:
@@ -308,15 +282,11 @@ def blurred(
     """
     options = options or BlurOptions()
     half = options.size // 2
-    padded, _ = with_margin(scene, frame, half)
+    padded = _with_margin(scene, frame, half)
     grid = _Grid.over(padded.shape[1:], frame, options.step)
     out = np.zeros((3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half), dtype=np.float32)
     total = len(CHANNELS) * (len(grid.exact_rows) + len(grid.rows))
     done = 0
-    shares = np.ones((len(grid.rows), len(grid.cols)), dtype=np.float32)
-    if options.vignetting:
-        fields = [[grid.field(row, col) for col in grid.cols] for row in grid.rows]
-        shares[:] = [[lens.transmission(h, settings) for h in line] for line in fields]
     for index, channel in enumerate(CHANNELS):
         kernels = []
         for row in grid.exact_rows:
@@ -332,7 +302,7 @@ def blurred(
         for i, row in enumerate(grid.rows):
             for j, col in enumerate(grid.cols):
                 for top, left, light in grid.windowed(padded[index], row, col):
-                    image = _convolved(light, spread[i, j] * shares[i, j])
+                    image = _convolved(light, spread[i, j])
                     out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
             done += 1
             on_step(done, total)
@@ -340,7 +310,7 @@ def blurred(
     return np.ascontiguousarray(np.maximum(inner, 0.0))
 
 
-def with_margin(scene: Planes, frame: Frame, margin: int) -> tuple[Planes, int]:
+def _with_margin(scene: Planes, frame: Frame, margin: int) -> Planes:
     """Cut or mirror a scene to the frame plus `margin`."""
     if scene.ndim != 3 or scene.shape[0] != len(CHANNELS):
         raise InvalidInputError(f"a scene has the shape (3, H, W), got {scene.shape}")
@@ -356,7 +326,7 @@ def with_margin(scene: Planes, frame: Frame, margin: int) -> tuple[Planes, int]:
     inner = scene[:, cut[0] : scene.shape[1] - cut[0], cut[1] : scene.shape[2] - cut[1]]
     missing = [max(margin - s // 2, 0) for s in spare]
     padded = np.pad(inner, ((0, 0), (missing[0],) * 2, (missing[1],) * 2), mode="symmetric")
-    return np.ascontiguousarray(padded, dtype=np.float32), max(missing)
+    return np.ascontiguousarray(padded, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -453,41 +423,21 @@ def _convolved(light: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArr
 _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100
 
 
-def shot_info(photo: SimulatedPhoto, *, taken_at: datetime | None = None, orientation: int = 1) -> ShotInfo:
-    """Metadata of a simulated photo as its camera would write it."""
-    truth = photo.truth
-    lens, camera, settings = truth.lens, truth.camera, truth.settings
-    widest = lens.widest(lens.focal_mm[0]), lens.widest(lens.focal_mm[-1])
-    return ShotInfo(
+def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
+    """Write the mosaic of a simulated photo as DNG."""
+    camera, lens, settings = photo.camera, photo.lens, photo.settings
+    metadata = PhotoMetadata(
         camera_maker=camera.maker,
         camera_model=camera.model,
         body_serial=camera.serial,
-        lens_maker=lens.maker,
-        lens_model=lens.model,
-        lens_serial=lens.serial,
+        lens=LensIdentity(lens.maker, lens.model, lens.serial, "exif"),
         aperture=round(lens.f_number(settings), 2),
         focal_mm=settings.focal_mm if settings.focal_mm is not None else lens.focal_mm[0],
-        focal_range_mm=(lens.focal_mm[0], lens.focal_mm[-1]),
-        widest_aperture=widest,
         focus_m=settings.focus_m,
         iso=max(round(100.0 * _BASE_ISO_ELECTRONS / camera.full_well_electrons), 1),
         exposure_s=1.0 / 125.0,
-        taken_at=taken_at,
         pixel_pitch_um=camera.pitch_um,
-        orientation=orientation,
     )
-
-
-def write_photo(
-    path: str | Path,
-    photo: SimulatedPhoto,
-    *,
-    taken_at: datetime | None = None,
-    orientation: int = 1,
-) -> None:
-    """Write the mosaic of a simulated photo as DNG."""
-    camera = photo.truth.camera
-    info = shot_info(photo, taken_at=taken_at, orientation=orientation)
     write_bayer_dng(
         path,
         photo.mosaic,
@@ -496,5 +446,5 @@ def write_photo(
         pattern=camera.pattern,
         color_matrix=camera.color_matrix,
         as_shot_neutral=camera.as_shot_neutral,
-        shot=info,
+        metadata=metadata,
     )

@@ -20,19 +20,19 @@ class _Kind:
     f_numbers: tuple[float, ...]
     center_px: tuple[float, float]  # rms width of the ray spot at the centre, pixels of 4.5 um: from, to
     corner_px: tuple[float, float]  # same at r = 1, mean over phi
-    fixed: Mapping[str, float] = field(default_factory=dict)  # other than the defaults of `_Recipe`
+    fixed: Mapping[str, float] = field(default_factory=dict)  # other than the defaults of `_Config`
     drawn: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # from, to
 
-    def recipe(self, rng: np.random.Generator) -> _Recipe:
+    def config(self, rng: np.random.Generator) -> _Config:
         """Draw one copy."""
         f_number = float(rng.choice(self.f_numbers))
         center, corner = (float(rng.uniform(*ends)) for ends in (self.center_px, self.corner_px))
         drawn = {name: float(rng.uniform(*ends)) for name, ends in self.drawn.items()}
-        return _Recipe(f_number, center, corner, **{**self.fixed, **drawn})
+        return _Config(f_number, center, corner, **{**self.fixed, **drawn})
 
 
 @dataclass(frozen=True, slots=True)
-class _Recipe:
+class _Config:
     """What was drawn of a kind; widths as there, uniform faults and tilt as shares of the corner's blur."""
 
     f_number: float
@@ -91,53 +91,53 @@ def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
     serial = f"SIM{seed:07d}"
     if kind == "zoom":
         short, long = float(rng.choice([18.0, 24.0, 28.0])), float(rng.choice([70.0, 85.0, 105.0]))
-        recipe = _KINDS[kind].recipe(rng)
-        wide = _optics(recipe, rng)
-        tele = _optics(replace(recipe, corner_px=recipe.corner_px * float(rng.uniform(0.6, 1.1))), rng)
+        config = _KINDS[kind].config(rng)
+        wide = _optics(config, rng)
+        tele = _optics(replace(config, corner_px=config.corner_px * float(rng.uniform(0.6, 1.1))), rng)
         # a shifted element stays where it is when one zooms
         tele = replace(tele, decentring=wide.decentring, tilt=wide.tilt)
-        name = f"Simulated Zoom {short:.0f}-{long:.0f}mm f/{recipe.f_number:g}"
+        name = f"Simulated Zoom {short:.0f}-{long:.0f}mm f/{config.f_number:g}"
         return SimulatedLens((wide, tele), (short, long), model=name, serial=serial)
     focal = float(rng.choice([24.0, 35.0, 50.0, 85.0]))
-    recipe = _KINDS[kind].recipe(rng)
-    name = f"Simulated {kind.title()} {focal:.0f}mm f/{recipe.f_number:g}"
-    return SimulatedLens((_optics(recipe, rng),), (focal,), model=name, serial=serial)
+    config = _KINDS[kind].config(rng)
+    name = f"Simulated {kind.title()} {focal:.0f}mm f/{config.f_number:g}"
+    return SimulatedLens((_optics(config, rng),), (focal,), model=name, serial=serial)
 
 
-def _optics(recipe: _Recipe, rng: np.random.Generator) -> Aberrations:
+def _optics(config: _Config, rng: np.random.Generator) -> Aberrations:
     sign = rng.choice([-1.0, 1.0], size=4)
     part = rng.uniform(0.5, 1.0, size=4) * sign
     spherical, coma, astigmatism, curvature = (
-        recipe.spherical * part[0],
-        recipe.coma * part[1],
-        recipe.astigmatism * part[2],
-        recipe.field_curvature * part[3],
+        config.spherical * part[0],
+        config.coma * part[1],
+        config.astigmatism * part[2],
+        config.field_curvature * part[3],
     )
     angle = rng.uniform(0.0, 2.0 * math.pi, size=4)
 
     def vector(k: int, length: float) -> tuple[float, float]:
         return length * math.cos(angle[k]), length * math.sin(angle[k])
 
-    center = Aberrations(f_number=recipe.f_number, spherical=spherical, defocus=-1.1 * spherical)
-    center = _scaled(center, recipe.center_px / _spot_px(center, 0.0))
+    center = Aberrations(f_number=config.f_number, spherical=spherical, defocus=-1.1 * spherical)
+    center = _scaled(center, config.center_px / _spot_px(center, 0.0))
     outer = Aberrations(
-        f_number=recipe.f_number,
+        f_number=config.f_number,
         coma=coma,
         astigmatism=astigmatism,
         field_curvature=curvature - astigmatism / 2.0,  # the flat compromise between the two foci
     )
-    outer = _scaled(outer, recipe.corner_px / _spot_px(outer, 1.0))
-    blur = _waves(recipe.corner_px, recipe.f_number)
+    outer = _scaled(outer, config.corner_px / _spot_px(outer, 1.0))
+    blur = _waves(config.corner_px, config.f_number)
     side = rng.choice([-1.0, 1.0])
     colour = float(rng.uniform(0.1, 0.4)) * blur
     return replace(
         outer,
         spherical=center.spherical,
         defocus=center.defocus,
-        decentring=vector(0, recipe.decentring * float(rng.uniform(0.7, 1.3))),
-        uniform_coma=vector(1, recipe.uniform_coma * blur),
-        uniform_astigmatism=vector(2, recipe.uniform_astigmatism * blur),
-        tilt=vector(3, recipe.tilt * blur),
+        decentring=vector(0, config.decentring * float(rng.uniform(0.7, 1.3))),
+        uniform_coma=vector(1, config.uniform_coma * blur),
+        uniform_astigmatism=vector(2, config.uniform_astigmatism * blur),
+        tilt=vector(3, config.tilt * blur),
         colour_focus=(side * colour * 0.3, colour * 0.6),
         vignetting=(1.15, float(rng.uniform(0.15, 0.4))),
         lateral_red=(float(rng.normal(0.0, 4e-4)), float(rng.normal(0.0, 3e-4))),

@@ -104,9 +104,6 @@ class CameraLens(Protocol):
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), its centre of mass at `offset` (row, col) pixels."""
 
-    def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
-        """Light that arrives at field vector `h`, over that of the full pupil."""
-
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
 
@@ -219,14 +216,6 @@ class SimulatedLens:
     ) -> SimulatedField:
         """The exact PSF of every place and channel at these settings, remembering what was asked."""
         return SimulatedField(self, settings or LensSettings(), pitch_um, defocus)
-
-    def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
-        """Light that the cat's eye lets through at field vector `h`, over that of the full pupil."""
-        optics, n = self.at_focal(settings.focal_mm), self.f_number(settings)
-        step = 2.0 / 128
-        px, py = coordinates(130, step)
-        cut = CatsEye.of(optics, h, n)(px, py, step).sum(dtype=np.float64)
-        return float(cut / disc(px, py, step).sum(dtype=np.float64))
 
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""

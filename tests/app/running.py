@@ -25,7 +25,8 @@ from scipy import ndimage
 from app.main import create_app
 from app.runtime import server
 from app.runtime.settings import Settings
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.simulate import demo_scene
 
 PATIENCE_S = 120.0
@@ -225,14 +226,12 @@ def write_light(
     rng = np.random.default_rng(seed)
     electrons = rng.poisson(light * 20000.0)
     mosaic = np.clip(512 + electrons / 20000.0 * 15000.0, 0, 16383).round().astype(np.uint16)
-    shot = ShotInfo(
+    metadata = PhotoMetadata(
         camera_maker="Test",
         camera_model="T-1",
-        lens_maker="Test Optics",
-        lens_model="Test 35mm f/1.8",
-        lens_serial=serial,
+        lens=LensIdentity("Test Optics", "Test 35mm f/1.8", serial or None, "exif" if serial else "none"),
         aperture=aperture,
         focal_mm=35.0,
     )
-    write_bayer_dng(path, mosaic, black=512, white=15512, shot=shot)
+    write_bayer_dng(path, mosaic, black=512, white=15512, metadata=metadata)
     return path

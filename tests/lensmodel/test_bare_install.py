@@ -27,12 +27,13 @@ sys.modules |= dict.fromkeys({ABSENT!r})  # None: as if it were not installed
 import numpy as np
 import lensmodel
 from lensmodel.core.psf import gaussian
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.values import PhotoMetadata
 
 rows, cols = np.ogrid[:160, :240]
 mosaic = (4000 + 2000 * np.sin(rows / 7.0) * np.cos(cols / 9.0)).astype(np.uint16)
 for name in "abc":
-    write_bayer_dng(name + ".dng", mosaic, black=512, white=16383, shot=ShotInfo(aperture=1.4))
+    write_bayer_dng(name + ".dng", mosaic, black=512, white=16383, metadata=PhotoMetadata(aperture=1.4))
 lensmodel.estimators.create("default"), lensmodel.selectors.create("r-map")
 calibrate = lensmodel.calibrate  # it is imported, but takes minutes, and refuses such small photos
 spots = [gaussian(15, np.eye(2))] * 8

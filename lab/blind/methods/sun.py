@@ -52,7 +52,6 @@ class Sun:
     # kernel values below this share of the peak, and islands of less than this mass, are dropped
     threshold: float = 0.05
     least_mass: float = 0.05
-    support: int | None = None  # odd side of the estimated kernel; None takes it from `size`
 
     name = "sun"
     version = 1
@@ -66,10 +65,8 @@ class Sun:
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
-        kept = usable(patches, noise, size)
-        views = [View.of(patch, model) for patch, model in kept]
-        side = self.support or size
-        schedule = Schedule(side, self.iterations)
+        views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
+        schedule = Schedule(size, self.iterations)
         found = coarse_to_fine(views, _Alternation(self, default_prior()), schedule, on_step=on_step)
         return unsure(cleaned(found.kernel, self.threshold, self.least_mass), size)
 
@@ -105,7 +102,7 @@ def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Ter
     """
     covered = ndimage.binary_dilation(edge_mask(x), np.ones((SIDE, SIDE), dtype=bool))
     half = side // 2
-    vote = 1.0 / max(view.noise**2, 1e-6)
+    weight = 1.0 / max(view.noise**2, 1e-6)
     terms = []
     for axis in (0, 1):
         gradient = np.diff(x, axis=axis)
@@ -114,7 +111,7 @@ def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Ter
         seen = np.diff(view.y, axis=axis)
         inner = seen[half : seen.shape[0] - half, half : seen.shape[1] - half].astype(np.float32)
         grid = Grid((inner.shape[0], inner.shape[1]), side)
-        terms.append(Term(grid, inner, edges, vote, ridge * float(np.vdot(edges, edges))))
+        terms.append(Term(grid, inner, edges, weight, ridge * float(np.vdot(edges, edges))))
     return terms[0], terms[1]
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
+from lab.blind.methods.zhang_model import PatchPosterior, pooled_kernel
 from lab.blind.steps.cleaning import cleaned, unsure
 from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lensmodel.blind.estimator import PsfEstimate, usable
@@ -44,7 +44,6 @@ class Zhang:
     # kernel values below this share of the peak are dropped at the end: gradients see no low frequencies of a
     # kernel, which leaves a faint pedestal over the whole support
     threshold: float = 0.05
-    support: int | None = None  # odd side of the estimated kernel; None takes it from `size`
 
     name = "zhang"
     version = 1
@@ -58,13 +57,11 @@ class Zhang:
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
-        kept = usable(patches, noise, size)
-        views = [View.of(patch, model) for patch, model in kept]
-        side = self.support or size
-        schedule = Schedule(side, self.iterations)
+        views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
+        schedule = Schedule(size, self.iterations)
         levels = len(schedule.sides(min(min(view.y.shape) for view in views)))
         coarse = _FIRST_SIGMA_PX / schedule.ratio ** (levels - 1)
-        start = gaussian(side, coarse**2 * np.eye(2))
+        start = gaussian(size, coarse**2 * np.eye(2))
         sweeps = _Sweeps(self.steps, self.floor)
         found = coarse_to_fine(views, sweeps, schedule, start=start, on_step=on_step)
         return unsure(cleaned(found.kernel, self.threshold), size)
@@ -81,7 +78,7 @@ class _Sweeps:
         kernel = centred(kernel)  # or it drifts, level by level, until the support cuts it
         # λ and γ start anew on each level: what was learned on the coarser one is too sure of itself.
         scenes = [
-            GradientBeliefs.of(view.y, level.side, kernel, self.floor + 2.0 * view.noise**2)
+            PatchPosterior.of(view.y, level.side, kernel, self.floor + 2.0 * view.noise**2)
             for view in level.views
         ]
         for _ in range(level.iterations):

@@ -33,7 +33,7 @@ _FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientPosterior:
-    """What is believed of one gradient image: x, γ, c."""
+    """Posterior of one gradient image: x, γ, c."""
 
     grid: Grid
     y: Floats
@@ -49,8 +49,7 @@ class GradientPosterior:
         gamma = np.full(grid.latent, power, dtype=np.float32)
         half = side // 2
         x = np.pad(y.astype(np.float32), half)
-        belief = cls(grid, y.astype(np.float32), x, gamma, gamma)
-        return belief.spread(kernel, noise)
+        return cls(grid, y.astype(np.float32), x, gamma, gamma).spread(kernel, noise)
 
     def spread(self, kernel: Kernelish, noise: float) -> GradientPosterior:
         """Update c = 1 / (w / λ + 1 / γ)."""
@@ -109,8 +108,8 @@ class GradientPosterior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GradientBeliefs:
-    """Beliefs on the two gradient images of one patch, with the noise variance λ of both."""
+class PatchPosterior:
+    """Posteriors of the two gradient images of one patch, with the noise variance λ of both."""
 
     down: GradientPosterior  # differences between neighbouring rows and columns
     across: GradientPosterior
@@ -118,7 +117,7 @@ class GradientBeliefs:
     floor: float  # d over the number of pixels
 
     @classmethod
-    def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> GradientBeliefs:
+    def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> PatchPosterior:
         """Start with half of the gradients' power as noise: nearly everything is still open."""
         down, across = np.diff(y, axis=0), np.diff(y, axis=1)
         noise = _FIRST_NOISE * 0.5 * float(np.mean(down**2) + np.mean(across**2)) + floor
@@ -129,19 +128,19 @@ class GradientBeliefs:
             floor,
         )
 
-    def improved(self, kernel: Kernelish, steps: int) -> GradientBeliefs:
+    def improved(self, kernel: Kernelish, steps: int) -> PatchPosterior:
         """Update x, c and γ of both gradients."""
         down, across = (
-            belief.sharpened(kernel, self.noise, steps).spread(kernel, self.noise).sparser()
-            for belief in (self.down, self.across)
+            each.sharpened(kernel, self.noise, steps).spread(kernel, self.noise).sparser()
+            for each in (self.down, self.across)
         )
         return replace(self, down=down, across=across)
 
-    def scaled(self, factor: float) -> GradientBeliefs:
+    def scaled(self, factor: float) -> PatchPosterior:
         """Multiply both x by a factor, as k is divided by it."""
         return replace(self, down=self.down.scaled(factor), across=self.across.scaled(factor))
 
-    def with_noise(self, kernel: Kernelish) -> GradientBeliefs:
+    def with_noise(self, kernel: Kernelish) -> PatchPosterior:
         """Update λ = (|y - k * x|² + sum_i c_i w_i + d) / n."""
         n = self.down.y.size + self.across.y.size
         misfit = self.down.misfit(kernel) + self.across.misfit(kernel)
@@ -152,12 +151,12 @@ class GradientBeliefs:
         return sum(b.free_energy(kernel, self.noise, self.floor) for b in (self.down, self.across))
 
     def weighted(self) -> tuple[tuple[GradientPosterior, float], tuple[GradientPosterior, float]]:
-        """Both beliefs with their weight 1 / λ in the kernel step."""
+        """Both posteriors with their weight 1 / λ in the kernel step."""
         return (self.down, 1.0 / self.noise), (self.across, 1.0 / self.noise)
 
 
-def pooled_kernel(beliefs: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:
-    """Update k >= 0 to the minimum of the summed free energies of beliefs with their weights 1 / λ.
+def pooled_kernel(posteriors: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:
+    """Update k >= 0 to the minimum of the summed free energies of posteriors with their weights 1 / λ.
 
     min over k >= 0 of  sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ_l
 
@@ -166,5 +165,5 @@ def pooled_kernel(beliefs: Sequence[tuple[GradientPosterior, float]], kernel: Ke
     ndarray of float64, shape (side, side)
         Not normalised.
     """
-    terms = [Term(b.grid, b.y, b.x, weight, b.grid.sums_of(b.variance)) for b, weight in beliefs]
+    terms = [Term(b.grid, b.y, b.x, weight, b.grid.sums_of(b.variance)) for b, weight in posteriors]
     return least_squares_kernel(terms, kernel)

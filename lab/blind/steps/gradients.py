@@ -1,6 +1,6 @@
 """Pieces that the methods by predicted edges share: prediction, selection, kernel step, borders.
 
-Cho and Lee, Xu and Jia, and the L0 methods all guess the gradients of the sharp image at strong
+Cho and Lee, and Xu and Jia guess the gradients of the sharp image at strong
 edges and solve for the kernel that takes them to the observed ones. Derivatives are forward
 differences. All steps are shift-invariant; borders are continued smoothly to a periodic canvas for
 image steps, and no edge within half a kernel of the border counts in kernel steps.
@@ -282,9 +282,9 @@ class KernelEquations:
         return plane[np.ix_(lags % self.grid[0], lags % self.grid[1])]
 
 
-def pruned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
+def pruned(kernel: NDArray[np.float64], threshold: float) -> Kernel:
     """Clean a kernel and roll it by whole pixels until its centre of mass is the middle."""
-    kept = np.array(cleaned(kernel, threshold, least_mass))
+    kept = np.array(cleaned(kernel, threshold))
     row, col = (round(x) for x in centroid(kept))
     if (row, col) != (0, 0):
         kept = ndimage.shift(kept, (-row, -col), order=0, mode="constant")

@@ -32,7 +32,8 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import EncodedPatch, PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.values import LensIdentity, PhotoMetadata
 
 SLOW_S = 10.0
 POOL = 400
@@ -68,15 +69,13 @@ def write_seeds(folder: Path) -> None:
     """Write a small valid file of each kind."""
     rng = np.random.default_rng(0)
     mosaic = rng.integers(512, 9000, (96, 128), dtype=np.uint16)
-    shot = ShotInfo(
+    metadata = PhotoMetadata(
         camera_maker="Test",
         camera_model="T-1",
-        lens_maker="Test",
-        lens_model="50mm",
-        lens_serial="1",
+        lens=LensIdentity("Test", "50mm", "1", "exif"),
         aperture=2.0,
     )
-    write_bayer_dng(folder / "a.dng", mosaic, black=512, white=15512, shot=shot)
+    write_bayer_dng(folder / "a.dng", mosaic, black=512, white=15512, metadata=metadata)
     picture = Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
     exif = Image.Exif()
     exif[0x010F], exif[0x829D] = "Test", 2.8

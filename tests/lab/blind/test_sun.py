@@ -4,38 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.sun import Sun, edge_terms, image_step
+from lab.blind.methods.sun import edge_terms, image_step
 from lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
 from lab.blind.steps.pyramid import View
-from lab.scenes import dead_leaves
 from lab.training import make_edge_patches
-from lensmodel.core.psf import as_kernel, delta, distance, gaussian
-from lensmodel.core.types import Kernel, NoiseModel, Plane
+from lensmodel.core.psf import as_kernel, delta, gaussian
+from lensmodel.core.types import Kernel, Plane
 from lensmodel.simulate import edge_area
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
-
-SIGMA = 0.01
-OVAL = gaussian(13, [[2.0, 0.8], [0.8, 1.2]])
-
-
-def scene(side: int, seed: int = 0) -> NDArray[np.float64]:
-    return dead_leaves(side, side, np.random.default_rng(seed), largest=40.0)[1].astype(np.float64)
-
-
-def shot(kernel: Kernel, *, side: int = 96, seed: int = 0) -> Plane:
-    y = signal.convolve(scene(side + kernel.shape[0] - 1, seed), kernel, mode="valid", method="direct")
-    return (y + np.random.default_rng(seed).normal(0, SIGMA, y.shape)).astype(np.float32)
-
-
-def stroke() -> Kernel:
-    kernel = np.zeros((13, 13))
-    kernel[np.arange(3, 10), np.arange(3, 10)] = np.linspace(1.0, 0.5, 7)
-    kernel[9, 4:9] = 0.4
-    return as_kernel(signal.convolve(kernel, gaussian(3, 0.3 * np.eye(2)), mode="same", method="direct"))
 
 
 def explained(y: Plane, sharp: NDArray[np.float64], kernel: Kernel) -> float:
@@ -100,10 +81,3 @@ def test_a_sharp_step_stays_and_a_soft_one_becomes_steeper() -> None:
     assert np.sqrt(np.mean((kept - step)[inner] ** 2)) < 0.03
     assert np.abs(np.diff(steeper, axis=1)[inner]).max() > 1.3 * np.abs(np.diff(soft, axis=1)[inner]).max()
     assert np.array_equal(steeper[count == 0], soft[count == 0])
-
-
-def test_a_stroke_is_recovered_from_one_patch() -> None:
-    found = Sun().estimate([shot(stroke(), side=128)], [NoiseModel.white(SIGMA)], size=15)
-
-    assert distance(found.kernel, stroke()).ncc > 0.85
-    assert distance(delta(15), stroke()).ncc < 0.5

@@ -37,7 +37,7 @@ def linear_field(f_number: float = 2.8) -> GridField:
         "pitch_um": 4.5,
         "half_diagonal_mm": 0.45,
     }
-    return GridField(axis, kernels, centers, np.ones((7, 7), dtype=np.float32), facts)
+    return GridField(axis, kernels, centers, facts)
 
 
 def test_repository_has_traced_lenses_within_bounds() -> None:

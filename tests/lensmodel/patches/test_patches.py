@@ -225,7 +225,6 @@ def test_strips_leave_no_trace_in_the_sums(photo: Plane, monkeypatch: pytest.Mon
 
 def test_every_window_is_chosen_or_has_a_reason(selection: Selection) -> None:
     assert {r.reason for r in selection.rejected} <= set(REASONS)
-    assert sum(selection.counts.values()) == len(selection.rejected)
     places = [(r.row, r.col) for r in selection.rejected] + [(p.row, p.col) for p in selection.patches]
     assert len(places) == len(set(places)) == 17 * 28
 
@@ -307,33 +306,8 @@ def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane
     result = chosen(photo_of(soft.astype(np.float32), blur_px=0.01))
 
     windows = len(result.patches) + len(result.rejected)
-    assert result.counts.get("defocus", 0) < 0.05 * windows
+    assert sum(r.reason == "defocus" for r in result.rejected) < 0.05 * windows
     assert sum(p.position.r > 0.6 and abs(p.position.phi) < 0.8 for p in result.patches) >= 3
-
-
-def test_camera_shake_is_warned_of_and_blur_that_turns_with_the_field_is_not(
-    scene: Plane, part_selection: Selection
-) -> None:
-    sharp = scene[:480, :640]
-    shaken = ndimage.uniform_filter1d(sharp, 9, axis=0)
-    rows, cols = np.mgrid[-240:240, -320:320]
-    frame_r = np.hypot(rows, cols) / 400
-    along = np.stack([cols, rows]) / np.maximum(np.hypot(rows, cols), 1)
-    radial = np.mean(
-        [
-            ndimage.map_coordinates(
-                sharp, [rows + 240 + t * along[1] * frame_r, cols + 320 + t * along[0] * frame_r], order=1
-            )
-            for t in np.linspace(-4, 4, 9)
-        ],
-        axis=0,
-    )
-
-    (warning,) = chosen(photo_of(shaken)).warnings
-    assert warning.startswith("motion")
-    assert abs(int(warning.split("(")[1].split()[0])) > 80  # vertical
-    assert part_selection.warnings == ()
-    assert chosen(photo_of(radial.astype(np.float32))).warnings == ()
 
 
 def test_noise_alone_is_refused_with_a_remedy() -> None:

@@ -13,7 +13,8 @@ from scipy import ndimage
 
 from lensmodel import photo, simulate
 from lensmodel.photo.defects import Neighbours, defects_of, suspects
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.values import PhotoMetadata
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)
 RANGE = CAMERA.white - CAMERA.black
@@ -54,8 +55,10 @@ def defective(clean: NDArray[np.uint16], at: NDArray[np.int64]) -> NDArray[np.ui
 
 
 def write(path: Path, values: NDArray[np.uint16], body: str = "SC-1") -> Path:
-    shot = ShotInfo(camera_model=body)
-    write_bayer_dng(path, values, black=CAMERA.black, white=CAMERA.white, pattern=CAMERA.pattern, shot=shot)
+    metadata = PhotoMetadata(camera_model=body)
+    write_bayer_dng(
+        path, values, black=CAMERA.black, white=CAMERA.white, pattern=CAMERA.pattern, metadata=metadata
+    )
     return path
 
 

@@ -20,7 +20,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng, write_linear_dng
+from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
 
 BLACK, WHITE = 512, 15000
 agree = partial(np.testing.assert_allclose, rtol=0.0, equal_nan=False)
@@ -150,8 +150,8 @@ def test_colours_land_in_the_planes_of_their_names(tmp_path: Path, pattern: str)
 def test_raw_stays_in_sensor_orientation(tmp_path: Path, orientation: int) -> None:
     scene = np.full((64, 96), 0.2) + 0.0005 * np.arange(96)
     scene[:32, :48] += 0.5  # bright at the upper left of the sensor
-    shot = ShotInfo(orientation=orientation)
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(scene), black=BLACK, white=WHITE, shot=shot)
+    metadata = photo.PhotoMetadata(orientation=orientation)
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(scene), black=BLACK, white=WHITE, metadata=metadata)
     developed = photo.develop(tmp_path / "x.dng")
 
     assert developed.planes.shape == (3, 64, 96)

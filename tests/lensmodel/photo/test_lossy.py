@@ -13,7 +13,7 @@ from PIL import Image
 from scipy import ndimage
 
 from lensmodel import photo
-from lensmodel.photo.dng import ShotInfo, write_linear_dng
+from lensmodel.photo.dng import write_linear_dng
 from lensmodel.photo.headers.opening import opened_header
 
 SIDE = 256
@@ -94,7 +94,10 @@ def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(tmp_path: Path
 
 
 def test_a_linear_dng_without_loss_is_not_lossy(tmp_path: Path) -> None:
-    write_linear_dng(tmp_path / "x.dng", np.moveaxis(scene().astype(np.uint16) * 200, 2, 0), shot=ShotInfo())
+    write_linear_dng(
+        tmp_path / "x.dng",
+        np.moveaxis(scene().astype(np.uint16) * 200, 2, 0),
+    )
     developed = photo.develop(tmp_path / "x.dng")
     assert developed.coding_noise is None
     assert not developed.lossy

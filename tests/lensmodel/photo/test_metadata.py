@@ -17,7 +17,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.tags.xmp import read_xmp
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
@@ -258,16 +258,16 @@ def test_the_pitch_of_a_photo_that_was_scaled_down_is_unknown(metadata_of: Read)
 def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(
     written: float, pitch: float | None, tmp_path: Path
 ) -> None:
-    shot, path = ShotInfo(pixel_pitch_um=written), tmp_path / "mosaic.dng"
-    write_bayer_dng(path, np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot)
+    metadata, path = photo.PhotoMetadata(pixel_pitch_um=written), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 96), 600, np.uint16), black=512, white=4095, metadata=metadata)
 
     # 72 pixels to the inch, as some cameras write, is a sensor of nothing
     assert photo.read_metadata(path).pixel_pitch_um == (pitch and pytest.approx(pitch))
 
 
 def test_no_sensor_is_larger_than_medium_format(tmp_path: Path) -> None:
-    shot, path = ShotInfo(pixel_pitch_um=50.0), tmp_path / "mosaic.dng"
-    write_bayer_dng(path, np.full((64, 1200), 600, np.uint16), black=512, white=4095, shot=shot)
+    metadata, path = photo.PhotoMetadata(pixel_pitch_um=50.0), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 1200), 600, np.uint16), black=512, white=4095, metadata=metadata)
 
     assert photo.read_metadata(path).pixel_pitch_um is None
 

@@ -25,7 +25,7 @@ from skimage import io
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.tags.xmp_block import OWN, write_sidecar
 
 METADATA = photo.PhotoMetadata(
@@ -231,7 +231,7 @@ def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
         black=512,
         white=15872,
         as_shot_neutral=neutral,
-        shot=ShotInfo(baseline_exposure=stops),
+        baseline_exposure=stops,
     )
     developed = photo.develop(tmp_path / "mosaic.dng")
     photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
@@ -252,8 +252,7 @@ def test_a_linear_dng_asks_for_the_baseline_exposure_of_the_dng_it_came_from(
     tmp_path: Path, stops: float | None
 ) -> None:
     mosaic = np.rint(512 + 15360 * planes(32, 48)[1]).astype(np.uint16)
-    shot = ShotInfo(baseline_exposure=stops)
-    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, shot=shot)
+    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, baseline_exposure=stops)
     developed = photo.develop(tmp_path / "mosaic.dng")
     photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
 

@@ -221,14 +221,6 @@ def test_finer_pixels_show_the_same_kernel_larger() -> None:
     assert np.linalg.norm(binned - coarse) < 0.01 * np.linalg.norm(coarse)
 
 
-def test_cats_eye_dims_the_corner_and_opens_on_stopping_down() -> None:
-    eye = lens(f_number=2.0, vignetting=(1.1, 0.4))
-
-    assert eye.transmission((0.0, 0.0), LensSettings()) == pytest.approx(1.0)
-    assert eye.transmission((0.9, 0.3), LensSettings()) < 0.9
-    assert eye.transmission((0.9, 0.3), LensSettings(aperture=5.6)) == pytest.approx(1.0)
-
-
 def test_zoom_passes_through_its_ends_and_lies_between() -> None:
     zoom = draw_lens(1, "zoom")
     short, long = zoom.focal_mm

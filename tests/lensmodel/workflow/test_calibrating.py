@@ -21,7 +21,7 @@ from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMis
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.lens import Lens
 
@@ -161,8 +161,8 @@ def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(
     blocks = np.random.default_rng(0).integers(700, 14000, (2, 110, 160))
     for name, squares in zip("ab", blocks, strict=True):
         mosaic = np.kron(squares, np.ones((7, 7))).astype(np.uint16)[:768, :1120]
-        shot = ShotInfo(aperture=2.8)
-        write_bayer_dng(tmp_path / f"{name}.dng", mosaic, black=512, white=15872, shot=shot)
+        metadata = photo.PhotoMetadata(aperture=2.8)
+        write_bayer_dng(tmp_path / f"{name}.dng", mosaic, black=512, white=15872, metadata=metadata)
 
     lens = lensmodel.calibrate(sorted(tmp_path.glob("*.dng")), estimator=Round(), kernel_size=15, patches=24)
 

@@ -14,7 +14,8 @@ from scipy import ndimage
 import lensmodel
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import develop
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.values import PhotoMetadata
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.simulate import BlurOptions, SimulatedCamera, demo_scene, draw_lens, photograph, write_photo
 
@@ -48,8 +49,8 @@ def smallest_photos(tmp_path: Path) -> Path:
         light = ndimage.gaussian_filter(sharp, WIDTH_PX)
         electrons = np.random.default_rng(seed).poisson(20000.0 * np.clip(light, 0.0, 1.0))
         mosaic = np.rint(np.clip(512.0 + 0.75 * electrons, 0.0, 16383.0)).astype(np.uint16)
-        shot = ShotInfo(aperture=1.4, pixel_pitch_um=9.0)
-        write_bayer_dng(tmp_path / file, mosaic, black=512, white=16383, shot=shot)
+        metadata = PhotoMetadata(aperture=1.4, pixel_pitch_um=9.0)
+        write_bayer_dng(tmp_path / file, mosaic, black=512, white=16383, metadata=metadata)
     return tmp_path
 
 

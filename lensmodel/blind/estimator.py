@@ -1,7 +1,4 @@
-"""What every blind estimator takes and gives, and what it refuses.
-
-From a raw kernel to an estimate: the last steps that several blind methods share.
-"""
+"""What every blind estimator takes and gives, what it refuses, and the last steps that several share."""
 
 from __future__ import annotations
 

@@ -1,21 +1,17 @@
 """Blind deblurring by internal patch recurrence, `michaeli-irani`: the paper's estimator.
 
-Michaeli and Irani, ECCV 2014, with one addition without which it collapses on photos in linear
-light: the noise of y is in the latent image too, so the normal equations of the kernel step get a
-spike that pulls k to a delta (errors in variables). Its expectation is known and taken off.
-
-Pieces of internal patch recurrence: pyramids, matching across scales, the image step.
-
 In a sharp picture small patches recur unchanged in a smaller copy of it; blur breaks that, and the
 smaller copy is sharper in its own pixels. Its patches are examples of what the sharp picture looks
 like. Source: T. Michaeli and M. Irani, "Blind deblurring using internal patch recurrence",
 ECCV 2014, section 3.
 
-Products of all shifted windows of an image, without writing the windows out.
+One addition, without which the method collapses on photos in linear light: the noise of y is in the latent
+image too, so the normal equations of the kernel step get a spike that pulls k to a delta (errors in
+variables). Its expectation is known and taken off.
 
-The normal equations of a kernel step are sums over pixels p of x(p + a) x(p + b), for all offsets a and b
-in the kernel's square. Sums that differ by a shift of both offsets share all rows but a few at their ends, so
-that the work grows with the third power of the side and not with the fourth.
+These equations are sums over pixels p of x(p + a) x(p + b), for all offsets a and b in the kernel's square.
+Sums that differ by a shift of both offsets share all rows but a few at their ends, so that the work grows
+with the third power of the side and not with the fourth, see `window_products`.
 """
 
 from __future__ import annotations

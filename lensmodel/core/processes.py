@@ -1,10 +1,8 @@
 """Where loops over patches, cells and photos run: any executor will do, here or on other machines.
 
-Worker processes can be started by a script, a notebook or a command alike.
-
 Python's spawned processes import the main module again: of a script without `if __name__ == "__main__"`
 each worker would begin the script anew. The workers here only run functions of this library and what was
-sent to them, so they leave the main module out.
+sent to them, so they leave the main module out: a script, a notebook and a command can start them alike.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
     place in the reference = H(pixel) + sum_ij c_ij X^i Y^j,   i + j <= degree
 
 with X, Y the pixel over half the diagonal of the frame, from its middle. The polynomial takes what a
-plane seen through a perfect lens does not have: distortion, and the small turns of a tripod.
-
-The four discs of a target in a photo.
+plane seen through a perfect lens does not have: distortion, and the small turns of a tripod. Of a target, the
+four discs give the first homography.
 """
 
 from __future__ import annotations

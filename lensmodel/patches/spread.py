@@ -1,9 +1,9 @@
-"""Spread the choice over the field: non-maximum suppression, quotas, field cells.
+"""Spread windows over the field.
 
-Windows spread evenly over a whole photo: what attention over many patches wants.
-
-The frame is cut into equal cells, one window in each, moved within the cell to where detail is richest.
-Windows that are flat or clipped are left out; nothing else is judged, since the network weighs its patches.
+`spread_windows` keeps of scored windows the best ones that lie apart: non-maximum suppression, quotas, cells
+of the field. `spread_evenly`, for the learned estimator, cuts the frame into equal cells and moves one window
+within each to where detail is richest; flat and clipped ones alone are left out, for the network weighs its
+patches.
 """
 
 from __future__ import annotations

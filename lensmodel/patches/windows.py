@@ -1,8 +1,6 @@
-"""What patch selection returns, and what a selector must be able to do.
+"""The windows of a photo: what is known of each candidate, as arrays, and which were chosen.
 
-One pass over a plane: sums over small blocks, from which any window is put together.
-
-What is known of every candidate window of a photo, as arrays.
+One pass over a plane sums over small blocks, from which any window is put together.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A lens whose PSF is known exactly, everywhere in the field and at every aperture.
 
-From a wavefront to a PSF on pixels: Fourier optics with exact sampling.
-
-The field behind the exit pupil is transformed, its intensity is integrated over square pixels::
+`Aberrations` of one copy make a wavefront W, and Fourier optics with exact sampling a PSF of it. The field
+behind the exit pupil is transformed, its intensity is integrated over square pixels::
 
     E(x) = sum_p A(p) exp(2 pi i W(p)) exp(-2 pi i p . x / (2 lambda N)),   |p| <= 1
     k(pixel) = integral over the pixel of sum_lambda s(lambda) |E(x)|^2
@@ -18,8 +17,6 @@ at f/1.4, where the speckle of the PSF is 20 times finer than a pixel.
 Sources: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, ch. 5 and 6;
 R. Soummer et al., "Fast computation of Lyot-style coronagraph propagation", Optics Express 15,
 2007, eq. 1 (the matrix Fourier transform).
-
-Aberrations of one copy of a lens, and the wavefront that they make.
 
 The wavefront is that of third-order theory with the faults of a single copy added. With the
 pupil p (right, up; |p| <= 1), the field h (right, up; |h| = r), and h' = h - decentring::

@@ -105,7 +105,8 @@ def blind(
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and curves.")
+        Path,
+        typer.Option("--output", "-o", metavar="DIR", help="Where to write: a folder for tables and curves."),
     ] = BLIND_OUTPUT,
     json_output: JsonFile = None,
     force: Force = False,

@@ -26,7 +26,13 @@ def gallery(
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for page, crops and stored results.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Where to write: a folder for page, crops and stored results.",
+        ),
     ] = Path("gallery-output"),
     only: Annotated[
         list[str] | None,

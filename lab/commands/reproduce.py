@@ -25,7 +25,10 @@ BENCHMARK = Path("bench-output")
 def reproduce(
     context: typer.Context,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
+        Path,
+        typer.Option(
+            "--output", "-o", help="Where to write: a folder for the page, its pictures and stored results."
+        ),
     ] = Path("reproduction"),
     size: Annotated[
         str,

@@ -28,7 +28,10 @@ FILES: Final = frozenset(
 def demo(
     context: typer.Context,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures and the report.")
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Where to write: a folder for the pictures and the report."
+        ),
     ] = Path("demo-output"),
     estimator: Estimator = "default",
     json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,

@@ -8,13 +8,29 @@ from typing import Annotated, get_args
 
 import typer
 
+from lensmodel.blind import estimators
 from lensmodel.cli import correction, folder
-from lensmodel.cli.calibrate import Estimator, Selector
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import AnyLens, Aperture, Force, Json, Photos, Quiet, Verbose, Workers, choice
+from lensmodel.cli.options import (
+    ANY_LENS,
+    JSON,
+    QUIET,
+    WORKERS,
+    Aperture,
+    Force,
+    HelpAll,
+    Photos,
+    Verbose,
+    choice,
+    rare,
+)
 from lensmodel.correction import Bounds, deconvolvers
+from lensmodel.patches import selectors
 from lensmodel.photo import OutputFormat
+
+LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting", "Writing", "Running"
+"""Panels of the options that --help-all adds."""
 
 
 def correct(
@@ -28,13 +44,7 @@ def correct(
         typer.Option(
             metavar="auto|ID",
             help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
-            "correct those that gain from it. With --server, also the id of a lens there.",
-        ),
-    ] = None,
-    server: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URL", help="Have a service elsewhere do the work; its key is read from LENS_API_KEY."
+            "correct those that visibly gain. With --server, also the id of a lens there.",
         ),
     ] = None,
     output: Annotated[
@@ -43,29 +53,8 @@ def correct(
             "--output",
             "-o",
             metavar="DIR|FILE",
-            help="Folder for the corrected photos, or of one photo a file such as sharp.tif; default: "
+            help="Where to write: a folder, or for one photo a file such as sharp.tif. Default: a folder "
             "`corrected` beside each photo.",
-        ),
-    ] = None,
-    profiles: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="With --lens auto: folder that keeps the lens profiles; default: `lenses` in the output.",
-        ),
-    ] = None,
-    learn_from: Annotated[
-        int,
-        typer.Option(
-            min=1, metavar="N", help="With --lens auto: learn from at most this many photos of a group."
-        ),
-    ] = folder.LEARN_FROM,
-    estimator: Estimator = "default",
-    selector: Selector = "r-map",
-    method: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned."
         ),
     ] = None,
     strength: Annotated[
@@ -74,25 +63,9 @@ def correct(
             min=0.0,
             max=1.0,
             metavar="0..1",
-            help="0: correct nothing; 1: all that the noise allows (of JPEGs: seven tenths of it).",
+            help="0: correct nothing; 1: all that the noise allows (for JPEGs, seven tenths of that).",
         ),
     ] = 1.0,
-    halo: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SHARE",
-            help="How far results may go beyond the photo's own range beside edges, as a share of that "
-            "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
-        ),
-    ] = None,
-    texture: Annotated[
-        float,
-        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."),
-    ] = 1.0,
-    denoise: Annotated[
-        float,
-        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."),
-    ] = 0.0,
     file_format: Annotated[
         OutputFormat | None,
         choice(
@@ -101,37 +74,120 @@ def correct(
             "dng: linear, for a raw converter. Default: by the name after -o, else tiff16.",
         ),
     ] = None,
+    aperture: Aperture = None,
+    force: Force = False,
+    profiles: Annotated[
+        Path | None,
+        rare(
+            typer.Option(
+                metavar="DIR", help="Folder of the lens profiles. Default: a folder `lenses` in the output."
+            ),
+            LEARNING,
+        ),
+    ] = None,
+    learn_from: Annotated[
+        int,
+        rare(
+            typer.Option(min=1, metavar="N", help="Learn from at most this many photos of each group."),
+            LEARNING,
+        ),
+    ] = folder.LEARN_FROM,
+    estimator: Annotated[
+        str, rare(typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}."), LEARNING)
+    ] = "default",
+    selector: Annotated[
+        str,
+        rare(
+            typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}."),
+            LEARNING,
+        ),
+    ] = "r-map",
+    any_lens: Annotated[bool, rare(ANY_LENS, LEARNING)] = False,
+    method: Annotated[
+        str | None,
+        rare(
+            typer.Option(
+                metavar="NAME",
+                help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
+            ),
+            CORRECTING,
+        ),
+    ] = None,
+    halo: Annotated[
+        float | None,
+        rare(
+            typer.Option(
+                metavar="SHARE",
+                help="How far results may go beyond the photo's own range beside edges, as a share of that "
+                "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
+            ),
+            CORRECTING,
+        ),
+    ] = None,
+    texture: Annotated[
+        float,
+        rare(
+            typer.Option(
+                min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."
+            ),
+            CORRECTING,
+        ),
+    ] = 1.0,
+    denoise: Annotated[
+        float,
+        rare(
+            typer.Option(
+                min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."
+            ),
+            CORRECTING,
+        ),
+    ] = 0.0,
     sidecar: Annotated[
         bool,
-        typer.Option(
-            "--sidecar",
-            help="Write an XMP file beside each corrected photo, NAME.tif.xmp, saying what was done and with "
-            "which lens.",
+        rare(
+            typer.Option(
+                "--sidecar",
+                help="Write an XMP file beside each corrected photo, NAME.tif.xmp, that says what was "
+                "done and with which lens.",
+            ),
+            WRITING,
         ),
     ] = False,
     keep_location: Annotated[
-        bool, typer.Option("--keep-location", help="Keep where the photo was taken (GPS); default: left out.")
+        bool,
+        rare(
+            typer.Option(
+                "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
+            ),
+            WRITING,
+        ),
     ] = False,
-    aperture: Aperture = None,
-    workers: Workers = None,
-    any_lens: AnyLens = False,
-    force: Force = False,
-    json_output: Json = False,
-    quiet: Quiet = False,
+    server: Annotated[
+        str | None,
+        rare(
+            typer.Option(
+                metavar="URL",
+                help="Have a service do the work on another machine; its key is read from LENS_API_KEY.",
+            ),
+            RUNNING,
+        ),
+    ] = None,
+    workers: Annotated[int | None, rare(WORKERS, RUNNING)] = None,
+    json_output: Annotated[bool, rare(JSON, RUNNING)] = False,
+    quiet: Annotated[bool, rare(QUIET, RUNNING)] = False,
     verbose: Verbose = 0,
+    help_all: HelpAll = False,
 ) -> None:
     """Remove the blur of the lens from photos.
 
-    Corrected photos are new files, NAME-corrected. Those that are there already are left alone:
-    a run that was stopped goes on where it was. Each appears complete or not at all. The names of
-    the written files go to standard output; with --lens auto a table is printed instead, one line per lens,
-    and -v reports every photo. The photos themselves are never changed.
+    Corrected photos are new files, NAME-corrected; the photos themselves are never changed. Files that
+    are already there are left alone, so a run that was stopped can be started again and goes on from
+    there. No file is ever half written. The names of the written files go to standard output; with
+    --lens auto it is a table instead, one line per lens, and -v reports on every photo.
 
     Examples:
 
         lensmodel correct holiday --lens auto
-
-        lensmodel correct holiday --server http://127.0.0.1:8000 -o corrected
 
         lensmodel correct holiday --profile my-24mm.lensprofile -o corrected
 
@@ -141,8 +197,11 @@ def correct(
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
+        lensmodel correct holiday --server http://127.0.0.1:8000 -o corrected
+
     Exit status: 0 all photos are corrected, 1 some are not, 2 called wrongly.
     """
+    del help_all
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")

@@ -73,8 +73,8 @@ def named(profile: Path | None) -> Path:
     """Where the lens is written; it has no usual place, since a person may have several."""
     if profile is None:
         raise UsageError(
-            "what is learned is written to a lens profile; add its name, "
-            "for example --profile my-24mm.lensprofile"
+            "add --profile and the name of a file, for example --profile my-24mm.lensprofile: "
+            "what is learned of the lens is written there"
         )
     return profile
 

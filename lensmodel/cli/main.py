@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final
 
 # Before NumPy is imported: the work is parallel over processes, and linear algebra libraries that
 # start threads of their own in each of them only get in one another's way.
@@ -23,82 +23,87 @@ from lensmodel.core.errors import LensModelError
 
 ending.workers_ignore_it()
 
+RESEARCH: Final = "Research"
+ADMINISTRATION: Final = "Administration"
+"""Panels of what few people need, after the commands of everyone."""
+
 
 class Commands(OnDemand):
     """The commands as `--help` lists them; a test holds each against its own help."""
 
     entries: ClassVar[Mapping[str, CommandEntry]] = {
+        "correct": CommandEntry("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos."),
         "calibrate": CommandEntry(
             "lensmodel.cli.calibrate:calibrate", "Learn the blur of one lens from photos, into a profile."
-        ),
-        "correct": CommandEntry("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos."),
-        "check": CommandEntry(
-            "lensmodel.cli.check:check",
-            "Find where a photo corrected by any program shows what the original cannot have contained.",
-        ),
-        "psf": CommandEntry(
-            "lensmodel.cli.psf:psf",
-            "Show what the lens makes of a point of light at one place in the picture.",
-        ),
-        "measure": CommandEntry(
-            "lensmodel.cli.measure:measure",
-            "Measure the blur of a lens from photos made for the purpose, into a profile.",
-        ),
-        "target": CommandEntry(
-            "lensmodel.cli.measure:target", "Write the page to print for `lensmodel measure target`."
         ),
         "report": CommandEntry(
             "lensmodel.cli.report:report",
             "Say how sharp a lens is, whether it is centred, and which photo would help most.",
         ),
+        "measure": CommandEntry(
+            "lensmodel.cli.measure:measure",
+            "Measure the blur of a lens from photos made for the purpose, into a profile.",
+        ),
+        "check": CommandEntry(
+            "lensmodel.cli.check:check",
+            "Find where a photo corrected by any program shows what the original cannot have contained.",
+        ),
+        "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
+        "target": CommandEntry(
+            "lensmodel.cli.measure:target",
+            "Write the page to print for `lensmodel measure target`.",
+            panel=RESEARCH,
+        ),
+        "psf": CommandEntry(
+            "lensmodel.cli.psf:psf",
+            "Show what the lens makes of a point of light at one place in the picture.",
+            panel=RESEARCH,
+        ),
         "export": CommandEntry(
             "lensmodel.cli.report:export_psfs",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
-            panel="Research",
-        ),
-        "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
-        "api": CommandEntry(
-            "app.commands.service:api",
-            "Run only the API process, for installations on many machines.",
-            hidden=True,
-        ),
-        "worker": CommandEntry(
-            "app.commands.service:worker",
-            "Run only a worker process, for installations on many machines.",
-            hidden=True,
-        ),
-        "config": CommandEntry(
-            "app.commands.service:config",
-            "Print the effective settings as environment variables; secrets are masked.",
-            panel="Administration",
-        ),
-        "doctor": CommandEntry(
-            "app.commands.upkeep:doctor",
-            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
-            panel="Administration",
-        ),
-        "backup": CommandEntry(
-            "app.commands.upkeep:backup",
-            "Copy all rows and blobs of an installation into a folder, even while it runs.",
-            panel="Administration",
+            panel=RESEARCH,
         ),
         "demo": CommandEntry(
             "lab.demo.command:demo",
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
-            panel="Research",
+            panel=RESEARCH,
         ),
         "reproduce": CommandEntry(
             "lab.commands.reproduce:reproduce",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
-            panel="Research",
+            panel=RESEARCH,
+        ),
+        "bench": CommandEntry("lab.commands.benchmarks:bench", "Measure quality and speed.", panel=RESEARCH),
+        "api": CommandEntry(
+            "app.commands.service:api",
+            "Run only the API process, for installations on many machines.",
+            panel=ADMINISTRATION,
+        ),
+        "worker": CommandEntry(
+            "app.commands.service:worker",
+            "Run only a worker process, for installations on many machines.",
+            panel=ADMINISTRATION,
+        ),
+        "config": CommandEntry(
+            "app.commands.service:config",
+            "Print the effective settings as environment variables; secrets are masked.",
+            panel=ADMINISTRATION,
+        ),
+        "doctor": CommandEntry(
+            "app.commands.upkeep:doctor",
+            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
+            panel=ADMINISTRATION,
+        ),
+        "backup": CommandEntry(
+            "app.commands.upkeep:backup",
+            "Copy all rows and blobs of an installation into a folder, even while it runs.",
+            panel=ADMINISTRATION,
         ),
         "keys": CommandEntry(
             "app.commands.keys:keys",
             "Make, list, renew and end the keys of a service that others can reach.",
-            panel="Administration",
-        ),
-        "bench": CommandEntry(
-            "lab.commands.benchmarks:bench", "Measure quality and speed.", panel="Research"
+            panel=ADMINISTRATION,
         ),
     }
 
@@ -107,7 +112,7 @@ app = typer.Typer(
     cls=Commands,
     name="lensmodel",
     help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
-    epilog="""Start with: lensmodel calibrate PHOTO... --profile my-lens.lensprofile
+    epilog="""Start with: lensmodel correct FOLDER --lens auto
 
 Exit status: 0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C, 143 by SIGTERM.""",
     no_args_is_help=True,

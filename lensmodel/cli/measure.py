@@ -39,7 +39,7 @@ class MeasurementOptions:
     size: int
     replace: bool
     any_lens: bool
-    output: Path | None
+    show: Path | None
 
 
 def measure(
@@ -57,13 +57,12 @@ def measure(
             "--replace", help="Drop what was learned blindly at the same aperture and focal length."
         ),
     ] = False,
-    output: Annotated[
+    show: Annotated[
         Path | None,
         typer.Option(
-            "--output",
-            "-o",
+            "--show",
             metavar="DIR",
-            help="Folder for pictures and figures of the edges of a chart: edges.pdf, edges.png, edges.csv.",
+            help="With edges: write to this folder which edges were measured: edges.pdf, .png and .csv.",
         ),
     ] = None,
     any_lens: AnyLens = False,
@@ -82,14 +81,14 @@ def measure(
 
     - points: stars, or pinholes in front of a lamp; not saturated.
 
-    - edges: a chart of dark squares or a checkerboard, turned by 5 degrees. With --output each edge can be
+    - edges: a chart of dark squares or a checkerboard, turned by 5 degrees. With --show each edge can be
     looked at: its place on the chart, its profile and its SFR curve.
 
     Examples:
 
         lensmodel measure target page.dng --profile my-24mm.lensprofile
 
-        lensmodel measure edges chart.dng --profile my-24mm.lensprofile -o edges
+        lensmodel measure edges chart.dng --profile my-24mm.lensprofile --show edges
 
         lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
 
@@ -100,11 +99,11 @@ def measure(
         raise UsageError(f"measure one of {', '.join(KINDS)}, not {kind!r}")
     if size % 2 == 0:
         raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
-    if output is not None:
+    if show is not None:
         if kind != "edges" or len(photos) != 1:
-            raise UsageError("--output shows the edges of one photo: lensmodel measure edges PHOTO -o DIR")
-        files.refuse_existing(*(output / name for name in EDGE_FILES), force=force)
-    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens, output)
+            raise UsageError("--show is for the edges of one photo: lensmodel measure edges PHOTO --show DIR")
+        files.refuse_existing(*(show / name for name in EDGE_FILES), force=force)
+    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens, show)
     _run(photos, files.named(profile), options, shown, as_json=json_output)
 
 
@@ -149,7 +148,7 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
     """Measure on the photos of one measurement and save the profile; say what became of it."""
     path, key = group[0], sampling.photo_id(group[0])
     known = Lens.load(target) if target.exists() else None
-    if options.output is None and known is not None and key in known.profile.photos:
+    if options.show is None and known is not None and key in known.profile.photos:
         return {"state": "known"}
 
     def admit(info: PhotoInfo) -> None:
@@ -160,8 +159,8 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
 
     photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
-    if options.output is not None:
-        _show_edges(photos[0], options.output)
+    if options.show is not None:
+        _show_edges(photos[0], options.show)
         if known is not None and key in known.profile.photos:
             return {"state": "known"}
     identity = Identity.of(photos[0].info.metadata)

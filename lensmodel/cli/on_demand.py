@@ -18,7 +18,6 @@ class CommandEntry:
     # module and name of the function, or of the `typer.Typer` of a command with commands of its own
     home: str
     summary: str  # first sentence of its help
-    hidden: bool = False  # whether the list leaves it out
     panel: str | None = None  # under which heading the list has it; None: first, under Commands
 
 
@@ -31,9 +30,7 @@ class OnDemand(TyperGroup):
     def __init__(self, **given: Any) -> None:  # noqa: ANN401 - what Typer passes
         super().__init__(**given)
         for name, entry in self.entries.items():
-            self.add_command(
-                TyperCommand(name, help=entry.summary, hidden=entry.hidden, rich_help_panel=entry.panel)
-            )
+            self.add_command(TyperCommand(name, help=entry.summary, rich_help_panel=entry.panel))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - Typer's own
         """Import the command that the words name."""
@@ -49,5 +46,5 @@ class OnDemand(TyperGroup):
         if isinstance(value, typer.Typer):
             alone.add_typer(value, name=name)
         else:
-            alone.command(name, hidden=entry.hidden)(value)
+            alone.command(name)(value)
         return typer.main.get_group(alone).commands[name]

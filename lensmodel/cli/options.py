@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import math
 from collections.abc import Iterable
@@ -57,17 +58,41 @@ def aperture_option(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` re
     return typer.Option("--aperture", "-a", metavar="N", parser=f_number, help=words)
 
 
+def rare(option: Any, panel: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
+    """Return an option that only --help-all shows, in a panel."""
+    changed = copy.copy(option)
+    changed.hidden, changed.rich_help_panel = True, panel
+    return changed
+
+
+def _show_all(context: typer.Context, wanted: bool) -> None:
+    """Print the help with the options that few people need."""
+    if wanted:
+        for parameter in context.command.params:
+            parameter.hidden = False  # type: ignore[attr-defined]  # options have it
+        typer.echo(context.get_help())
+        raise typer.Exit
+
+
+HelpAll = Annotated[
+    bool,
+    typer.Option(
+        "--help-all", callback=_show_all, is_eager=True, help="Show all options: these are the usual ones."
+    ),
+]
 Photos = Annotated[
     list[str], typer.Argument(metavar="PHOTO", help="Files, folders, or quoted patterns such as '*.dng'.")
 ]
 Profile = Annotated[
-    Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The lens profile; always needed.")
+    Path | None,
+    typer.Option(
+        "--profile", "-p", metavar="FILE", help="The lens profile to write or add to; always needed."
+    ),
 ]
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
 Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
-AnyLens = Annotated[
-    bool, typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
-]
+ANY_LENS = typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
+AnyLens = Annotated[bool, ANY_LENS]
 Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
 RADIUS = typer.Option(
     "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the centre: 0 centre, 1 corner."
@@ -78,19 +103,19 @@ ANGLE = typer.Option(
 Size = Annotated[
     int, typer.Option(min=3, max=255, metavar="N", callback=_odd, help="Side in pixels, an odd number.")
 ]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers",
-        "-j",
-        min=1,
-        metavar="N",
-        help="Processes that learn, threads that correct; default: one per core.",
-    ),
-]
+WORKERS = typer.Option(
+    "--workers",
+    "-j",
+    min=1,
+    metavar="N",
+    help="How many cores to use, as processes or threads. Default: all.",
+)
+Workers = Annotated[int | None, WORKERS]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only errors.")]
+JSON = typer.Option("--json", help="Print the result as JSON, and nothing else.")
+Json = Annotated[bool, JSON]
+QUIET = typer.Option("--quiet", "-q", help="No progress and no notes, only errors.")
+Quiet = Annotated[bool, QUIET]
 Verbose = Annotated[
     int,
     typer.Option(

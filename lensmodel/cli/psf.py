@@ -49,7 +49,10 @@ def psf(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="Write the PSF to this file: .npy, .json, .tif or .png."
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Where to write: a file ending in .npy, .json, .tif or .png.",
         ),
     ] = None,
     force: Force = False,

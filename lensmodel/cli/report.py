@@ -59,14 +59,16 @@ def report(
     profile: ProfileFile,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for the report: page, print, figures."),
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Where to write: a folder for page, print and figures."
+        ),
     ] = None,
     aperture: Aperture = None,
     aspect: Aspect = 1.5,
     against: Annotated[
         Path | None,
         typer.Option(
-            "--against", metavar="PROFILE", help="Profile of another copy to compare with; needs --output."
+            "--against", metavar="FILE", help="Profile of another copy to compare with; needs --output."
         ),
     ] = None,
     photo: Annotated[
@@ -194,7 +196,7 @@ def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
 def export_psfs(
     context: typer.Context,
     profile: ProfileFile,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Where to write: a file.")],
     file_format: Annotated[
         str | None,
         typer.Option(

@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -85,8 +86,39 @@ def test_each_example_is_understood_by_its_command(line: str) -> None:
 def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: str) -> None:
     listed, command = ROOT.commands[name], ROOT.imported(name)
 
-    assert (command.name, command.hidden) == (listed.name, listed.hidden)
+    assert command.name == listed.name
     assert inspect.cleandoc(command.help or "").splitlines()[0] == listed.help
+
+
+def test_six_commands_are_for_everyone_and_twelve_in_panels_of_their_own() -> None:
+    panels = Counter(entry.panel for entry in ROOT.entries.values())
+
+    assert panels == {None: 6, "Research": 6, "Administration": 6}
+
+
+def test_correct_shows_ten_options_and_all_of_them_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = {}
+    for flag in ("--help", "--help-all"):
+        with contextlib.suppress(typer.Exit):
+            ROOT.imported("correct").main([flag], standalone_mode=False)
+        shown[flag] = set(re.findall(r"^│ (--[\w-]+)", capsys.readouterr().out, re.MULTILINE))
+
+    options = {o for p in COMMANDS["correct"].params for o in p.opts if o.startswith("--")}
+    assert len(shown["--help"]) == 10
+    assert shown["--help-all"] == options | {"--help"}
+
+
+def test_the_short_name_o_is_where_to_write_in_every_command() -> None:
+    found = {
+        name: parameter
+        for name, command in COMMANDS.items()
+        for parameter in command.params
+        if "-o" in parameter.opts
+    }
+
+    assert len(found) > 5
+    assert all("--output" in parameter.opts for parameter in found.values())
+    assert all(parameter.help.startswith("Where to write: ") for parameter in found.values())
 
 
 def test_an_option_that_does_not_exist_would_be_noticed() -> None:

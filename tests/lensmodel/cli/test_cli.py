@@ -442,8 +442,8 @@ def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
 # --- refusals ----------------------------------------------------------------------------------
 
 REFUSED = {
-    "nowhere to write": (["calibrate", "one.dng"], 2, "add its name, for example --profile my-24mm"),
-    "nowhere to measure into": (["measure", "edges", "one.dng"], 2, "add its name, for example --profile"),
+    "nowhere to write": (["calibrate", "one.dng"], 2, "^lensmodel: add --profile and the name of"),
+    "nowhere to measure into": (["measure", "edges", "one.dng"], 2, "^lensmodel: add --profile and the name"),
     "missing photo": (["calibrate", "gone.dng", "-p", "new"], 2, "no photo called gone.dng"),
     "empty folder": (["calibrate", "empty", "-p", "new"], 2, "no photo in the folder empty"),
     "no image": (["correct", "text.dng", "-p", PROFILE, "-o", "out"], 1, "belong to no photo format"),
@@ -505,7 +505,11 @@ REFUSED = {
     "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
     "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
     "report there": (["report", PROFILE, "-o", "reported"], 2, "report.csv is there already; --force"),
-    "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
+    "export format": (
+        ["export", PROFILE, "-o", "new.bmp", "--format", "bmp"],
+        2,
+        "'bmp'; add .* .csv, .fits, .json",
+    ),
     "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .csv, .fits, .json"),
     "export by two formats": (
         ["export", PROFILE, "-o", "new.fits", "--format", "npz"],

@@ -23,7 +23,7 @@ from app.blobs.storage import Storage
 from app.errors import NotReadyError, UnknownPictureError
 
 TILE: Final = 512
-"""Side of a tile in pixels, as `static/tiles.js` has it."""
+"""Side of a tile in pixels, as `static/viewer.js` has it."""
 
 WHOLE: Final = 1600
 """Longer side of the whole picture in pixels at most (chosen): fills most screens until there are tiles."""
@@ -62,7 +62,7 @@ def _levels(height: int, width: int) -> list[tuple[int, int]]:
         levels.append((-(-height // TILE), -(-width // TILE)))
         if max(height, width) <= TILE:
             break
-        height, width = height // 2, width // 2
+        height, width = -(-height // 2), -(-width // 2)
     return levels
 
 
@@ -85,12 +85,11 @@ def _pictures(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
 
 
 def _shrunk(picture: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """Return the means of squares of pixels, of at least one row and column."""
-    height, width = (max(size // step, 1) for size in picture.shape[:2])
-    high, wide = (min(step, size) for size in picture.shape[:2])
-    squares = picture[: height * high, : width * wide].reshape(height, high, width, wide, 3)
-    mean = squares.astype(np.uint16).mean(axis=(1, 3), dtype=np.float32)
-    return np.rint(mean).astype(np.uint8)
+    """Return the means of squares of pixels; the last ones go on as the edge is."""
+    padded = np.pad(picture, (*((0, -size % step) for size in picture.shape[:2]), (0, 0)), mode="edge")
+    height, width = (size // step for size in padded.shape[:2])
+    squares = padded.reshape(height, step, width, step, 3)
+    return np.rint(squares.mean(axis=(1, 3), dtype=np.float32)).astype(np.uint8)
 
 
 def _jpeg(picture: NDArray[np.uint8]) -> bytes:

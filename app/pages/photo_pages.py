@@ -7,6 +7,7 @@ from typing import Final
 
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
+from pydantic import Field
 
 from app.blobs import tiles
 from app.errors import InvalidParameterError
@@ -86,6 +87,7 @@ class PreviewIn(Region):
     With `layers` it is also wanted as the sliders of texture and grain need it.
     """
 
+    method: str | None = Field(default=None, max_length=40)
     lens_id: Id | None = None
     layers: bool = False
 
@@ -103,6 +105,7 @@ def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
         {
             "photo_id": photo_id,
             "lens_id": part.lens_id,
+            "method": part.method,
             "roi": turned.model_dump(),
             "layers": part.layers,
             "output": {"format": "png8", "color_space": "srgb"},

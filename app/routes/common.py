@@ -11,8 +11,10 @@ from fastapi import Query
 from app.errors import UnknownLensError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
+from app.other_lens import Described
 from app.schemas import OptionalName, Problem
 from app.store.tables import LensRow
+from lensmodel.core.names import camera_name
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[
@@ -56,6 +58,18 @@ def find_lens(call: Call, lens_id: str) -> LensRow:
     if lens is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
     return lens
+
+
+def described_lens(call: Call, lens: LensRow) -> Described:
+    """Return what is known of a lens by itself and by its newest photos."""
+    own = call.store.photos.page(call.owner, before=None, limit=200, lens_id=lens.public_id)
+    return Described(
+        lens.maker,
+        lens.model,
+        lens.serial,
+        {camera_name(row.camera_maker, row.camera_model) for row in own if row.camera_model},
+        [row.focal_mm for row in own if row.focal_mm],
+    )
 
 
 def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:

@@ -23,7 +23,16 @@ from app.http.dependencies import Call, CallDep
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
 from app.routes import photos as photo_routes
-from app.routes.common import Cursor, Limit, OnlyId, find_lens, matches_tag, next_link, problems
+from app.routes.common import (
+    Cursor,
+    Limit,
+    OnlyId,
+    described_lens,
+    find_lens,
+    matches_tag,
+    next_link,
+    problems,
+)
 from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
 from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
@@ -136,14 +145,6 @@ def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
 
 def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
     """Refuse a photo that seems to be of another lens, as the command line does."""
-    own = call.store.photos.page(call.owner, before=None, limit=200, lens_id=lens.public_id)
-    known = Described(
-        lens.maker,
-        lens.model,
-        lens.serial,
-        {camera_name(row.camera_maker, row.camera_model) for row in own if row.camera_model},
-        [row.focal_mm for row in own if row.focal_mm],
-    )
     camera = camera_name(photo.camera_maker, photo.camera_model)
     own_lens = Described(
         photo.lens_maker,
@@ -152,7 +153,7 @@ def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
         [camera] if photo.camera_model else [],
         [photo.focal_mm] if photo.focal_mm else [],
     )
-    why = difference(known, own_lens)
+    why = difference(described_lens(call, lens), own_lens)
     if why is not None:
         raise OtherLensError(f"{photo.filename} seems to be of another lens: {why}; {REMEDY}")
 

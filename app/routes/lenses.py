@@ -8,10 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, status
 from pydantic import Field
 
-from app.errors import ConflictError, InvalidParameterError, UnknownLensError
+from app.errors import ConflictError, InvalidParameterError, OtherLensError, UnknownLensError
 from app.http import views
 from app.http.dependencies import CallDep
-from app.routes.common import Cursor, Limit, OnlyName, cut, find_lens, next_link, problems
+from app.other_lens import REMEDY, difference
+from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link, problems
 from app.schemas import MAX_VERSION, CalibrationPage, Id, LateralOut, LensOut, LensPage, Name, Question
 from lensmodel.core.errors import NoSamplesError
 
@@ -49,6 +50,7 @@ class LensChange(Question):
     back_to: int | None = Field(
         None, ge=1, le=MAX_VERSION, description="a version: photos that joined later are left out"
     )
+    any_lens: bool = Field(default=False, description="merge lenses too that seem to be two")
 
 
 class LensIn(Question):
@@ -69,11 +71,12 @@ def create_lens(new: LensIn, call: CallDep) -> LensOut:
 def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     """Rename a lens, merge it into another, or go back to an earlier version.
 
-    Merged, its photos teach the other lens, which is returned, and it is forgotten. Going back leaves out the
-    photos that joined later; they stay, and can be included again.
+    Merged, its photos teach the other lens, which is returned, and it is forgotten; lenses that seem to be
+    two are merged only with `any_lens`. Going back leaves out the photos that joined later; they stay,
+    and can be included again.
     """
     lens = find_lens(call, lens_id)
-    if len(change.model_fields_set) != 1:
+    if len(change.model_fields_set - {"any_lens"}) != 1:
         raise InvalidParameterError("send one of label, merge_into and back_to")
     lenses = call.store.lenses
     if change.merge_into is not None:
@@ -85,6 +88,11 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
                 f"lens {lens_id} has the model {lens.way}, and {change.merge_into} {target.way}: only lenses "
                 "of one model can be merged"
             )
+        why = (
+            None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
+        )
+        if why is not None:
+            raise OtherLensError(f"the two seem to be different lenses: {why}; {REMEDY}")
         if not lenses.merge(lens_id, change.merge_into, call.owner):
             raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
         return read_lens(change.merge_into, call)

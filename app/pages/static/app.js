@@ -9,7 +9,7 @@ import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
 import { setUpSignIn, setUpSignOut } from "./session.js";
 import { setUpUpload } from "./upload.js";
-import { setUpViewer } from "./view_tools.js";
+import { setUpViewer } from "./viewer.js";
 
 const parts = [
   setUpUpload,

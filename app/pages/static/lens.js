@@ -214,7 +214,8 @@ export function setUpLensActions() {
       const into = fields.get("lens");
       if (!into) throw new Error("Choose the lens that this one is to be merged into.");
       if (!(await confirmed("All photos of this lens will count for the other one. This cannot be undone.", "Merge"))) return "";
-      return send("PATCH", lens, { merge_into: into }).then(() => `/lenses/${into}`);
+      const merged = await withItsLens((any) => send("PATCH", lens, { merge_into: into, any_lens: any }));
+      return merged && `/lenses/${into}`;
     },
     upload: (fields) => withItsLens((any) => putProfile(lens, chosen(fields), any)),
     delete: async () => {

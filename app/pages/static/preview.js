@@ -1,9 +1,12 @@
-// What a correction would do to the part of the photo that is seen: computed once for a place, mixed at once by the sliders.
+// What a correction would do to the part of the photo that is seen: soon in the middle of it, by the quick method, then
+// in all of it. It is computed once for a place; the sliders mix it at once.
 
-import { byId, failure, send } from "./common.js";
+import { ask, byId, send } from "./common.js";
 
 const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
 const PAUSE_MS = 500;
+const SOON = [800, 600]; // pixels of what is seen first: about a second of work
+const LEAST = 0.3; // decibels: less gain is not seen, not at three times the size either
 const WORKING = "Working out what a correction does here …";
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
   const value = code / 255;
@@ -47,19 +50,11 @@ export function setUpPreview(viewer) {
   if (!viewer || !form || !("preview" in form.dataset)) return;
   const words = byId("preview-words");
   const canvas = document.createElement("canvas");
-  let [part, asked, timer, running] = [null, 0, 0, ""];
-  const forget = (id) => fetch(`/v1/corrections/${id}`, { method: "DELETE", keepalive: true }).catch(() => {}); // it may be gone
-  const left = new Set();
-  // What nobody waits for any more stops; but the same wish again is the same correction.
-  const sweep = () => {
-    for (const id of left) if (id !== running) forget(id);
-    left.clear();
-  };
-  const leave = () => {
-    if (running) left.add(running);
-    running = "";
-  };
-  const value = (name) => Number(form.elements[name].value);
+  const fields = form.elements;
+  let [part, timer, running] = [null, 0, new AbortController()];
+  let aim = null; // what is computed, or was last
+  let wanted = !viewer.hasAfter; // a photo that is corrected already shows that until other settings are tried
+  const value = (name) => Number(fields[name].value);
   // What texture and grain need takes as long again: only for those who move their sliders.
   const layered = () => value("texture") !== 1 || value("denoise") !== 0;
   const show = () => {
@@ -67,61 +62,48 @@ export function setUpPreview(viewer) {
     const mixed = mix(part.layers, { strength: value("strength"), texture: value("texture"), denoise: value("denoise") });
     [canvas.width, canvas.height] = [mixed.width, mixed.height];
     canvas.getContext("2d").putImageData(mixed, 0, 0);
-    const first = viewer.patches.length === 0;
-    viewer.patches = [{ ...part.region, image: canvas }];
-    if (first && viewer.mode === "before") viewer.setMode("split");
-    viewer.redraw();
-    viewer.root.dataset.previewed = "";
+    viewer.cover(canvas, part.region);
+    if (viewer.mode === "before" && !viewer.hasAfter) viewer.setMode("split");
+    viewer.hasAfter = true;
+    viewer.hold(false);
+    viewer.root.dataset.previewed = part.method;
   };
-  const covers = ({ region }, wanted) =>
-    wanted.x >= region.x &&
-    wanted.y >= region.y &&
-    wanted.x + wanted.width <= region.x + region.width &&
-    wanted.y + wanted.height <= region.y + region.height;
+  const corrected = async ([region, method, layers], signal, say) => {
+    const lens = fields.lens_id?.value;
+    const { id } = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, method, layers, ...(lens ? { lens_id: lens } : {}) });
+    try {
+      const report = await settled(id, signal, say);
+      const names = layers ? ["before", "after", "smooth", "clean"] : ["before", "after"];
+      const pixels = await Promise.all(names.map((name) => pixelsOf(`/ui/corrections/${id}/layer/${name}`)));
+      const gain = Math.max(...Object.values(report.zones).map((zone) => zone.expected_gain_db ?? 0));
+      return { region, method, layered: layers, layers: Object.fromEntries(names.map((name, k) => [name, pixels[k]])), gain: report.nothing_to_correct ? 0 : gain };
+    } finally {
+      fetch(`/v1/corrections/${id}`, { method: "DELETE", keepalive: true }).catch(() => {}); // its pictures are here, or nobody waits
+    }
+  };
   const compute = async (region) => {
-    asked += 1;
-    const [mine, layers] = [asked, layered()];
-    leave();
+    running.abort();
+    running = new AbortController();
+    const { signal } = running;
+    const [method, layers] = [fields.method.value, layered()];
+    aim = { region, method, layered: layers };
+    const steps = [[region, method, layers]];
+    if (method === "standard" && !layers) steps.unshift([middle(region), "fast", false]);
     words.textContent = WORKING;
     try {
-      const lens = form.elements.lens_id?.value;
-      const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, {
-        ...region,
-        layers,
-        ...(lens ? { lens_id: lens } : {}),
-      });
-      if (mine !== asked) {
-        left.add(made.id);
-        if (running) sweep();
-        return;
+      for (const step of steps) {
+        const made = await corrected(step, signal, (text) => step === steps[0] && (words.textContent = text));
+        if (signal.aborted) return;
+        part = made;
+        show();
+        if (made.gain < LEAST) words.textContent = form.dataset.nothing;
+        else if (step !== steps.at(-1)) words.textContent = "A quick first look; the better one is being made …";
+        else words.textContent = seenWhole() ? "This is what you get. Sliders under More change it." : "The lower right shows what you get. Zoom in to see it elsewhere.";
+        if (!made.gain) return;
       }
-      running = made.id;
-      sweep();
-      const end = await settled(made.id, (job) => {
-        if (mine === asked) words.textContent = job.state === "queued" ? "Waiting for other work to finish …" : WORKING;
-        return mine === asked;
-      });
-      if (mine !== asked) return;
-      if (end.state !== "succeeded") throw new Error(end.error?.detail ?? "the preview was stopped");
-      const base = `/ui/corrections/${made.id}/layer`;
-      const names = layers ? ["before", "after", "smooth", "clean"] : ["before", "after"];
-      const pixels = await Promise.all(names.map((name) => pixelsOf(`${base}/${name}`)));
-      if (mine !== asked) return;
-      running = "";
-      part = { region, layered: layers, layers: Object.fromEntries(names.map((name, k) => [name, pixels[k]])) };
-      words.textContent = end.untouched
-        ? form.dataset.nothing
-        : !seenWhole()
-          ? "The lower right shows what you get. Zoom in to see it elsewhere."
-          : "This is what you get. Sliders under More change it.";
-      show();
-      forget(made.id); // its pictures are here now
       if (layered() !== layers) look(); // a slider was moved meanwhile
     } catch (reason) {
-      if (mine !== asked) return;
-      leave();
-      sweep();
-      words.textContent = `No preview: ${reason.message}`;
+      if (!signal.aborted) words.textContent = `No preview: ${reason.message}`;
     }
   };
   const seenWhole = () => viewer.region.width * viewer.region.height <= MOST;
@@ -131,14 +113,12 @@ export function setUpPreview(viewer) {
     const height = Math.min(viewer.height, Math.max(1, Math.floor(MOST / width)));
     return { x: viewer.width - width, y: viewer.height - height, width, height };
   };
-  let wanted = !viewer.after; // a photo that is corrected already shows that until other settings are tried
   const look = () => {
     clearTimeout(timer);
-    if (!wanted || form.elements.lens_id?.value === "") return;
+    if (!wanted || fields.lens_id?.value === "") return;
     timer = setTimeout(() => {
       const region = seenWhole() ? viewer.region : lowerRight();
-      if (part && covers(part, region) && (part.layered || !layered())) return;
-      compute(region);
+      if (!aim || aim.method !== fields.method.value || !covers(aim, region) || (layered() && !aim.layered)) compute(region);
     }, PAUSE_MS);
   };
   viewer.onChange(look);
@@ -146,34 +126,36 @@ export function setUpPreview(viewer) {
     const first = !wanted;
     wanted = true;
     show();
-    if (first || (part && layered() && !part.layered)) look();
+    if (first || part) look();
   });
-  form.elements.lens_id?.addEventListener("change", () => {
-    part = null;
-    look();
-  });
+  fields.lens_id?.addEventListener("change", () => (aim = null));
   window.addEventListener("pagehide", () => {
-    leave();
-    sweep();
+    running.abort();
+    aim = null;
   });
   window.addEventListener("pageshow", (event) => event.persisted && look()); // back from another page: it was stopped
   look();
 }
 
-// Wait for the end of a job; `heard` is told each state and says whether anybody still waits.
-async function settled(id, heard) {
-  let [tag, job] = ["", { state: "queued" }];
-  for (;;) {
-    const response = await fetch(`/v1/jobs/${id}?wait=20`, { headers: tag ? { "If-None-Match": tag } : {} });
-    if (response.status !== 304 && !response.ok) throw failure(await response.text(), response.status);
-    if (response.status !== 304) {
-      tag = response.headers.get("ETag") ?? "";
-      job = await response.json();
-      if (["succeeded", "failed", "cancelled"].includes(job.state)) {
-        const correction = await (await fetch(`/v1/corrections/${id}`)).json();
-        return { ...job, untouched: correction.report?.nothing_to_correct };
-      }
-    }
-    if (!heard(job)) return { state: "left" };
+function covers({ region }, wanted) {
+  const reaches = (at, size) => wanted[at] >= region[at] && wanted[at] + wanted[size] <= region[at] + region[size];
+  return reaches("x", "width") && reaches("y", "height");
+}
+
+function middle({ x, y, width, height }) {
+  const [w, h] = [Math.min(width, SOON[0]), Math.min(height, SOON[1])];
+  return { x: x + Math.floor((width - w) / 2), y: y + Math.floor((height - h) / 2), width: w, height: h };
+}
+
+// Wait for the end of a correction; its report.
+async function settled(id, signal, say) {
+  for (let tag = ""; ; ) {
+    const response = await fetch(`/v1/jobs/${id}?wait=20`, { signal, headers: tag ? { "If-None-Match": tag } : {} });
+    if (response.status === 304) continue;
+    tag = response.headers.get("ETag") ?? "";
+    const { state, error } = await response.json();
+    if (state === "succeeded") return (await (await ask(`/v1/corrections/${id}`, { signal })).json()).report;
+    if (!["queued", "running"].includes(state)) throw new Error(error?.detail ?? "the preview was stopped");
+    say(state === "queued" ? "Waiting for other work to finish …" : WORKING);
   }
 }

@@ -1,298 +1,273 @@
-// Before and after in one view that pans and zooms freely: split, side by side, one alone, or held.
+// Before and after in two views of OpenSeadragon that move as one: split, side by side, one alone, or held.
 
-import { Tiles } from "./tiles.js";
+import { byId } from "./common.js";
 
-const MOST_ZOOM = 8;
-const STEP = 1.25;
+const TILE = 512; // as the service cuts pictures
+const CLOSEST = 8; // pixels of the screen for one of the photo
+const OVERLAY = 8; // pixels of the photo for one of the squares over it
+
+const ratio = () => window.devicePixelRatio || 1;
 
 export class Viewer {
   constructor(root) {
     this.root = root;
     this.stage = root.querySelector(".stage");
-    this.canvas = root.querySelector("canvas");
-    this.handle = root.querySelector(".handle");
-    this.words = root.querySelector(".zoom-words");
-    this.width = Number(root.dataset.width);
-    this.height = Number(root.dataset.height);
-    this.mode = root.dataset.after ? "split" : "before";
-    this.split = 0.5;
-    this.held = false;
-    this.patches = []; // pictures of parts, drawn over the corrected photo: {x, y, width, height, image}
-    this.overlay = null; // draws over the corrected photo in photo pixels
-    this.listeners = new Set();
-    this.waiting = false;
-    const redraw = () => this.redraw();
-    this.before = new Tiles(root.dataset.before, this.width, this.height, redraw);
-    this.after = root.dataset.after ? new Tiles(root.dataset.after, this.width, this.height, redraw) : null;
-    this.view = { x: this.width / 2, y: this.height / 2, scale: 0 };
-    this.pointers = new Map();
-    this.listen();
-    new ResizeObserver(() => this.resized()).observe(this.stage);
-  }
-
-  get ratio() {
-    return window.devicePixelRatio || 1;
-  }
-
-  get shown() {
-    return this.held ? "before" : this.mode;
-  }
-
-  get hasAfter() {
-    return this.after !== null || this.patches.length > 0;
-  }
-
-  get panes() {
-    const box = { x: 0, y: 0, width: this.stage.clientWidth, height: this.stage.clientHeight };
-    if (this.shown !== "side") return [box];
-    if (box.width >= box.height) {
-      const half = box.width / 2;
-      return [{ ...box, width: half - 1 }, { ...box, x: half + 1, width: half - 1 }];
-    }
-    const half = box.height / 2; // a phone held upright: one above the other
-    return [{ ...box, height: half - 1 }, { ...box, y: half + 1, height: half - 1 }];
-  }
-
-  get fitting() {
-    const [pane] = this.panes;
-    return Math.min(pane.width / this.width, pane.height / this.height);
-  }
-
-  resized() {
-    const { clientWidth, clientHeight } = this.stage;
-    if (!clientWidth || !clientHeight) return;
-    const first = this.view.scale === 0;
-    const fitted = this.fitted;
-    this.canvas.width = Math.round(clientWidth * this.ratio);
-    this.canvas.height = Math.round(clientHeight * this.ratio);
-    if (first && this.fromAddress()) return;
-    if (first || fitted) this.fit();
-    else this.changed();
-  }
-
-  fit() {
+    [this.width, this.height] = [Number(root.dataset.width), Number(root.dataset.height)];
+    this.hasAfter = Boolean(root.dataset.after);
     this.fitted = true;
-    this.set(this.width / 2, this.height / 2, this.fitting);
+    this.listeners = new Set();
+    const { before, after = before } = root.dataset;
+    this.panes = [this.open(".pane.before", before), this.open(".pane.after", after)];
+    [this.leader] = this.panes; // the one that is moved: the other follows
+    this.setMode(this.hasAfter ? "split" : "before");
   }
 
-  // Go to a place in photo pixels, one of its pixels to one of the screen's.
-  goTo(x, y, scale = 1 / this.ratio) {
-    this.fitted = false;
-    this.set(x, y, scale);
+  open(place, base) {
+    const maxLevel = Math.max(0, Math.ceil(Math.log2(Math.max(this.width, this.height) / TILE)));
+    const pane = window.OpenSeadragon({
+      element: this.stage.querySelector(place),
+      tileSources: { width: this.width, height: this.height, tileSize: TILE, maxLevel, getTileUrl: (level, col, row) => `${base}/${maxLevel - level}/${col}_${row}.jpg` },
+      drawer: "canvas",
+      showNavigationControl: false,
+      keyboardNavEnabled: false, // the stage listens to keys
+      tabIndex: -1,
+      animationTime: matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 0.3,
+      visibilityRatio: 1,
+      constrainDuringPan: true,
+      maxZoomPixelRatio: CLOSEST / ratio(),
+      preserveImageSizeOnResize: true,
+      gestureSettingsMouse: { clickToZoom: false, dblClickToZoom: true },
+    });
+    pane.element.addEventListener("pointerdown", () => (this.leader = pane), { capture: true });
+    pane.element.addEventListener("wheel", () => (this.leader = pane), { capture: true, passive: true });
+    pane.addHandler("open", () => this.bound(pane) || (pane === this.leader && this.fromAddress()));
+    pane.addHandler("resize", () => this.bound(pane) || (pane === this.leader && (this.refit = this.fitted))); // whole stays whole
+    pane.addHandler("viewport-change", () => this.moved(pane));
+    pane.addHandler("fully-loaded-change", () => this.loaded());
+    return pane;
   }
 
-  set(x, y, scale) {
-    const least = Math.min(this.fitting, 1 / this.ratio);
-    const bounded = Math.min(MOST_ZOOM / this.ratio, Math.max(least, scale));
-    const [pane] = this.panes;
-    const hold = (at, size, room) => {
-      const half = room / bounded / 2;
-      return half * 2 >= size ? size / 2 : Math.min(size - half, Math.max(half, at));
-    };
-    this.view = { x: hold(x, this.width, pane.width), y: hold(y, this.height, pane.height), scale: bounded };
-    this.changed();
+  // A photo that is smaller than the stage is seen pixel by pixel too.
+  bound({ viewport }) {
+    viewport.minZoomLevel = Math.min(viewport.getHomeZoom(), viewport.imageToViewportZoom(1 / ratio()));
   }
 
-  // Zoom by a factor so that the photo under a point of the stage stays there.
-  zoom(factor, at) {
-    const pane = this.paneAt(at);
-    const { x, y, scale } = this.view;
-    const [dx, dy] = at ? [at.x - pane.x - pane.width / 2, at.y - pane.y - pane.height / 2] : [0, 0];
-    const least = Math.min(this.fitting, 1 / this.ratio);
-    const next = Math.min(MOST_ZOOM / this.ratio, Math.max(least, scale * factor));
-    this.fitted = false;
-    this.set(x + dx / scale - dx / next, y + dy / scale - dy / next, next);
+  loaded() {
+    const ready = this.panes.every((pane) => pane.world.getItemAt(0)?.getFullyLoaded());
+    this.stage.setAttribute("aria-busy", String(!ready));
   }
 
-  pan(dx, dy) {
-    this.fitted = false;
-    this.set(this.view.x - dx / this.view.scale, this.view.y - dy / this.view.scale, this.view.scale);
+  get viewport() {
+    return this.leader.viewport;
   }
 
-  paneAt(at) {
-    const panes = this.panes;
-    const within = (pane) =>
-      at && at.x >= pane.x && at.x < pane.x + pane.width && at.y >= pane.y && at.y < pane.y + pane.height;
-    return panes.find(within) ?? panes[0];
+  get centre() {
+    return this.viewport.viewportToImageCoordinates(this.viewport.getCenter());
   }
 
   // The part of the photo that is seen, in whole photo pixels.
   get region() {
-    const [pane] = this.panes;
-    const { x, y, scale } = this.view;
-    const [halfX, halfY] = [pane.width / scale / 2, pane.height / scale / 2];
-    const left = Math.max(0, Math.floor(x - halfX));
-    const top = Math.max(0, Math.floor(y - halfY));
-    const right = Math.min(this.width, Math.ceil(x + halfX));
-    const bottom = Math.min(this.height, Math.ceil(y + halfY));
-    return { x: left, y: top, width: right - left, height: bottom - top };
+    const { x, y, width, height } = this.viewport.viewportToImageRectangle(this.viewport.getBounds());
+    const [left, top] = [Math.max(0, Math.floor(x)), Math.max(0, Math.floor(y))];
+    return { x: left, y: top, width: Math.min(this.width, Math.ceil(x + width)) - left, height: Math.min(this.height, Math.ceil(y + height)) - top };
+  }
+
+  fit() {
+    this.refit = false;
+    this.viewport.goHome(true);
+  }
+
+  // Go to a place in photo pixels, one of its pixels to one of the screen's.
+  goTo(x, y, zoom = 1) {
+    this.viewport.zoomTo(this.viewport.imageToViewportZoom(zoom / ratio()), null, true);
+    this.viewport.panTo(this.viewport.imageToViewportCoordinates(x, y), true);
+    this.viewport.applyConstraints(true);
+  }
+
+  zoom(factor) {
+    this.viewport.zoomBy(factor).applyConstraints();
+  }
+
+  pan(x, y) {
+    const far = Math.min(this.stage.clientWidth, this.stage.clientHeight) / 5;
+    this.viewport.panBy(this.viewport.deltaPointsFromPixels(new window.OpenSeadragon.Point(far * x, far * y))).applyConstraints();
   }
 
   setMode(mode) {
     this.mode = mode;
-    if (this.fitted) this.fit();
-    this.changed();
+    this.hold(false);
   }
 
   hold(on) {
-    if (this.held === on) return;
-    this.held = on;
-    this.changed();
+    this.root.dataset.shown = on || !this.hasAfter ? "before" : this.mode;
+    this.told();
+  }
+
+  // Lay a canvas over the corrected photo where it belongs, in photo pixels.
+  cover(canvas, { x, y, width, height }) {
+    const [, after] = this.panes;
+    const place = after.viewport.imageToViewportRectangle(x, y, width, height);
+    if (canvas.isConnected) after.updateOverlay(canvas, place);
+    else after.addOverlay(canvas, place);
   }
 
   onChange(listener) {
     this.listeners.add(listener);
   }
 
-  changed() {
-    this.handle.hidden = !this.hasAfter || this.shown !== "split"; // at once: the next key may be meant for it
-    this.redraw();
-    const percent = Math.round(this.view.scale * this.ratio * 100);
-    this.words.textContent = `${percent} %`;
+  told() {
     for (const listener of this.listeners) listener(this);
+  }
+
+  moved(pane) {
+    const { viewport } = this;
+    for (const other of this.panes.filter((each) => each !== this.leader && each.viewport)) {
+      other.viewport.zoomTo(viewport.getZoom(true), null, true);
+      other.viewport.panTo(viewport.getCenter(true), true);
+    }
+    if (pane !== this.leader) return;
+    if (this.refit) this.fit();
+    const scale = viewport.viewportToImageZoom(viewport.getZoom(true)) * ratio();
+    for (const pane of this.panes) pane.drawer?.setImageSmoothingEnabled(scale < 0.999);
+    this.root.classList.toggle("close", scale >= 0.999);
+    this.fitted = Math.abs(viewport.getZoom() / viewport.getHomeZoom() - 1) < 1e-3;
+    this.root.querySelector(".zoom-words").textContent = `${Math.round(scale * 100)} %`;
+    this.told();
     clearTimeout(this.noting);
     this.noting = setTimeout(() => {
-      const { x, y, scale } = this.view;
-      const at = this.fitted ? "" : `#at=${Math.round(x)},${Math.round(y)},${(scale * this.ratio).toFixed(2)}`;
+      const { x, y } = this.centre;
+      const at = this.fitted ? "" : `#at=${Math.round(x)},${Math.round(y)},${scale.toFixed(2)}`;
       history.replaceState(null, "", `${location.pathname}${location.search}${at}`);
     }, 300);
   }
 
   fromAddress() {
-    const match = /^#at=(\d+),(\d+),([\d.]+)$/.exec(location.hash);
-    if (!match) return false;
-    this.goTo(Number(match[1]), Number(match[2]), Number(match[3]) / this.ratio);
-    return true;
+    const [, ...place] = /^#at=(\d+),(\d+),([\d.]+)$/.exec(location.hash) ?? [];
+    if (place.length) this.goTo(...place.map(Number));
   }
+}
 
-  redraw() {
-    if (this.waiting) return;
-    this.waiting = true;
-    this.canvas.setAttribute("aria-busy", "true");
-    requestAnimationFrame(() => {
-      this.waiting = false;
-      this.draw();
-    });
-  }
+export function setUpViewer() {
+  const root = byId("viewer");
+  if (!root) return null;
+  const viewer = new Viewer(root);
+  for (const button of root.querySelectorAll("button")) button.disabled = false;
+  setUpTools(root, viewer);
+  setUpHold(root, viewer);
+  setUpSplit(root, viewer);
+  setUpPlaces(root, viewer);
+  return viewer;
+}
 
-  draw() {
-    const context = this.canvas.getContext("2d");
-    const { ratio } = this;
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    const shown = this.hasAfter ? this.shown : "before";
-    const panes = this.panes;
-    const pictures = [this.before, this.after].filter(Boolean);
-    for (const tiles of pictures) tiles.loading = false;
-    const split = shown === "split";
-    if (split) {
-      const [pane] = panes;
-      const at = pane.width * this.split;
-      this.drawPane(context, pane, "before", { ...pane, width: at });
-      this.drawPane(context, pane, "after", { ...pane, x: at, width: pane.width - at });
-      this.handle.style.left = `${at}px`;
-    } else if (shown === "side") {
-      this.drawPane(context, panes[0], "before", panes[0]);
-      this.drawPane(context, panes[1], "after", panes[1]);
-    } else this.drawPane(context, panes[0], shown, panes[0]);
-    this.handle.hidden = !split;
-    this.root.dataset.shown = shown;
-    this.root.classList.toggle("stacked", shown === "side" && panes[1].y > 0);
-    this.canvas.setAttribute("aria-busy", String(pictures.some(({ loading }) => loading)));
-  }
-
-  drawPane(context, pane, which, clip) {
-    context.save();
-    context.beginPath();
-    context.rect(clip.x, clip.y, clip.width, clip.height);
-    context.clip();
-    const tiles = which === "after" && this.after ? this.after : this.before;
-    tiles.draw(context, this.view, pane, this.ratio);
-    if (which === "after") {
-      context.translate(pane.x + pane.width / 2 - this.view.x * this.view.scale, pane.y + pane.height / 2 - this.view.y * this.view.scale);
-      context.scale(this.view.scale, this.view.scale);
-      for (const { image, x, y, width, height } of this.patches) context.drawImage(image, x, y, width, height);
-      this.overlay?.(context, this.view.scale);
-    }
-    context.restore();
-  }
-
-  listen() {
-    const { stage, handle } = this;
-    const at = (event) => {
-      const box = stage.getBoundingClientRect();
-      return { x: event.clientX - box.left, y: event.clientY - box.top };
-    };
-    stage.addEventListener("pointerdown", (event) => {
-      if (event.target === handle || event.button > 0) return;
-      stage.setPointerCapture(event.pointerId);
-      this.pointers.set(event.pointerId, at(event));
-    });
-    stage.addEventListener("pointermove", (event) => {
-      const before = this.pointers.get(event.pointerId);
-      if (!before) return;
-      const now = at(event);
-      const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, point]) => point);
-      if (others.length === 1) {
-        const [other] = others;
-        const apart = (point) => Math.max(8, Math.hypot(point.x - other.x, point.y - other.y));
-        this.zoom(apart(now) / apart(before), { x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 });
-        this.pan((now.x - before.x) / 2, (now.y - before.y) / 2);
-      } else this.pan(now.x - before.x, now.y - before.y);
-      this.pointers.set(event.pointerId, now);
-    });
-    for (const kind of ["pointerup", "pointercancel"])
-      stage.addEventListener(kind, (event) => this.pointers.delete(event.pointerId));
-    stage.addEventListener(
-      "wheel",
-      (event) => {
-        event.preventDefault();
-        this.zoom(STEP ** (-Math.sign(event.deltaY) * Math.min(2, Math.abs(event.deltaY) / 60 + 0.4)), at(event));
-      },
-      { passive: false },
-    );
-    stage.addEventListener("dblclick", (event) => {
-      if (this.view.scale * this.ratio > 0.99) this.fit();
-      else this.zoom(1 / this.ratio / this.view.scale, at(event));
-    });
-    const moveSplit = (share) => {
-      this.split = Math.min(0.98, Math.max(0.02, share));
-      handle.setAttribute("aria-valuenow", String(Math.round(this.split * 100)));
-      this.redraw();
-    };
-    handle.addEventListener("pointerdown", (event) => {
-      event.stopPropagation();
-      handle.setPointerCapture(event.pointerId);
-    });
-    handle.addEventListener("pointermove", (event) => {
-      if (handle.hasPointerCapture(event.pointerId)) moveSplit(at(event).x / stage.clientWidth);
-    });
-    handle.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: -0.02, ArrowRight: 0.02, ArrowDown: -0.02, ArrowUp: 0.02 }[event.key];
-      if (step === undefined) return;
-      event.preventDefault();
-      event.stopPropagation();
-      moveSplit(this.split + step);
-    });
-    this.canvas.addEventListener("keydown", (event) => this.key(event));
-  }
-
-  key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const far = Math.min(this.stage.clientWidth, this.stage.clientHeight) / 5;
-    const acts = {
-      ArrowLeft: () => this.pan(far, 0),
-      ArrowRight: () => this.pan(-far, 0),
-      ArrowUp: () => this.pan(0, far),
-      ArrowDown: () => this.pan(0, -far),
-      "+": () => this.zoom(STEP),
-      "=": () => this.zoom(STEP),
-      "-": () => this.zoom(1 / STEP),
-      0: () => this.fit(),
-      1: () => this.goTo(this.view.x, this.view.y),
-    };
-    if (!acts[event.key]) return;
+function setUpTools(root, viewer) {
+  const whole = root.querySelector('[data-act="window"]');
+  const fill = (on) => {
+    root.classList.toggle("whole", on);
+    document.documentElement.classList.toggle("covered", on);
+    whole.setAttribute("aria-pressed", String(on));
+    whole.textContent = on ? "Back to the page" : "Whole window";
+  };
+  const acts = {
+    in: () => viewer.zoom(1.5),
+    out: () => viewer.zoom(1 / 1.5),
+    fit: () => viewer.fit(),
+    one: () => viewer.goTo(viewer.centre.x, viewer.centre.y),
+    window: () => fill(!root.classList.contains("whole")),
+  };
+  const keys = {
+    ...{ ArrowLeft: () => viewer.pan(-1, 0), ArrowRight: () => viewer.pan(1, 0), ArrowUp: () => viewer.pan(0, -1), ArrowDown: () => viewer.pan(0, 1) },
+    ...{ "+": acts.in, "=": acts.in, "-": acts.out, 0: acts.fit, 1: acts.one },
+  };
+  for (const button of root.querySelectorAll("[data-act]")) button.addEventListener("click", () => acts[button.dataset.act]());
+  viewer.stage.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(".handle") || !keys[event.key]) return;
     event.preventDefault();
-    acts[event.key]();
+    keys[event.key]();
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && root.classList.contains("whole")) fill(false);
+  });
+  const modes = [...root.querySelectorAll("[data-mode]")];
+  const show = () => {
+    for (const button of modes) button.setAttribute("aria-pressed", String(button.dataset.mode === viewer.mode));
+    for (const part of root.querySelectorAll(".modes, .hold")) part.hidden = !viewer.hasAfter;
+    root.querySelector(".handle").hidden = root.dataset.shown !== "split";
+  };
+  for (const button of modes) button.addEventListener("click", () => viewer.setMode(button.dataset.mode));
+  viewer.onChange(show);
+  show();
+}
+
+function setUpHold(root, viewer) {
+  const button = root.querySelector(".hold");
+  const hold = (on) => {
+    viewer.hold(on);
+    button.setAttribute("aria-pressed", String(on));
+  };
+  button.addEventListener("pointerdown", (event) => {
+    button.setPointerCapture(event.pointerId);
+    hold(true);
+  });
+  for (const kind of ["pointerup", "pointercancel", "blur"]) button.addEventListener(kind, () => hold(false));
+  const typing = (target) => target.matches("input, select, textarea") && target.type !== "range";
+  const isKey = (event) =>
+    (event.key.toLowerCase() === "b" && !event.ctrlKey && !event.metaKey && !event.altKey && !typing(event.target)) ||
+    (event.target === button && (event.key === " " || event.key === "Enter"));
+  document.addEventListener("keydown", (event) => {
+    if (!isKey(event)) return;
+    event.preventDefault();
+    if (!event.repeat) hold(true);
+  });
+  document.addEventListener("keyup", (event) => isKey(event) && hold(false));
+  window.addEventListener("blur", () => hold(false));
+}
+
+function setUpSplit(root, { stage }) {
+  const handle = root.querySelector(".handle");
+  let split = 0.5;
+  const move = (share) => {
+    split = Math.min(0.98, Math.max(0.02, share));
+    handle.setAttribute("aria-valuenow", String(Math.round(split * 100)));
+    stage.style.setProperty("--split", `${split * 100}%`);
+  };
+  handle.addEventListener("pointerdown", (event) => handle.setPointerCapture(event.pointerId));
+  handle.addEventListener("pointermove", (event) => {
+    const { left, width } = stage.getBoundingClientRect();
+    if (handle.hasPointerCapture(event.pointerId)) move((event.clientX - left) / width);
+  });
+  handle.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -0.02, ArrowRight: 0.02, ArrowDown: -0.02, ArrowUp: 0.02 }[event.key];
+    if (step === undefined) return;
+    event.preventDefault();
+    move(split + step);
+  });
+}
+
+// Nine places of the picture as small crops, and a list of the worst ones: choosing one brings the view there, pixel by
+// pixel. A box shows as squares over the photo where checks held the correction back.
+function setUpPlaces(root, viewer) {
+  const places = [...document.querySelectorAll(".mosaic button, [data-x]")];
+  for (const place of places) {
+    const { row, col, x = col * viewer.width, y = row * viewer.height } = place.dataset;
+    place.disabled = false;
+    place.addEventListener("click", () => {
+      viewer.goTo(Number(x), Number(y));
+      root.scrollIntoView({ block: "start" });
+      for (const other of places) other.setAttribute("aria-pressed", String(other === place));
+    });
   }
+  const box = byId("show-held");
+  if (!box) return;
+  const { tiles, side, most } = JSON.parse(byId("held").textContent);
+  const canvas = Object.assign(document.createElement("canvas"), { width: viewer.width / OVERLAY, height: viewer.height / OVERLAY });
+  const context = canvas.getContext("2d");
+  for (const tile of tiles) {
+    context.fillStyle = `rgb(255 60 40 / ${0.12 + (0.5 * tile.held) / most})`;
+    context.fillRect(tile.x / OVERLAY, tile.y / OVERLAY, side / OVERLAY, side / OVERLAY);
+  }
+  box.disabled = false;
+  box.addEventListener("change", () => {
+    viewer.cover(canvas, { x: 0, y: 0, width: viewer.width, height: viewer.height });
+    canvas.hidden = !box.checked;
+  });
 }

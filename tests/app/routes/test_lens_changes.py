@@ -56,8 +56,11 @@ def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -
     one, two = (steps.counted(serial=serial) for serial in ("1", "2"))
     first, second = steps.lens_id(one), steps.lens_id(two)
 
-    merged = client.patch(f"/v1/lenses/{first}", json={"merge_into": second}).json()
+    asked = client.patch(f"/v1/lenses/{first}", json={"merge_into": second})
+    merged = client.patch(f"/v1/lenses/{first}", json={"merge_into": second, "any_lens": True}).json()
 
+    assert (asked.status_code, asked.json()["code"]) == (409, "other_lens")
+    assert "its serial number is 1, that of the lens 2" in asked.json()["detail"]
     assert (merged["id"], merged["photos"], merged["samples"]) == (second, 2, 12)
     assert client.get(f"/v1/lenses/{first}").status_code == 404
     assert steps.lens_id(one) == second
@@ -65,7 +68,7 @@ def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -
     busy = steps.receive()
     steps.inspect(busy, serial="3")
     third = steps.lens_id(busy)
-    refused = client.patch(f"/v1/lenses/{third}", json={"merge_into": second})
+    refused = client.patch(f"/v1/lenses/{third}", json={"merge_into": second, "any_lens": True})
     assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lab.traced.grid import GridLens
+from lab.traced import GridLens
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.measured.edges import SlantedEdges
@@ -130,7 +130,9 @@ def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: 
 def main() -> None:
     """Photograph the chart through a traced lens, measure it, and print T and S beside the truth."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("grid", type=Path, help="of a traced lens, as `python -m lab.traced make` writes it")
+    parser.add_argument(
+        "grid", type=Path, help="of a traced lens, as `python -m lab.population grid` writes it"
+    )
     asked = parser.parse_args()
     lens = GridLens.read(asked.grid)
     camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grids[0].pitch_um)

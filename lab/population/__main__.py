@@ -60,6 +60,7 @@ def _arguments() -> argparse.Namespace:
     grid.add_argument("design", nargs="+", choices=sorted(PRESCRIPTIONS), metavar="DESIGN")
     grid.add_argument("--copy", type=int, default=0, help="seed of the copy")
     grid.add_argument("--pitch", type=float, default=4.5, help="pixel pitch, micrometres")
+    grid.add_argument("--stopped", type=float, default=0.0, help="stops closed from wide open")
     publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
     publish.add_argument("weights", type=Path)
     publish.add_argument(
@@ -92,11 +93,13 @@ def _describe(asked: argparse.Namespace) -> None:
 
 
 def _grid(asked: argparse.Namespace) -> None:
+    asked.folder.mkdir(parents=True, exist_ok=True)
     for design in asked.design:
         lens = draw(np.random.default_rng([asked.copy, *design.encode()]), [design])
         lens = replace(lens, pitch_um=asked.pitch)
-        path = asked.folder / f"{design.replace('@', '-')}-f{lens.f_number:.2g}.npz"
-        grid_of(lens).write(path)
+        f_number = lens.f_number * 2.0 ** (asked.stopped / 2.0)
+        path = asked.folder / f"{design.replace('@', '-')}-f{f_number:.2g}.npz"
+        grid_of(lens, f_number).write(path)
         print(path, "held out" if design in HELD_OUT else "trained on")
 
 

@@ -1,7 +1,4 @@
-"""Grids of PSFs of traced lenses, so that the rest of the laboratory takes photos through them.
-
-The trace of `lab.traced` needs half a second a kernel and an extra; this takes seconds a lens.
-"""
+"""Grids of PSFs of traced lenses, so that the rest of the laboratory takes photos through them."""
 
 from __future__ import annotations
 
@@ -12,18 +9,22 @@ import numpy as np
 from lab.population.kernels import SIDE, WAVELENGTHS_UM, kernels_of
 from lab.population.prescriptions import PRESCRIPTIONS
 from lab.population.traced import TracedLens
-from lab.traced.grid import GridField
+from lab.traced import GridField
 
 _AT_ONCE: Final = 64  # places whose rays are traced together
 _INSIDE: Final = 1.001  # half diagonals: designs are traced no farther out than the corner
 
 
-def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField:
-    """Kernels of a traced lens at nodes of the field, wide open.
+def grid_of(
+    lens: TracedLens, f_number: float | None = None, *, step: float = 0.1, size: int = 55
+) -> GridField:
+    """Kernels of a traced lens at nodes of the field.
 
     Parameters
     ----------
     lens : TracedLens
+    f_number : float, optional
+        Wide open by default.
     step : float
         Distance of the nodes in half diagonals; it divides 1.
     size : int
@@ -40,13 +41,13 @@ def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField
     radius = np.hypot(right, up)
     inside = np.argwhere(radius <= _INSIDE)
     xy = np.stack([right[tuple(inside.T)], up[tuple(inside.T)]], -1)
-    parts = [kernels_of(lens, xy[i : i + _AT_ONCE]) for i in range(0, len(xy), _AT_ONCE)]
+    parts = [kernels_of(lens, xy[i : i + _AT_ONCE], f_number) for i in range(0, len(xy), _AT_ONCE)]
     margin = (SIDE - size) // 2
     cut = np.concatenate(parts)[:, :, margin : SIDE - margin, margin : SIDE - margin]
     cut = cut / cut.sum((-1, -2), keepdims=True)
     waves = np.array([wave for pair in WAVELENGTHS_UM.values() for wave in pair])
     shifts = np.concatenate(
-        [lens.lateral_um(xy[i : i + _AT_ONCE], waves) for i in range(0, len(xy), _AT_ONCE)]
+        [lens.lateral_um(xy[i : i + _AT_ONCE], waves, f_number) for i in range(0, len(xy), _AT_ONCE)]
     )
     of_colours = shifts.reshape(len(xy), 3, 2, 2).mean(2) / lens.pitch_um
     n = axis.size
@@ -61,7 +62,7 @@ def grid_of(lens: TracedLens, *, step: float = 0.1, size: int = 55) -> GridField
         "design": lens.design,
         "source": PRESCRIPTIONS[lens.design].source,
         "widest": lens.f_number,
-        "f_number": lens.f_number,
+        "f_number": f_number or lens.f_number,
         "focal_mm": lens.focal_mm,
         "pitch_um": lens.pitch_um,
         "half_diagonal_mm": lens.half_diagonal_mm,

@@ -10,7 +10,6 @@ their published focal length, or did not form an image, were left out; tests hol
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import dataclass
 from importlib.resources import files
@@ -19,8 +18,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.traced.patents import PATENTS
-from lab.traced.prescription import Design
 from lensmodel.core.errors import InvalidInputError
 
 Array = NDArray[np.float64]
@@ -31,9 +28,10 @@ D_UM: Final = 0.58756
 _F_UM, _C_UM, _G_UM = 0.48613, 0.65627, 0.43584
 
 LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
-"""Designs of `lab.traced` that development may see; its other four are held out."""
+"""Designs that development may see, whatever their place in the order."""
 
 _UNSEEN: Final = frozenset({"telephoto", "field-corrector", "aspheric", "noct"})
+"""Designs that are held out, whatever theirs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,28 +160,6 @@ def _parsed(row: dict[str, Any]) -> Prescription:
     )
 
 
-_PATENT_FOCAL: Final = {"tronnier": 50.3, "retrofocus": 35.4, "aspheric": 49.5, "noct": 59.6}
-
-
-def _of_design(design: Design) -> Prescription:
-    """A patent of `lab.traced`: its glasses are (n_d, V_d)."""
-    surfaces = design.surfaces
-    terms = max(len(s.asphere) for s in surfaces)
-    return Prescription(
-        design.name,
-        design.source,
-        _PATENT_FOCAL[design.name],
-        design.f_number,
-        design.half_field_deg,
-        np.array([0.0 if math.isinf(s.radius) else 1.0 / s.radius for s in surfaces]),
-        np.array([s.thickness for s in surfaces]),
-        np.array([s.conic for s in surfaces]),
-        np.array([[*s.asphere, *[0.0] * (terms - len(s.asphere))] for s in surfaces]),
-        np.array([_glass(s.glass) for s in surfaces]),
-        design.stop,
-    )
-
-
 def _glass(glass: Any) -> tuple[float, float, float]:  # noqa: ANN401 - a tuple of two or three, or a name
     if glass is None:
         return (1.0, 1.0, 0.0)
@@ -196,7 +172,7 @@ def _glass(glass: Any) -> tuple[float, float, float]:  # noqa: ANN401 - a tuple 
 
 def _read() -> dict[str, Prescription]:
     lines = files(__package__).joinpath("prescriptions.json").read_text(encoding="utf-8").splitlines()
-    read = [_parsed(json.loads(line)) for line in lines] + [_of_design(design) for design in PATENTS]
+    read = [_parsed(json.loads(line)) for line in lines]
     return {one.name: one for one in sorted(read, key=lambda one: one.name)}
 
 
@@ -210,7 +186,4 @@ PRESCRIPTIONS: Final = _read()
 """All designs by name, in sorted order."""
 
 HELD_OUT: Final = _held_out()
-"""Names of the designs that nothing may be trained on: every other patent or book page in sorted order.
-
-Designs of `lab.traced` keep to the half that they are in there.
-"""
+"""Names of the designs that nothing may be trained on: every other patent or book page in sorted order."""

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import lensmodel
+from lab import traced as stored
 from lab.code_version import version_of
 from lab.reproduce import programs
 from lab.reproduce.frames import Layout, content_of, layout_for, scene_files
-from lab.traced import GridLens, grid
+from lab.traced import GridLens
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import LensSettings
@@ -199,7 +200,7 @@ def key_of(case: Case, plan: Reproduction, code: str) -> str:
 def _lens_of(case: Case) -> tuple[object, ...]:
     lens = None
     if case.grid is not None:  # the file, and the code that answers between its nodes
-        lens = hashlib.sha256(case.grid.read_bytes() + Path(grid.__file__).read_bytes()).hexdigest()
+        lens = hashlib.sha256(case.grid.read_bytes() + Path(stored.__file__).read_bytes()).hexdigest()
     return (case.seed, case.focal_mm, case.aperture, case.height, case.width, lens)
 
 

@@ -17,7 +17,7 @@ from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
 
-DATA = Path(__file__).parents[2] / "lensmodel" / "data"
+DATA = Path(__file__).parents[1] / "lensmodel" / "data"
 GRIDS = sorted(DATA.glob("traced-*.npz"))
 
 

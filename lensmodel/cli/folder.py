@@ -27,7 +27,7 @@ from lensmodel.cli.console import Display, aligned, gain_words
 from lensmodel.core import processes
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
 from lensmodel.core.files import atomic
-from lensmodel.core.names import name_key, serial_key
+from lensmodel.core.names import camera_name, name_key, serial_key
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
@@ -426,7 +426,8 @@ class PhotoGroup:
     @property
     def camera(self) -> str:
         """The body in words."""
-        return self.shots[0].metadata.camera_model or "unknown camera"
+        said = self.shots[0].metadata
+        return camera_name(said.camera_maker, said.camera_model) or "unknown camera"
 
     @property
     def lens(self) -> str:

@@ -28,6 +28,7 @@ from lensmodel.cli.options import (
 )
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
+from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo import develop
@@ -144,17 +145,14 @@ def measured(
 
 def name_of(lens: Mapping[str, str]) -> str:
     """What to call a lens: its label, or maker and model without saying the maker twice."""
-    maker, model = lens.get("maker", ""), lens.get("model", "")
-    if model.casefold().startswith(maker.casefold()):
-        maker = ""
-    return lens.get("label") or f"{maker} {model}".strip()
+    return lens.get("label") or full_name(lens.get("maker"), lens.get("model"))
 
 
 def details_of(known: LensProfile) -> dict[str, str]:
     """What else stands on the page: copy, cameras, photos, the day, the program; and a caveat for JPEG."""
     names = sorted(known.photos.values())
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    cameras = (f"{c.maker or ''} {c.model or ''}".strip() for c in known.cameras)
+    cameras = (camera_name(c.maker, c.model) for c in known.cameras)
     jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in names)
     details = {
         "Serial number": str(known.lens.get("serial") or ""),

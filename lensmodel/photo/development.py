@@ -178,7 +178,18 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
         grain=_grain(planes, (noise[0], noise[1], noise[2]), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
         chroma_step=header.chroma_step,
-        remarks=("its transparency is dropped",) if transparent else (),
+        remarks=(*(("its transparency is dropped",) if transparent else ()), *_of_turning(info)),
+    )
+
+
+def _of_turning(info: PhotoInfo) -> tuple[str, ...]:
+    """Say that a program has turned a picture: sensors are wider than high."""
+    said = info.metadata
+    if info.height <= info.width or said.orientation != 1 or said.camera_model is None:
+        return ()
+    return (
+        "a program has turned its pixels upright, and nothing tells which way: what its lens does at the top "
+        "and at the sides may be mixed up",
     )
 
 

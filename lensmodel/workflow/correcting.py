@@ -9,6 +9,7 @@ from typing import Final
 
 from lensmodel import correction
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError, OutsideSupportError
+from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, ModelField
@@ -154,22 +155,15 @@ def _own_samples(
 def placed(developed: LinearPhoto, model: LensModel) -> LinearPhoto:
     """Count the places of a photo in the half diagonal of the largest frame that its lens was seen on.
 
-    A frame in crop mode is the middle of the sensor. Where the pixel pitch is unknown the photo is taken for
-    a whole frame, and that is told where its size is another.
+    A frame in crop mode is the middle of the sensor. Where a pixel pitch is unknown, only a photo of a size
+    that the lens was seen on can be placed.
     """
     frame, info = developed.frame, developed.info
     pitch, circle = info.metadata.pixel_pitch_um, circle_mm(model.samples)
-    if circle is None or frame.circle_px is not None:
+    if frame.circle_px is not None:
         return developed
-    if pitch is None:
-        pixels = {round(sample.half_diagonal_px) for sample in model.samples if sample.half_diagonal_px}
-        if pixels and not any(abs(frame.half_diagonal / size - 1.0) < ALIKE for size in pixels):
-            remarks_log.warning(
-                "its pixel pitch is unknown: %d x %d pixels are taken for the whole frame of %.1f mm",
-                frame.width,
-                frame.height,
-                2.0 * circle,
-            )
+    if pitch is None or circle is None:
+        _require_known_size(frame, model)
         return developed
     own = frame.half_diagonal * pitch / 1000.0
     sizes = f"{2.0 * own:.1f} mm diagonal, and its lens is known on a frame of {2.0 * circle:.1f} mm"
@@ -184,4 +178,16 @@ def placed(developed: LinearPhoto, model: LensModel) -> LinearPhoto:
         raise OutsideSupportError(
             f"it was cut to {sizes}: nobody can tell from which part; correct the whole photo, then cut it"
         )
+    remarks_log.info("it is taken for the middle of the frame: it has %s", sizes)
     return dataclasses.replace(developed, frame=dataclasses.replace(frame, circle_px=circle * 1000.0 / pitch))
+
+
+def _require_known_size(frame: Frame, model: LensModel) -> None:
+    """Refuse a photo that may be a crop, or scaled down, where nothing tells."""
+    known = sorted({round(2.0 * s.half_diagonal_px) for s in model.samples if s.half_diagonal_px})
+    if known and not any(abs(2.0 * frame.half_diagonal / size - 1.0) < ALIKE for size in known):
+        raise OutsideSupportError(
+            f"its {frame.width} x {frame.height} pixels have a diagonal of {2.0 * frame.half_diagonal:.0f} "
+            f"pixels, and its lens is known on {' and '.join(map(str, known))}: nothing tells whether it was "
+            "cut or scaled; give the photo as the camera wrote it"
+        )

@@ -497,7 +497,7 @@ REFUSED = {
     "no such size": (
         ["reproduce", "--size", "huge"],
         2,
-        "--size must be quick, small, default or full, got 'huge'",
+        "--size must be quick or default, got 'huge'",
     ),
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),

@@ -141,15 +141,43 @@ def test_what_a_program_cut_is_refused_by_both_sizes() -> None:
         placed(developed_of(CROPPED, kind="jpeg", centred=False), model)
 
 
-def test_a_photo_of_unknown_pitch_is_taken_for_a_whole_frame_and_that_is_told(
-    caplog: pytest.LogCaptureFixture,
+@pytest.mark.parametrize("of_photo", [PITCH, None])
+@pytest.mark.parametrize("of_lens", [PITCH, None])
+def test_a_photo_of_unknown_pitch_is_placed_by_its_size_alone(
+    of_photo: float | None, of_lens: float | None
 ) -> None:
-    model = LensModel.fit(samples_on(WHOLE))
+    samples = [replace(sample, pixel_pitch_um=of_lens) for sample in samples_on(WHOLE)]
+    model = LensModel.fit(samples)
 
-    assert placed(developed_of(WHOLE, None), model).frame == WHOLE
-    assert caplog.text == ""
-    assert placed(developed_of(CROPPED, None), model).frame == CROPPED
-    assert "480 x 320 pixels are taken for the whole frame of 5.2 mm" in caplog.text
+    assert placed(developed_of(WHOLE, of_photo), model).frame == WHOLE
+    if of_photo is None or of_lens is None:
+        with pytest.raises(OutsideSupportError, match=r"480 x 320 .* 577 pixels.* known on 865"):
+            placed(developed_of(CROPPED, of_photo), model)
+    else:
+        assert placed(developed_of(CROPPED, of_photo), model).frame.circle_px is not None
+
+
+@pytest.mark.parametrize(
+    ("rows", "cols", "orientation", "turned"),
+    [
+        (300, 200, 1, True),
+        (300, 200, 6, False),
+        (200, 300, 1, False),
+        (200, 200, 1, False),
+    ],
+)
+def test_a_picture_whose_pixels_were_turned_by_a_program_says_so(
+    rows: int, cols: int, orientation: int, turned: bool, tmp_path: Path
+) -> None:
+    block = Image.Exif()
+    block[0x0110], block[0x0112] = "T-1", orientation
+    pixels = np.random.default_rng(0).integers(0, 255, (rows, cols, 3), dtype=np.uint8)
+    for name in ("x.jpg", "x.tif", "x.png"):
+        Image.fromarray(pixels).save(tmp_path / name, exif=block)
+
+        remarks = photo.develop(tmp_path / name).remarks
+
+        assert any("turned its pixels" in remark for remark in remarks) == turned
 
 
 def test_lateral_colour_in_another_unit_displaces_the_same_pixels_alike() -> None:

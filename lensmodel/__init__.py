@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from lensmodel.api import calibrate, correct
     from lensmodel.blind import PsfEstimate, PsfEstimator, estimators
     from lensmodel.core.errors import CancelledError, LensModelError
+    from lensmodel.core.geometry import field_grid
     from lensmodel.core.psf import PsfSample
     from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
     from lensmodel.correction import Bounds, Corrected, Deconvolver, Restored, Sensor, deconvolvers
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.arrays import photo_from_array
-    from lensmodel.workflow.lens import Lens, field_grid
+    from lensmodel.workflow.lens import Lens
     from lensmodel.workflow.sampling import CalibrationEvent
 
 __all__ = [
@@ -73,9 +74,10 @@ _HOMES: Final = {
     "lensmodel.patches": ("Selector", "selectors"),
     "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
     "lensmodel.core.errors": ("CancelledError", "LensModelError"),
-    "lensmodel.workflow.lens": ("Lens", "field_grid"),
+    "lensmodel.workflow.lens": ("Lens",),
     "lensmodel.photo": ("LinearPhoto", "develop"),
     "lensmodel.workflow.sampling": ("CalibrationEvent",),
+    "lensmodel.core.geometry": ("field_grid",),
     "lensmodel.core.psf": ("PsfSample",),
     "lensmodel.model": ("ModelSettings", "PsfAnswer"),
     "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel"),

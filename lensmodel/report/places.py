@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R
+from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, field_grid
 from lensmodel.core.types import FieldPosition
 
 DEFAULT_ASPECT: Final = 1.5
@@ -45,14 +45,8 @@ def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     """Centres of rows x cols equal cells of the picture, row by row from the top left."""
     if not (1 <= rows <= 100 and 1 <= cols <= 100):
         raise InvalidInputError(f"a grid has 1..100 rows and columns, got {rows} x {cols}")
-    width, height = half_sides(aspect)
-    places = []
-    for i in range(rows):
-        y = height * (1.0 - (2 * i + 1) / rows)
-        for j in range(cols):
-            x = width * ((2 * j + 1) / cols - 1.0)
-            places.append(FieldPosition(min(math.hypot(x, y), 1.0), math.atan2(y, x)))
-    return tuple(places)
+    r, phi = field_grid(rows, cols, aspect=aspect)
+    return tuple(FieldPosition(float(a), float(b)) for a, b in zip(r.ravel(), phi.ravel(), strict=True))
 
 
 def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:

@@ -180,6 +180,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
 def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Correct the photo in `developed` with the samples in the folder; write the result there.
 
+    A compressed photo that would gain nothing to be seen is left as it is, which some of its cells tell soon.
     The photo's own samples join them, unless they are there already: `photo` is what they are called.
     """
     _log_compiling()
@@ -203,6 +204,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         layers=extremes if arguments.get("layers") else (),
         lateral=lateral,
         roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
+        least_gain_db=correcting.SEEN_DB if developed.lossy and roi is None else None,
         workers=arguments["workers"],
         on_step=progress,
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Final
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Final
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query
@@ -17,12 +18,15 @@ from app.pages.rendering import page
 from app.routes import lenses as lens_routes
 from app.routes.common import find_lens
 from app.routes.lens_reports import stored_report
-from app.schemas import Aperture, PhotoOut
+from app.schemas import Aperture, CalibrationOut, PhotoOut
 from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.types import FieldPosition
+from lensmodel.core.types import ZONES, FieldPosition
 from lensmodel.report import LensReport, Side, Unit, compare
 from lensmodel.report.documents import place_table
+
+if TYPE_CHECKING:
+    from lensmodel.report.plots import Chart
 
 SHOWN_VERSIONS: Final = 200
 """Versions of the history on the page (chosen): the newest of them."""
@@ -83,7 +87,7 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
         lens=lens,
         counting=shown.counting(call, lens_id),
         history=history,
-        curve=sum(bool(event.error) for event in history) > 1,  # one point is no curve
+        curve=_error_history(history),
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         coverage=words.coverage_bars(newest),
@@ -151,6 +155,17 @@ def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, A
         "charts": charts(test, aperture, unit),
         "table": place_table(test),
     }
+
+
+def _error_history(history: Sequence[CalibrationOut]) -> Chart | None:
+    """Draw the errors of versions that were measured; None where one point would be no curve."""
+    from lensmodel.report.plots import error_history  # noqa: PLC0415 - as above
+
+    measured = [(event.version, event.error) for event in history if isinstance(event.error, Mapping)]
+    if len(measured) < 2:
+        return None
+    errors = {zone: [error.get(zone) for _, error in measured] for zone in ZONES}
+    return error_history([version for version, _ in measured], errors)
 
 
 def _test(call: Call, lens: LensRow) -> LensReport | None:

@@ -23,6 +23,7 @@ from app.schemas import CorrectionIn, Id, PhotoOut, Region
 from app.store.corrections import run_folder
 from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
+from lensmodel.workflow.correcting import SEEN_DB
 
 NAMES: Final = (
     *("upper left", "upper middle", "upper right"),
@@ -76,6 +77,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         corrections=corrections,
         done=done,
         nothing=words.nothing_words(row.kind),
+        least=SEEN_DB,
         tiles=f"/ui/photos/{photo_id}/tiles" if done is None else f"/ui/corrections/{done.id}/tiles",
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

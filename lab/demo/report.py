@@ -21,11 +21,11 @@ from lensmodel.core.files import write_atomically
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import distance
 from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
-from lensmodel.quality.images import Picture, crop_boxes
+from lensmodel.quality.images import Picture
 from lensmodel.simulate import edge_chart
 
 _JUDGED: Final[tuple[Zone, ...]] = ("center", "corner")
-_GAP, _LABEL = 6, 18  # pixels between crops and above them: a line of text fits (chosen)
+_GAP = 6  # pixels between crops (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,21 +148,38 @@ def sharpness(planes: Planes) -> dict[Zone, Sharpness]:
     return {zone: Sharpness(row.mtf50, row.mtf_max, row.overshoot) for zone, row in by_zone.items()}
 
 
-def draw_crops(rows: Mapping[str, Picture], path: Path, *, side: int = 220) -> None:
-    """Write a PNG with one row of five 1:1 crops for each picture, labelled."""
-    pictures = list(rows.items())
-    height, width = pictures[0][1].shape[:2]
-    boxes = crop_boxes(height, width, side)
-    size = (len(boxes) * (side + _GAP) + _GAP, len(pictures) * (side + _LABEL + _GAP) + _GAP)
-    sheet = Image.new("RGB", size, "#202124")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default()
+def draw_crops(rows: Mapping[str, Picture], path: Path, *, side: int = 180) -> None:
+    """Write a PNG with one row of crops for each picture, two screen pixels for one of its own.
+
+    They are where the last picture has most detail: in each third of the width.
+    """
+    pictures, large = list(rows.items()), 2 * side
+    places = _detailed(pictures[-1][1], side)
+    size = (len(places) * (large + _GAP) + _GAP, len(pictures) * (large + _GAP) + _GAP)
+    sheet = Image.new("RGB", size, "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(18)
     for i, (label, picture) in enumerate(pictures):
-        top = _GAP + i * (side + _LABEL + _GAP)
-        for j, (place, (row, col)) in enumerate(boxes.items()):
-            left = _GAP + j * (side + _GAP)
-            draw.text((left + 2, top + 3), f"{label}, {place}", fill="#e8eaed", font=font)
-            sheet.paste(Image.fromarray(picture[row : row + side, col : col + side]), (left, top + _LABEL))
+        top = _GAP + i * (large + _GAP)
+        for j, (row, col) in enumerate(places):
+            crop = Image.fromarray(picture[row : row + side, col : col + side])
+            sheet.paste(
+                crop.resize((large, large), Image.Resampling.NEAREST), (_GAP + j * (large + _GAP), top)
+            )
+        draw.rectangle((_GAP, top, _GAP + 20 + draw.textlength(label, font), top + 30), "#000c")
+        draw.text((_GAP + 10, top + 4), label, "white", font)
     sheet.save(path, optimize=True)
+
+
+def _detailed(picture: Picture, side: int) -> list[tuple[int, int]]:
+    """Top left corners of the windows with the steepest steps, one in each third of the width."""
+    grey = picture.mean(axis=2)
+    steep = np.abs(np.diff(grey, axis=0))[:, :-1] + np.abs(np.diff(grey, axis=1))[:-1]
+    sums = np.pad(steep.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    width = grey.shape[1]
+    thirds = [inside[:, k * width // 3 : (k + 1) * width // 3 - side] for k in range(3)]
+    found = [np.unravel_index(third.argmax(), third.shape) for third in thirds]
+    return [(int(row), int(col) + k * width // 3) for k, (row, col) in enumerate(found)]
 
 
 def draw_history(errors: Sequence[Mapping[Zone, float]], path: Path) -> None:

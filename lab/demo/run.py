@@ -80,11 +80,7 @@ def _simulated(
     say(f"Correcting {camera.HELD_OUT} as a picture to look at")
     shutil.copy(corrected(client, held_out, work, say), output / "corrected.tif")
     gain = camera.CAMERA.white_balance
-    rows = {
-        "as photographed": as_shown(before, gain),
-        "corrected": as_shown(after, gain),
-        "the scene itself": as_shown(truth.sharp, gain),
-    }
+    rows = {"as photographed": as_shown(before, gain), "corrected": as_shown(after, gain)}
     report.draw_crops(rows, output / "before-after.png")
     aperture = client.lens(lens_id).apertures[0]
     (output / "psf-field.png").write_bytes(client.field_png(lens_id, aperture=aperture))

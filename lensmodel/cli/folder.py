@@ -33,15 +33,12 @@ from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.calibrating import Identity
+from lensmodel.workflow.correcting import SEEN_DB
 from lensmodel.workflow.lens import Lens
 
 LEARN_FROM: Final = 8
 """Photos that a group is learned from: five are the advice (docs/guide.md), three more for other
 apertures (chosen); each takes about a minute."""
-
-SEEN_DB: Final = 0.3
-"""Expected gain of a photo below which it is left as it is (chosen): at 0.2 dB nobody saw a difference in
-photos enlarged three times."""
 
 _UNSURE: Final = 0.5
 """Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)."""

@@ -6,7 +6,7 @@ import base64
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,7 @@ import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
-from lensmodel.core.types import Channel
+from lensmodel.core.types import Channel, Zone
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
@@ -56,7 +56,7 @@ _UNITS: Final[dict[Unit, str]] = {
     "lp/mm": "line pairs per mm",
 }
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
-_LETTERS: Final = 80  # of a legend beside each other (chosen: they fit below a chart)
+_LETTERS: Final = 34  # of a legend beside each other (chosen: they fit in what a phone shows of a chart)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
 _A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
@@ -105,6 +105,22 @@ def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> l
 def comparison_charts(comparison: Comparison) -> list[Chart]:
     """Contrast of both at the lowest and the highest frequency they share, and the map of the difference."""
     return [_chart(panel) for panel in _compared(comparison)]
+
+
+def error_history(versions: Sequence[int], errors: Mapping[Zone, Sequence[float | None]]) -> Chart:
+    """Draw how the expected error of a lens fell from version to version, in each zone."""
+
+    def draw(ax: Axes) -> None:
+        for ink, (zone, shares) in zip(_INKS, errors.items(), strict=False):
+            ax.plot(
+                versions, [math.nan if e is None else 100.0 * e for e in shares], "o-", color=ink, label=zone
+            )
+        ax.set(xlabel="version of the lens", ylabel="error, %")
+        ax.set_ylim(bottom=0.0)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        _legend(ax)
+
+    return _chart(("Error after each version", _on(draw)))
 
 
 def pages(report: LensReport) -> list[Figure]:

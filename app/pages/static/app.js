@@ -2,8 +2,8 @@
 
 import { setUpBatch } from "./batch.js";
 import { setUpForms, setUpGroups } from "./forms.js";
-import { setUpCharts, setUpField, setUpHistory, setUpLensActions } from "./lens.js";
-import { keepFocus, setUpLive } from "./live.js";
+import { setUpCharts, setUpField, setUpLensActions } from "./lens.js";
+import { keepPlace, setUpLive } from "./live.js";
 import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
@@ -19,14 +19,13 @@ const parts = [
   setUpField,
   setUpCharts,
   setUpLensActions,
-  setUpHistory,
   setUpPhoto,
   setUpMeasure,
   setUpSignIn,
   setUpSignOut,
   () => setUpPreview(setUpViewer()),
   setUpLive,
-  keepFocus,
+  keepPlace,
 ];
 for (const setUp of parts) {
   try {

@@ -1,13 +1,8 @@
-// The lens: its map of blur, the blur at a point, and how its error fell.
+// The lens: its map of blur, the blur at a point, its charts, and what is done with it.
 
 import { acting, ask, byId, confirmed, send, withItsLens } from "./common.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
-const ZONES = [
-  ["center", "Centre", []],
-  ["mid", "Middle", [8, 4]],
-  ["corner", "Corners", [2, 3]],
-];
 
 // Brightness as the square root of light, as the map has it: faint tails stay visible.
 function draw(canvas, rows) {
@@ -230,55 +225,4 @@ export function setUpLensActions() {
       const question = `Go back to version ${version}? Photos that joined later are left out; they stay and can be counted again.`;
       return (await confirmed(question, "Go back")) && send("PATCH", `/v1/lenses/${back.dataset.lens}`, { back_to: version }).then(() => true);
     }, byId("back-alert"));
-}
-
-function plot(holder, events) {
-  const style = getComputedStyle(document.documentElement);
-  const probe = document.createElement("i");
-  document.body.append(probe);
-  // colours are written as light-dark(): let the browser say which one holds
-  const colour = (name) => ((probe.style.color = `var(--${name})`), getComputedStyle(probe).color);
-  const font = `14px ${style.fontFamily}`;
-  const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { show: false }, font, labelFont: font };
-  const share = (event, zone) => (typeof event.error === "object" ? (event.error?.[zone] ?? null) : event.error);
-  const of = (event, zone) => (share(event, zone) === null ? null : 100 * share(event, zone)); // in percent
-  const options = {
-    width: holder.clientWidth - 16,
-    height: 280,
-    legend: { live: false },
-    scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(10, most * 1.1)] } },
-    axes: [
-      { ...axis, label: "version of the lens", size: 34, labelSize: 26, incrs: [1, 2, 5, 10, 20, 50] },
-      { ...axis, label: "error, %", size: 60 },
-    ],
-    series: [
-      { label: "Version" },
-      ...ZONES.map(([zone, label, dash]) => ({ label, stroke: colour(zone), width: 2.5, dash, points: { show: true, size: 7, fill: colour(zone) } })),
-    ],
-  };
-  const data = [events.map((event) => event.version), ...ZONES.map(([zone]) => events.map((event) => of(event, zone)))];
-  probe.remove();
-  holder.replaceChildren();
-  const made = new window.uPlot(options, data, holder);
-  new ResizeObserver(() => made.setSize({ width: holder.clientWidth - 16, height: 280 })).observe(holder);
-  return made;
-}
-
-export async function setUpHistory() {
-  const holder = byId("history");
-  if (!holder) return;
-  const all = [];
-  for (let next = `/v1/lenses/${holder.dataset.lens}/calibrations`; next; ) {
-    const response = await fetch(next);
-    if (!response.ok) return;
-    const page = await response.json();
-    all.push(...page.items);
-    next = page.next;
-  }
-  const events = all.filter(({ error }) => (typeof error === "object" ? Object.keys(error ?? {}).length : true));
-  const made = plot(holder, events);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    made.destroy();
-    plot(holder, events);
-  });
 }

@@ -29,13 +29,14 @@ export function setUpLive() {
   document.addEventListener("visibilitychange", refresh);
 }
 
-// A page that is loaded again has the focus where it was, also on what has taken the place of a button.
-export function keepFocus() {
-  window.addEventListener("pagehide", () => sessionStorage.setItem("focus", document.activeElement?.id ?? ""));
+// A page that is loaded again has open what was open, and the focus where it was, also on what has taken its place.
+export function keepPlace() {
+  window.addEventListener("pagehide", () => {
+    const open = [...document.querySelectorAll("details[open] > summary")].map(({ textContent }) => textContent);
+    sessionStorage.setItem("place", JSON.stringify({ open, focus: document.activeElement?.id }));
+  });
   if (performance.getEntriesByType("navigation")[0]?.type !== "reload") return;
-  const name = sessionStorage.getItem("focus");
-  if (!name) return;
-  const at = byId(name) ?? byId("main");
-  for (let part = at.closest("details"); part; part = part.parentElement.closest("details")) part.open = true;
-  at.focus({ preventScroll: true });
+  const { open = [], focus } = JSON.parse(sessionStorage.getItem("place") ?? "{}");
+  for (const summary of document.querySelectorAll("details > summary")) summary.parentElement.open ||= open.includes(summary.textContent);
+  if (focus) (byId(focus) ?? byId("main")).focus({ preventScroll: true });
 }

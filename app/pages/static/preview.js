@@ -6,7 +6,6 @@ import { ask, byId, send } from "./common.js";
 const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
 const PAUSE_MS = 500;
 const SOON = [800, 600]; // pixels of what is seen first: about a second of work
-const LEAST = 0.3; // decibels: less gain is not seen, not at three times the size either
 const WORKING = "Working out what a correction does here …";
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
   const value = code / 255;
@@ -96,7 +95,7 @@ export function setUpPreview(viewer) {
         if (signal.aborted) return;
         part = made;
         show();
-        if (made.gain < LEAST) words.textContent = form.dataset.nothing;
+        if (made.gain < Number(form.dataset.least)) words.textContent = form.dataset.nothing;
         else if (step !== steps.at(-1)) words.textContent = "A quick first look; the better one is being made …";
         else words.textContent = seenWhole() ? "This is what you get. Sliders under More change it." : "The lower right shows what you get. Zoom in to see it elsewhere.";
         if (!made.gain) return;

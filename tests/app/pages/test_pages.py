@@ -387,28 +387,6 @@ def test_a_lens_shows_where_photos_had_detail_and_its_versions(page: Page, learn
     expect(page.locator("section[aria-labelledby=coverage-title] .zones li")).to_have_count(3)
 
 
-def test_two_measured_versions_make_a_curve(page: Page, learned: dict[str, Any]) -> None:
-    errors = [{}, {"center": 0.2, "mid": 0.3, "corner": 0.4}, {"center": 0.1, "mid": 0.2, "corner": 0.3}]
-    items = [{"version": k, "error": error} for k, error in enumerate(errors, start=1)]
-    page.route("**/calibrations", lambda route: route.fulfill(json={"items": items, "next": None}))
-
-    def with_a_place(route: Route) -> None:  # its versions may be measured both at once
-        answer = route.fetch()
-        body = answer.text()
-        script = '<script src="/static/vendor/uplot.min.js" defer></script>'
-        if 'id="history"' not in body:
-            body = body.replace("</head>", f"{script}</head>")
-            place = f'<div id="history" class="plot" data-lens="{learned["lens_id"]}"></div>'
-            body = body.replace("<details><summary>All versions", f"{place}<details><summary>All versions")
-        route.fulfill(response=answer, body=body)
-
-    page.route(f"**/lenses/{learned['lens_id']}/tests", with_a_place)
-    page.goto(f"/lenses/{learned['lens_id']}/tests")
-
-    expect(page.locator("#history canvas")).to_be_visible()
-    expect(page.locator("#history .u-legend")).to_contain_text("Corners")
-
-
 def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(
     page: Page, service: Service, tmp_path: Path
 ) -> None:
@@ -662,8 +640,8 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_label("Name", exact=True).fill("My first")
     page.get_by_role("button", name="Rename").click()
     expect(page.locator("h1")).to_have_text("My first")
+    expect(page.get_by_role("button", name="Rename")).to_be_focused()  # and what was open is open
 
-    page.get_by_text("Rename, merge").click()
     page.get_by_label("It is the same copy as").select_option(made[1])
     page.get_by_role("button", name="Merge into it").click()
     page.get_by_role("button", name="Cancel").click()
@@ -724,6 +702,14 @@ def test_a_page_does_not_go_while_somebody_is_asked(page: Page, learned: dict[st
     with page.expect_navigation():
         page.get_by_role("button", name="Cancel").click()
     assert not page.evaluate("window.first")
+
+
+def test_the_focus_stays_where_a_button_was(page: Page, service: Service, tmp_path: Path) -> None:
+    photo = service.calibrated(write_photo(tmp_path / "focus.dng", 63, serial="F-1", shape=SMALL))
+    page.goto(f"/photos/{photo['id']}")
+    page.get_by_role("button", name="Leave it out of the lens").click()
+
+    expect(page.get_by_role("button", name="Use it again")).to_be_focused()
 
 
 def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> None:

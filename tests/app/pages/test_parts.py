@@ -20,6 +20,7 @@ from app.blobs.storage import Storage
 from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
 from app.jobs.inspection import body_key
+from app.jobs.sample_files import write_samples
 from app.jobs.task_files import R_MAP, SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.batch import unused_name
@@ -31,7 +32,8 @@ from app.store import LensName, Store
 from app.store.corrections import Result
 from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
-from lensmodel.core.types import ignore_step
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
 
@@ -202,6 +204,44 @@ def test_a_jpeg_without_gain_says_so_in_one_sentence_with_the_reason(
     assert said[1].startswith("Nothing to correct here. The camera has sharpened and compressed this JPEG")
     assert said[1].count(". ") == 1
     assert '<option value="jpeg" selected>' in page
+
+
+@pytest.mark.parametrize(("ending", "left"), [(".jpg", True), (".png", False)])
+def test_a_jpeg_that_would_gain_nothing_is_left_soon(tmp_path: Path, ending: str, left: bool) -> None:
+    scene = np.random.default_rng(2).integers(0, 255, (30, 40, 3), dtype=np.uint8).repeat(24, 0).repeat(24, 1)
+    Image.fromarray(scene).save(tmp_path / f"p{ending}", quality=92)
+    developed, folder = tmp_path / "developed", tmp_path / "work"
+    for made in (developed, folder):
+        made.mkdir()
+    tasks.develop({"path": str(tmp_path / f"p{ending}"), "max_megapixels": 1.0}, developed, ignore_step)
+    places = [(0.1 + 0.15 * k, 1.1 * k - 3.0) for k in range(6)]
+    kernel = gaussian(15, 0.3**2 * np.eye(2))  # a lens without fault
+    samples = [
+        PsfSample(kernel, FieldPosition(*place), LensSettings(channel=channel), estimator="default/1")
+        for place in places
+        for channel in CHANNELS
+    ]
+    write_samples(folder, samples)
+    wish = {
+        "developed": str(developed),
+        "photo": "p",
+        "mode": "default",
+        "lateral": None,
+        "method": "fast",
+        "settings": {"aperture": None, "focal_mm": None, "focus_m": None},
+        "strength": 1.0,
+        "bounds": {},
+        "output": {"format": "png8", "color_space": "srgb", "quality": 90},
+        "roi": None,
+        "workers": 1,
+        "description": "",
+    }
+    steps: list[int] = []
+
+    done = tasks.correct(wish, folder, lambda step, _: steps.append(step))
+
+    assert done["report"]["nothing_to_correct"] == left
+    assert bool(steps) != left  # no cell after those that tell
 
 
 def test_corrections_are_followed_and_fetched_together(client: TestClient, corrected: dict[str, Any]) -> None:
@@ -381,6 +421,17 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
 
     assert "<td>202</td>" in page
     assert "77 places" in page
+
+
+def test_two_measured_versions_make_a_curve(client: TestClient, steps: Steps, store: Store) -> None:
+    lens = steps.lens_id(steps.counted())
+    steps.counted()
+    curves = []
+    for version, error in ((1, 0.4), (2, 0.2)):
+        store.lenses.record_metrics(lens, version, {"error": {"center": error, "corner": None}})
+        curves.append('alt="Error after each version"' in client.get(f"/lenses/{lens}/tests").text)
+
+    assert curves == [False, True]
 
 
 def test_the_page_of_a_lens_says_which_model_it_has(client: TestClient, steps: Steps) -> None:

@@ -45,12 +45,12 @@ def all_pairs(
     t = np.arange(size, dtype=np.float64) - size // 2
     u, v = (a.ravel() for a in pixel_to_local(t[:, None], t[None, :], position.phi))
     above, below = np.zeros(u.size), np.zeros(u.size)
-    for sample, vote in zip(samples, _votes(samples, position, settings, widths), strict=True):
+    for sample, weight in zip(samples, _weights(samples, position, settings, widths), strict=True):
         kernel = np.pad(sample.kernel, PAD)
         p = np.arange(kernel.shape[0], dtype=np.float64) - kernel.shape[0] // 2
         pu, pv = (a.ravel() for a in pixel_to_local(p[:, None], p[None, :], sample.position.phi))
         squared = (u[:, None] - pu) ** 2 + (v[:, None] - pv) ** 2
-        near = vote * np.exp(-0.5 * squared / pixel**2)
+        near = weight * np.exp(-0.5 * squared / pixel**2)
         above += near @ kernel.ravel()
         below += near.sum(axis=1)
     return (above / below).reshape(size, size)
@@ -69,14 +69,14 @@ def factorised(
     t = np.arange(size, dtype=np.float64) - size // 2
     u, v = pixel_to_local(t[:, None], t[None, :], position.phi)
     above, below = np.zeros((size, size)), np.zeros((size, size))
-    for sample, vote in zip(samples, _votes(samples, position, settings, widths), strict=True):
+    for sample, weight in zip(samples, _weights(samples, position, settings, widths), strict=True):
         kernel = np.pad(sample.kernel, PAD)
         p = np.arange(kernel.shape[0], dtype=np.float64) - kernel.shape[0] // 2
         drow, dcol = local_to_pixel(u, v, sample.position.phi)
         rows = np.exp(-0.5 * ((drow[..., None] - p) / pixel) ** 2)
         cols = np.exp(-0.5 * ((dcol[..., None] - p) / pixel) ** 2)
-        above += vote * ((rows @ kernel) * cols).sum(axis=-1)
-        below += vote * rows.sum(axis=-1) * cols.sum(axis=-1)
+        above += weight * ((rows @ kernel) * cols).sum(axis=-1)
+        below += weight * rows.sum(axis=-1) * cols.sum(axis=-1)
     return above / below
 
 
@@ -129,7 +129,7 @@ class PaperModel:
         return self.kernel_at_settings(position, LensSettings(channel=channel), size)
 
 
-def _votes(
+def _weights(
     samples: Sequence[PsfSample],
     position: FieldPosition,
     settings: LensSettings,

@@ -69,7 +69,7 @@ class CorrectionJob:
     bounds: Bounds
     cell_factor: int
     audited: bool
-    plain: bool
+    unguarded: bool
     stored: StoredColour | None
     layers: tuple[Bounds, ...] = ()
 
@@ -201,10 +201,10 @@ def _within(
     plans = plan(cell, tile.photo, tile.posteriors, tile.offsets, sensors, SHARE * bounds.texture)
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
-    if job.strength == 0.0 or not (worth or job.plain):
+    if job.strength == 0.0 or not (worth or job.unguarded):
         return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), None, left=True)
-    blurs, solution = solved((1.0,) * len(CHANNELS) if job.plain else plans.shares)
-    if job.plain:
+    blurs, solution = solved((1.0,) * len(CHANNELS) if job.unguarded else plans.shares)
+    if job.unguarded:
         return RestoredCell(job.weakened(tile.cell_pixels, solution.planes[tile.inner]), expected, None)
     restored, audit = _checked(job, tile, bounds, blurs, solution)
     if expected.changed(tile.cell_pixels, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:

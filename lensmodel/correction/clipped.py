@@ -14,7 +14,7 @@ from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
+from lensmodel.correction.methods.richardson_lucy import first_guess, richardson_lucy_steps
 
 Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -197,7 +197,7 @@ def _estimate(
     measured = np.where(
         measured < _UNSEEN * full, reach, np.maximum(measured, np.float32(_LEAST_SEEN * full))
     )
-    latent = climbed(latent, data, measured, blur, sensor, steps=steps)
+    latent = richardson_lucy_steps(latent, data, measured, blur, sensor, steps=steps)
     below = np.minimum(latent, np.float32(sensor.clip))
     excess = np.where(own, latent - below, np.float32(0.0))
     bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))

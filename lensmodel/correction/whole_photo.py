@@ -105,7 +105,7 @@ def correct_planes(
     bounds: Bounds | None = None,
     layers: Sequence[Bounds] = (),
     audited: bool = True,
-    plain: bool = False,
+    unguarded: bool = False,
     least_gain_db: float | None = None,
     stored: StoredColour | None = None,
     roi: Roi | tuple[int, int, int, int] | None = None,
@@ -153,7 +153,7 @@ def correct_planes(
     audited : bool
         Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
         errors can be seen.
-    plain : bool
+    unguarded : bool
         Return what the method makes of the PSFs as they are: nothing is weighed, bounded, added back or
         audited, as in a paper's own experiments. Not for photos that anyone wants to keep.
     least_gain_db : float or None
@@ -206,7 +206,7 @@ def correct_planes(
         # Kernels do not change within cells that are larger than usual.
         solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
         audited,
-        plain,
+        unguarded,
         stored,
         tuple(layers),
     )

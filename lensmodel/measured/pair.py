@@ -123,7 +123,7 @@ class AperturePair:
             )
         start = np.eye(3)
         start[:2, 2] = -_COARSE * np.array(coarse.shift)
-        warp = Warp.plain(start, opened.frame)
+        warp = Warp.of_homography(start, opened.frame)
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
             places = bent(

@@ -42,7 +42,7 @@ class Warp:
     frame: Frame  # of the photo
 
     @classmethod
-    def plain(cls, homography: NDArray[np.float64], frame: Frame) -> Warp:
+    def of_homography(cls, homography: NDArray[np.float64], frame: Frame) -> Warp:
         """Return a warp without a bend."""
         return cls(homography, np.zeros((len(_powers(DEGREE)), 2)), frame)
 

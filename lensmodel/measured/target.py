@@ -199,7 +199,7 @@ def _identified(
     for detail in details:
         page = TargetPage(detail)
         for turn in range(4):
-            warp = Warp.plain(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
+            warp = Warp.of_homography(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
             if not 0.3 < warp.scale(*middle) < 3.0:
                 break  # no turn makes noise visible that pixels do not resolve
             placed = PlacedPage(page, warp)

@@ -63,17 +63,17 @@ def correct_photo(
     whole, developed = developed.frame, placed(developed, model)
     if lateral is not None and developed.frame != whole:
         lateral = lateral.counted_in(developed.frame.half_diagonal)
-    wanted, plain = _way(model, method)
+    wanted, unguarded = _method_of(model, method)
     field = known or psfs_for(developed, model, settings, method=method, photo=photo)
     planes, cfa = developed.planes, developed.cfa
-    if developed.lossy and not plain:
+    if developed.lossy and not unguarded:
         strength *= LOSSY_SHARE
     solver = correction.deconvolvers.resolve(wanted)
     if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correction.correct_planes(
         planes,
-        field if plain else _Posteriors(field),
+        field if unguarded else _Posteriors(field),
         developed.frame,
         method=solver,
         strength=strength,
@@ -83,7 +83,7 @@ def correct_photo(
         cfa=cfa,
         bounds=bounds,
         layers=layers,
-        plain=plain,
+        unguarded=unguarded,
         least_gain_db=least_gain_db,
         stored=correction.StoredColour.of_photo(developed),
         roi=roi,
@@ -106,7 +106,7 @@ class _Posteriors:
         return correction.PsfPosterior.of_rings(kernel, answer.predicted_error, answer.ring_error)
 
 
-def _way(
+def _method_of(
     model: LensModel, method: str | correction.Deconvolver | None
 ) -> tuple[str | correction.Deconvolver, bool]:
     """Which method is wanted, and whether all is done the paper's way and nothing else."""
@@ -127,8 +127,8 @@ def psfs_for(
     Only the way of the paper, and lenses of measured kernels alone, take no patches of the photo.
     """
     developed = placed(developed, model)
-    _, plain = _way(model, method)
-    if not plain and model.weights:
+    _, unguarded = _method_of(model, method)
+    if not unguarded and model.weights:
         model = model.added(_own_samples(developed, model, settings, photo))
     return model.field(settings, pitch_um=developed.info.metadata.pixel_pitch_um)
 

@@ -136,7 +136,7 @@ class SaturationAwareRichardsonLucy:
         """Deconvolve one plane; see `Deconvolver`."""
         latent, reach = first_guess(blurred, blur)
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
-        latent = climbed(
+        latent = richardson_lucy_steps(
             latent,
             blurred,
             reach,
@@ -159,7 +159,7 @@ _LIGHT = 0.9
 light a little below the level; much lower, ordinary bright places would be treated as lights)."""
 
 
-def climbed(
+def richardson_lucy_steps(
     latent: Plane,
     blurred: Plane,
     reach: Plane,

@@ -13,7 +13,7 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.compiled.common import through
 from lensmodel.correction.compiled.tile import fill
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
+from lensmodel.correction.methods.richardson_lucy import first_guess, richardson_lucy_steps
 from lensmodel.correction.tiles.canvas import Canvas, seam
 
 _DEPTH, _MORE = 4, 8
@@ -84,12 +84,12 @@ def _extended(
     wide = blur.reach
     depth, both = _DEPTH * wide + _MORE, 2 * wide
     wider = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
-    plain = replace(sensor, clip=float("inf"), measured=None)
+    unclipped = replace(sensor, clip=float("inf"), measured=None)
 
     def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
         part = np.ascontiguousarray(part)
         latent, reach = first_guess(part, blur)
-        return climbed(latent, part, reach, blur, plain, steps=steps)
+        return richardson_lucy_steps(latent, part, reach, blur, unclipped, steps=steps)
 
     top, bottom, left, right = sensor.edges
     if left:

@@ -189,7 +189,7 @@ def test_colours_hardly_mix() -> None:
     assert difference(model.query(FieldPosition(0.5, 0.0), GREEN, SIZE).kernel, narrow) < 0.05
 
 
-def test_weight_scales_the_vote() -> None:
+def test_samples_answer_by_their_weight() -> None:
     where = FieldPosition(0.5, 0.0)
     loud = PsfSample(gaussian(SIZE, np.eye(2)), where, GREEN, weight=1.0, photo="a")
     quiet = PsfSample(gaussian(SIZE, np.eye(2) * 4), where, GREEN, weight=0.01, photo="b")

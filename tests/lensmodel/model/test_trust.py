@@ -153,7 +153,7 @@ class TestOutliers:
 
         assert moved("default") < 0.1 * moved("paper")
 
-    def test_excluded_photo_stays_and_does_not_vote(self, good: list[tuple[PsfSample, ...]]) -> None:
+    def test_excluded_photo_stays_and_has_no_weight(self, good: list[tuple[PsfSample, ...]]) -> None:
         without = LensModel.fit(merged(good[:3]), ModelSettings(excluded=("p1",)))
         where = FieldPosition(0.5, 0.5)
 

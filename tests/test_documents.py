@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from lensmodel.photo.endings import ENDINGS
 
@@ -15,3 +19,18 @@ def test_the_page_of_formats_lists_the_endings_that_are_taken() -> None:
     named = {f".{word}" for word in re.findall(r"\.([a-z0-9]+)\b", " ".join(re.findall(r"`[^`\n]+`", read)))}
 
     assert named == ENDINGS
+
+
+def test_the_search_of_the_documents_needs_neither_worker_nor_request(tmp_path: Path) -> None:
+    site = pytest.importorskip("tools.docs_site")
+    (tmp_path / "search").mkdir()
+    sections = [{"location": "guide.html", "title": "Guide", "text": "aberration \u2028 coma"}]
+    (tmp_path / "search" / "search_index.json").write_text(json.dumps({"config": {}, "docs": sections}))
+
+    site.on_post_build(SimpleNamespace(site_dir=str(tmp_path)))
+
+    index = (tmp_path / "search" / "index.js").read_text(encoding="utf-8")
+    assert json.loads(index.removeprefix("const searchedSections = ").removesuffix(";\n")) == sections
+    script = (tmp_path / "search" / "main.js").read_text(encoding="utf-8")
+    assert "searchedSections" in script
+    assert not re.search(r"Worker\(|fetch\(|XMLHttpRequest", script)

@@ -26,6 +26,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_post_build(config: MkDocsConfig) -> None:
+    """Let the search work from a folder too, see `docs_search.js`."""
+    folder = Path(config.site_dir) / "search"
+    index = json.loads((folder / "search_index.json").read_text(encoding="utf-8"))
+    sections = json.dumps(index["docs"], ensure_ascii=False)
+    (folder / "index.js").write_text(f"const searchedSections = {sections};\n", encoding="utf-8")
+    (folder / "main.js").write_bytes(Path(__file__).with_name("docs_search.js").read_bytes())
+
+
 def front() -> str:
     """The README as the first page: what it links to in this folder lies beside it."""
     text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

@@ -79,6 +79,10 @@ def begin(part: str, level: str, form: Format = "text") -> None:
     handler.setFormatter(as_json(part) if form == "json" else text)
     # replaces the handlers of the command line
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    # people look for the address that is printed, not for every request; collectors get all
+    for_people = form == "text" and level.upper() == "INFO"
+    for name in ("app.access", "uvicorn.error"):
+        logging.getLogger(name).setLevel(logging.WARNING if for_people else logging.NOTSET)
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it logs every check of the schema
     engine = logging.getLogger("dbos")  # it adds a handler with its own format unless there is one
     engine.handlers, engine.propagate = [logging.NullHandler()], True

@@ -119,3 +119,22 @@ def test_a_connection_that_is_kept_gives_nothing_of_one_request_to_the_next(
     assert sent.status_code == 202
     said = {record["path"]: record for record in read(lines) if record["logger"] == "app.access"}
     assert "photo_id" not in said["/v1/formats"]
+
+
+@pytest.mark.parametrize(
+    ("level", "form", "said"),
+    [("info", "text", False), ("debug", "text", True), ("info", "json", True), ("warning", "text", False)],
+)
+def test_requests_are_logged_for_collectors_and_for_who_asks(
+    level: str, form: logs.Format, said: bool
+) -> None:
+    root = logging.getLogger()
+    before = root.level, root.handlers[:]
+    try:
+        logs.begin("api", level, form)
+        assert logging.getLogger("app.access").isEnabledFor(logging.INFO) == said
+        assert logging.getLogger("app.access").isEnabledFor(logging.WARNING)
+    finally:
+        root.level, root.handlers = before[0], before[1]
+        for name in ("app.access", "uvicorn.error"):
+            logging.getLogger(name).setLevel(logging.NOTSET)

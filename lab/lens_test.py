@@ -1,10 +1,12 @@
-"""The lens test against the truth: T and S of a traced lens by its chart.
+"""The lens test against the truth: T and S of a traced lens by its chart, and by its report from photos.
 
-    python -m lab.lens_test GRID.npz
+    LENSMODEL_TEST_DATA=... python -m lab.lens_test GRID.npz [--photos 3]
 
 A chart of dark squares that lean is photographed through a lens whose kernels are known. Nothing of what is
 tested takes part in making it: squares are drawn by their exact areas in pixels, the pixel's own box is
-taken out again, and the truth is the transfer function of the lens's own kernel at each place.
+taken out again, and the truth is the transfer function of the lens's own kernel at each place. With
+`--photos` the lens is also learned from so many photos as `lab.blind_gain` takes them, and the zones of its
+report are printed beside the truth.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import argparse
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -21,13 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from lab.blind_gain import CAMERA, KnownLens
 from lab.traced import GridLens
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition, LensSettings, Planes
+from lensmodel import calibrate
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.measured.measurer import MeasuredPsf
 from lensmodel.photo import develop
 from lensmodel.quality import tangential_sagittal_mtf50
+from lensmodel.report import lens_report
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
 from lensmodel.simulate.charts import edge_area
 
@@ -133,6 +138,7 @@ def main() -> None:
     parser.add_argument(
         "grid", type=Path, help="of a traced lens, as `python -m lab.population grid` writes it"
     )
+    parser.add_argument("--photos", type=int, default=0, help="from which the lens is learned too")
     asked = parser.parse_args()
     lens = GridLens.read(asked.grid)
     camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grids[0].pitch_um)
@@ -144,6 +150,36 @@ def main() -> None:
     psfs = SlantedEdges().measure([photo], size=31, channels=("g",))
     print(f"{lens.model}: {len(psfs)} places of {len(squares)} squares")
     print("\n".join(_table(lens, psfs, camera.pitch_um)))
+    if asked.photos:
+        print(f"\nreport from {asked.photos} photos:")
+        print("\n".join(_report_by_zone(lens, asked.photos, camera.pitch_um)))
+
+
+def _report_by_zone(lens: GridLens, photos: int, pitch_um: float) -> list[str]:
+    """Learn the lens from photos; a line for each zone: median T and S of the report and of the truth."""
+    known = KnownLens("", lens, 2000, replace(CAMERA, pitch_um=pitch_um))
+    with tempfile.TemporaryDirectory() as folder:
+        shots = [Path(folder) / f"{number}.dng" for number in range(photos)]
+        for number, path in enumerate(shots):
+            known.shot(number, path)
+        model = calibrate(shots, aperture=known.settings.aperture).model
+    found = lens_report(model, "", channels=("g",)).tested[0]
+    lines = []
+    for zone in ZONES:
+        at = [k for k, place in enumerate(found.positions) if zone_of(place.r) == zone]
+        said, true = [], []
+        for k in at:
+            place = found.positions[k]
+            said.append((min(found.tangential[k], 0.5), min(found.sagittal[k], 0.5)))
+            turns = (0.0, math.pi / 2)
+            true.append([min(true_mtf50(lens, place, place.phi + t, pitch_um), 0.5) for t in turns])
+        (t, s), (true_t, true_s) = np.median(said, axis=0), np.median(true, axis=0)
+        unknown = sum(found.unknown[k] for k in at) / len(at)
+        lines.append(
+            f"{zone}: T {t:.3f} truth {true_t:.3f} ({t / true_t - 1.0:+.0%}), "
+            f"S {s:.3f} truth {true_s:.3f} ({s / true_s - 1.0:+.0%}), hatched {unknown:.0%}"
+        )
+    return lines
 
 
 def _table(lens: CameraLens, psfs: Sequence[MeasuredPsf], pitch_um: float) -> list[str]:

@@ -125,6 +125,22 @@ def test_tangential_and_sagittal_are_told_apart() -> None:
     assert found.curves[-1].tangential[0] == found.curves[-1].sagittal[0]
 
 
+def test_beyond_the_outermost_square_of_a_chart_nothing_is_known() -> None:
+    chart = [
+        PsfSample(
+            gaussian(15, np.eye(2)), FieldPosition(r, phi), LensSettings(2.8), estimator="measured-edges/1"
+        )
+        for r in (0.1, 0.4, 0.7)
+        for phi in np.linspace(-3.0, 3.0, 12)
+    ]
+    found = lens_report(LensModel.fit(chart), "", channels=("g",)).tested[0]
+
+    radii = np.array([place.r for place in found.positions])
+    unknown = np.array(found.unknown)
+    assert unknown[radii > 0.78].all()
+    assert not unknown[radii < 0.65].any()
+
+
 def test_sides_are_given_apart_and_their_two_directions_too() -> None:
     found = report_of(bad_side=0.8, astigmatic=1.8)
 

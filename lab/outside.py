@@ -1,0 +1,85 @@
+"""Blind PSFs of real lenses against what was measured on the very photo: judges that nobody simulated.
+
+    python -m lab.outside $LENSMODEL_TEST_DATA/psf/starfield_a.tiff --aperture 2.8
+
+A photo of the sky shows its lens as it is: stars are points. They are measured, and the lens is learned from
+the same photo as if it were any other, by a network that has seen no stars. Cells where stars seem far wider
+than elsewhere hold pairs or trails, and are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from lensmodel.core.psf import delta, distance, rms_width
+from lensmodel.core.types import LensSettings
+from lensmodel.measured.points import Points
+from lensmodel.model import LensModel
+from lensmodel.photo import develop
+from lensmodel.workflow import sampling
+
+SIZE: Final = 31
+_WIDEST: Final = 2.5  # times the median width (chosen): wider cells hold no single stars
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A green PSF at one place of a photo: the stars of a cell against the blind model."""
+
+    r: float
+    distance: float  # relative L2
+    told: float  # what the model expects it to be
+    error: float  # of the measurement, as it expects
+    point: float  # relative L2 of a point, which is a lens without blur
+    measured_px: float  # r.m.s. widths along one axis
+    blind_px: float
+
+
+def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
+    """Measure the stars of a photo, learn its lens from it blindly, and compare cell by cell.
+
+    Raises
+    ------
+    NotEnoughEvidenceError
+        If it shows too few stars, or too little to learn from.
+    """
+    stars = Points().measure([develop(path)], size=SIZE, channels=("g",))
+    samples = sampling.samples_of_photo(path, sampling.Config(settings), workers=1)
+    model, green = LensModel.fit(samples), settings.with_channel("g")
+    widths = [rms_width(star.kernel) for star in stars]
+    for star, width in zip(stars, widths, strict=True):
+        if width > _WIDEST * np.median(widths):
+            continue
+        answer = model.query(star.position, green, SIZE)
+        found, point = (distance(kernel, star.kernel).rel_l2 for kernel in (answer.kernel, delta(SIZE)))
+        told = answer.predicted_error
+        yield Judged(star.position.r, found, told, star.error, point, width, rms_width(answer.kernel))
+
+
+def main() -> None:
+    """Print a row for each cell with stars, and the medians."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("photos", type=Path, nargs="+", metavar="PHOTO")
+    parser.add_argument("--aperture", type=float, help="where the photos do not say it")
+    asked = parser.parse_args()
+    print("| photo | r | relative L2 | told | of the stars | of a point | width of stars, px | blind |")
+    print("|---|---|---|---|---|---|---|---|")
+    for path in asked.photos:
+        rows = sorted(judged(path, LensSettings(aperture=asked.aperture)), key=lambda row: row.r)
+        for row in rows:
+            values = (
+                row.r, row.distance, row.told, row.error, row.point, row.measured_px, row.blind_px,
+            )  # fmt: skip
+            print(f"| {path.name} | " + " | ".join(f"{value:.2f}" for value in values) + " |")
+        middle = float(np.median([row.distance for row in rows]))
+        print(f"{path.name}: median {middle:.2f} of {len(rows)} places")
+
+
+if __name__ == "__main__":
+    main()

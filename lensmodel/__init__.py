@@ -3,7 +3,7 @@
     import lensmodel
 
     lens = lensmodel.calibrate(["a.dng", "b.dng"])
-    kernel = lens.psf(r=0.9, phi=0.6, aperture=1.4).kernel
+    kernel = lens.psf(r=0.9, phi=0.6).kernel
     photo = lensmodel.correct("c.dng", lens, "c.tif")
     lens.save("my-24mm.lensprofile")
 

@@ -14,7 +14,8 @@ from lensmodel import correction, photo
 from lensmodel.blind import PsfEstimator, estimators
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.types import LensSettings, StepHook, ignore_step
+from lensmodel.core.progress import ProgressLine
+from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
 from lensmodel.photo.arrays import photo_from_array
@@ -27,7 +28,6 @@ from lensmodel.workflow.sampling import (
     CalibrationEvent,
     Config,
     EventHook,
-    ignore_event,
     photo_id,
     preset_of,
     settings_of,
@@ -59,7 +59,7 @@ def calibrate(
     patches: int | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
-    on_event: EventHook = ignore_event,
+    on_event: EventHook | None = None,
 ) -> Lens:
     """Learn the blur of one lens from photos taken with it (Hirsch and Schölkopf, ICCV 2015).
 
@@ -100,7 +100,8 @@ def calibrate(
         Runs whole photos instead, on other machines too.
     on_event : callable
         Called as `on_event(event)` with a `CalibrationEvent`: `event.photo`, `event.stage`, `event.done` of
-        `event.total` patches, `event.detail`; raising `CancelledError` there stops the work.
+        `event.total` patches, `event.detail`; raising `CancelledError` there stops the work. None shows the
+        progress in a terminal or notebook.
 
     Returns
     -------
@@ -120,6 +121,7 @@ def calibrate(
         As `on_event` raised it.
     """
     _require_workers(workers)
+    on_event = _shown_events() if on_event is None else on_event
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
@@ -174,7 +176,7 @@ def correct(
     keep_location: bool = False,
     workers: int | None = None,
     siblings: Iterable[Path | str] = (),
-    on_step: StepHook = ignore_step,
+    on_step: StepHook | None = None,
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
@@ -221,7 +223,8 @@ def correct(
     siblings : iterable of paths
         Other photos of the body: a pixel that stands out in two pictures is defective and is replaced.
     on_step : callable
-        Called as `on_step(done, total)`; raising `CancelledError` there stops the work.
+        Called as `on_step(done, total)`; raising `CancelledError` there stops the work. None shows the
+        progress in a terminal.
 
     Returns
     -------
@@ -275,7 +278,7 @@ def correct(
         photo="" if source is None else photo_id(source),
         least_gain_db=least_gain_db,
         workers=workers or os.cpu_count() or 1,
-        on_step=on_step,
+        on_step=_shown_steps(source) if on_step is None else on_step,
     )
     too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
     if target is None or too_little:
@@ -314,6 +317,34 @@ def correct(
             },
         )
     return corrected
+
+
+def _shown_events() -> EventHook:
+    """Show what becomes of each photo."""
+    line = ProgressLine()
+
+    def show(event: CalibrationEvent) -> None:
+        if event.stage == "counted":
+            line.end(f"{event.photo.name}: {event.total} samples")
+        elif event.stage == "skipped":
+            line.end(f"{event.photo.name}: not used: {event.detail}")
+        else:
+            share = f" {event.done / event.total:.0%}" if event.total else ""
+            line.say(f"{event.photo.name}: {event.stage}{share}")
+
+    return show
+
+
+def _shown_steps(source: Path | None) -> StepHook:
+    """Show how far the correction of a photo is."""
+    line, name = ProgressLine(), "the photo" if source is None else source.name
+
+    def show(done: int, total: int) -> None:
+        line.say(f"{name}: corrected {done / max(total, 1):.0%}")
+        if done == total:
+            line.say("")
+
+    return show
 
 
 def _format_of(output: Path) -> photo.OutputFormat:

@@ -318,3 +318,13 @@ def test_what_other_processes_cannot_load_runs_in_threads_of_this_one() -> None:
     assert not processes.portable(lambda: None)
     with processes.pool(None, 1, own) as pool:
         assert pool.submit(id, own).result() == id(own)
+
+
+@pytest.mark.parametrize(("r", "aperture"), [(0.95, 2.8), (0.05, 16.0), (0.9, 22.0)])
+def test_a_question_outside_what_the_photos_show_warns(r: float, aperture: float) -> None:
+    lens = lensmodel.Lens.from_kernels(
+        [np.outer(*[np.hanning(7)] * 2)] * 3, [0.0, 0.1, 0.1], [0.0, 1.0, 2.0], aperture=2.8
+    )
+
+    with pytest.warns(UserWarning, match="is a guess"):
+        lens.psf(r, 0.6, aperture=aperture)

@@ -63,6 +63,8 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     corrections = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
     corrections = [correction for correction in corrections if correction.roi is None]
     done = next((correction for correction in corrections if correction.state == "succeeded"), None)
+    shown_by = "" if done is None else f"/ui/corrections/{done.id}/tiles"
+    better = done is not None and not (done.report or {}).get("nothing_to_correct")
     return page(
         "photo.html",
         photo=_upright(photo, row),
@@ -78,7 +80,8 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         done=done,
         nothing=words.nothing_words(row.kind),
         least=SEEN_DB,
-        tiles=f"/ui/photos/{photo_id}/tiles" if done is None else f"/ui/corrections/{done.id}/tiles",
+        before=f"/ui/photos/{photo_id}/tiles" if done is None else f"{shown_by}/before",
+        after=f"{shown_by}/after" if better else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )
 
@@ -127,6 +130,8 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     can_look = correction.roi is None and pictures.exists(
         call.storage, f"{run_folder(plan.correction)}{SIDES['after']}"
     )
+    changed = not report.get("nothing_to_correct")
+    can_look = can_look and changed
     zones, most_gain = words.gain_bars(report.get("zones") or {})
     size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(
@@ -135,10 +140,10 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         job=views.correction_job(plan),
         photo=_upright(photo, row),
         can_look=can_look,
-        zones=zones,
+        zones=zones if changed else [],
         most_gain=most_gain,
         nothing=words.nothing_words(row.kind),
-        audit=words.held_places(report.get("audit") or {}, *size),
+        audit=words.held_places(report.get("audit") or {}, *size) if changed else None,
         held=words.held_squares(report.get("audit") or {}, *size) if can_look else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

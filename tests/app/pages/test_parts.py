@@ -77,9 +77,9 @@ def a_picture() -> NDArray[np.uint8]:
     return scene
 
 
-@pytest.fixture
-def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
-    """A correction to a DNG that has changed nothing."""
+def finished(
+    client: TestClient, steps: Steps, store: Store, settings: Settings, *, nothing: bool
+) -> dict[str, Any]:
     wish = {"photo_id": steps.counted().public_id, "output": {"format": "dng"}}
     made: dict[str, Any] = client.post("/v1/corrections", json=wish).json()
     blobs, folder = Storage(settings.storage), f"corrections/{made['id']}/1-1/"
@@ -98,9 +98,21 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
         "tile_side": 64,
     }
     result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
-    report = {"zones": {}, "nothing_to_correct": True, "audit": audit}
+    report = {"zones": {}, "nothing_to_correct": nothing, "audit": audit}
     assert store.corrections.finish(run, result, report)
     return made
+
+
+@pytest.fixture
+def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
+    """A correction to a DNG."""
+    return finished(client, steps, store, settings, nothing=False)
+
+
+@pytest.fixture
+def unchanged(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
+    """A correction that was not worth it."""
+    return finished(client, steps, store, settings, nothing=True)
 
 
 def no_decoder(*_: Any) -> Any:
@@ -176,7 +188,6 @@ def test_a_corrected_dng_is_looked_at_and_its_audit_told(
     page = client.get(f"/corrections/{corrected['id']}").text
 
     assert 'id="viewer"' in page
-    assert "Nothing to correct here." in page
     assert "10% of the correction was held back over the whole photo." in page
     assert "detail that does not match the photo: 10.0%" in page
     assert '{"held": 0.4, "x": 64, "y": 0}' in page
@@ -188,7 +199,19 @@ def test_the_page_of_a_photo_shows_its_correction(client: TestClient, corrected:
 
     assert f'data-after="/ui/corrections/{corrected["id"]}/tiles/after"' in page
     assert f'href="/v1/corrections/{corrected["id"]}/result" download' in page
+    assert "Download the corrected photo" in page
+
+
+@pytest.mark.parametrize("kind", ["photos", "corrections"])
+def test_where_nothing_is_to_be_gained_a_page_says_so_and_compares_nothing(
+    client: TestClient, unchanged: dict[str, Any], kind: str
+) -> None:
+    page = client.get(f"/{kind}/{unchanged['photo_id' if kind == 'photos' else 'id']}").text
+
     assert "Nothing to correct here.</b> Removing the blur would not make it visibly better" in page
+    assert "Download the photo" in page
+    assert "data-after" not in page
+    assert "held back" not in page
 
 
 def test_a_jpeg_without_gain_says_so_in_one_sentence_with_the_reason(
@@ -244,13 +267,13 @@ def test_a_jpeg_that_would_gain_nothing_is_left_soon(tmp_path: Path, ending: str
     assert bool(steps) != left  # no cell after those that tell
 
 
-def test_corrections_are_followed_and_fetched_together(client: TestClient, corrected: dict[str, Any]) -> None:
-    wish = {"photo_id": corrected["photo_id"], "output": {"format": "png8"}}
+def test_corrections_are_followed_and_fetched_together(client: TestClient, unchanged: dict[str, Any]) -> None:
+    wish = {"photo_id": unchanged["photo_id"], "output": {"format": "png8"}}
     waiting = client.post("/v1/corrections", json=wish).json()["id"]
-    ids = f"{corrected['id']},{waiting}"
+    ids = f"{unchanged['id']},{waiting}"
 
     page, part = client.get(f"/batch?ids={ids}").text, client.get(f"/ui/parts?page=batch&id={ids}").text
-    archive = client.get(f"/batch.zip?ids={ids},{corrected['id']}")
+    archive = client.get(f"/batch.zip?ids={ids},{unchanged['id']}")
 
     assert "2 corrections" in page
     assert "1 of 2 done" in part

@@ -63,6 +63,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     corrections = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
     corrections = [correction for correction in corrections if correction.roi is None]
     done = next((correction for correction in corrections if correction.state == "succeeded"), None)
+    lens = None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call)
     shown_by = "" if done is None else f"/ui/corrections/{done.id}/tiles"
     better = done is not None and not (done.report or {}).get("nothing_to_correct")
     return page(
@@ -74,8 +75,9 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
+        known=lens.samples > 0 if lens else bool(candidates),
         proposed=shown.grouped([row])[0].name,
-        lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
+        lens=lens,
         corrections=corrections,
         done=done,
         nothing=words.nothing_words(row.kind),

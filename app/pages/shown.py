@@ -38,10 +38,17 @@ def lenses(call: Call) -> list[LensOut]:
 
 
 def lenses_with_photos(call: Call) -> list[LensOut]:
-    """Return the newest lenses, except those without samples whose photos all failed or were cancelled."""
+    """Return the newest lenses, except those without samples whose photos all failed or are gone.
+
+    A lens that was given its name before any photo is none of these.
+    """
     listed = lenses(call)
-    hopeful = call.store.lenses.with_photos_beyond(HOPELESS, [lens.id for lens in listed if not lens.samples])
-    return [lens for lens in listed if lens.samples or lens.id in hopeful]
+    unknown = [lens.id for lens in listed if not lens.samples]
+    hopeful = call.store.lenses.with_photos_beyond(HOPELESS, unknown)
+    tried = call.store.lenses.with_photos_beyond(frozenset(), unknown)
+    return [
+        lens for lens in listed if lens.samples or lens.id in hopeful or (lens.label and lens.id not in tried)
+    ]
 
 
 def counting(call: Call, lens_id: str) -> bool:

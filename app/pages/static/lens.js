@@ -186,15 +186,12 @@ async function putProfile(lens, file, any = false) {
 
 // What is done with a lens as a whole, and a lens whose profile somebody gave away.
 export function setUpLensActions() {
-  const chosen = (fields) => {
-    if (!fields.get("profile")?.size) throw new Error("Choose a profile first.");
-    return fields.get("profile");
-  };
-  acting(byId("add-profile"), async (fields) => {
-    const file = chosen(fields);
-    const { id } = await send("POST", "/v1/lenses", { label: file.name.replace(/\.lensprofile$/i, "") });
+  acting(byId("add-lens"), async (fields) => {
+    const [file, label] = [fields.get("profile"), fields.get("label").trim()];
+    if (!label && !file.size) throw new Error("Give a name, or choose a profile.");
+    const { id } = await send("POST", "/v1/lenses", { label: label || file.name.replace(/\.lensprofile$/i, "") });
     try {
-      await putProfile(`/v1/lenses/${id}`, file);
+      if (file.size) await putProfile(`/v1/lenses/${id}`, file);
     } catch (reason) {
       await send("DELETE", `/v1/lenses/${id}`).catch(() => {}); // it may be gone with its profile
       throw reason;
@@ -212,7 +209,10 @@ export function setUpLensActions() {
       const merged = await withItsLens((any) => send("PATCH", lens, { merge_into: into, any_lens: any }));
       return merged && `/lenses/${into}`;
     },
-    upload: (fields) => withItsLens((any) => putProfile(lens, chosen(fields), any)),
+    upload: (fields) => {
+      if (!fields.get("profile").size) throw new Error("Choose a profile first.");
+      return withItsLens((any) => putProfile(lens, fields.get("profile"), any));
+    },
     delete: async () => {
       const question = "Delete this lens and everything learned from its photos? The photos themselves are kept.";
       return (await confirmed(question, "Delete the lens")) && send("DELETE", lens).then(() => "/");

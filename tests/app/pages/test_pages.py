@@ -246,6 +246,22 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     visitor.complaints.clear()
 
 
+def test_a_tester_begins_with_a_lens_without_photos(page: Page, service: Service) -> None:
+    page.goto("/")
+    page.get_by_text("Add a lens by its profile").click()
+    page.get_by_role("button", name="Add", exact=True).click()
+    expect(page.locator("#add-lens .alert")).to_have_text("Give a name, or choose a profile.")
+    page.get_by_label("Name", exact=True).fill("Lens on the bench")
+    page.get_by_role("button", name="Add", exact=True).click()
+    page.wait_for_url("**/lenses/*")
+    page.get_by_role("link", name="Measure it by a test photo").click()
+
+    expect(page.locator("h1")).to_contain_text("Lens on the bench")
+    page.get_by_text("Send a test photo").click()
+    expect(page.get_by_label("What it shows")).to_be_visible()
+    assert service.http.delete(f"/v1/lenses/{page.url.split('/')[-2]}").status_code == 204
+
+
 def test_a_photo_sent_twice_is_said_to_be_used_already(page: Page, service: Service, tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "twice.dng", 3, serial="C-2", shape=SMALL)
     sent = service.upload(photo)
@@ -675,7 +691,7 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_role("button", name="Delete lens").click()
     page.get_by_role("button", name="Delete the lens").click()
     page.wait_for_url("**/")
-    page.get_by_text("Add the profile of a lens").click()
+    page.get_by_text("Add a lens by its profile").click()
     page.get_by_label("A file that ends in").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/lenses/*")

@@ -398,6 +398,20 @@ def test_a_lens_is_proposed_a_name(maker: str | None, model: str | None, lens: s
     assert grouped([row])[0].name == name
 
 
+def test_a_lens_that_was_named_before_any_photo_is_listed_and_no_ghost(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    client.post("/v1/lenses", json={"label": "Lens on the bench"})
+    ghost = steps.receive()
+    steps.inspect(ghost, serial="2")
+    store.photos.fail(ghost.public_id, ghost.epoch, "raw_decode_failed", "damaged")
+
+    page = client.get("/").text
+
+    assert page.count('class="card"') == 1
+    assert "Lens on the bench" in page
+
+
 def test_no_lens_is_chosen_beforehand_for_a_photo_that_names_none(
     client: TestClient, steps: Steps, store: Store
 ) -> None:

@@ -369,7 +369,7 @@ class Client:
         lens_id: str,
         path: str | Path,
         *,
-        form: Literal["json", "csv", "html", "pdf"] | None = None,
+        form: Literal["json", "csv", "pdf"] | None = None,
         against: str | None = None,
         aperture: float | None = None,
         against_aperture: float | None = None,

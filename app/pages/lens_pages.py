@@ -23,7 +23,7 @@ from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import ZONES, FieldPosition
 from lensmodel.report import LensReport, Side, Unit, compare
-from lensmodel.report.documents import place_table
+from lensmodel.report.tables import place_table
 
 if TYPE_CHECKING:
     from lensmodel.report.plots import Chart

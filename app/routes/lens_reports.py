@@ -20,20 +20,16 @@ from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import Channel
 from lensmodel.report import Comparison, LensReport, Side, compare
-from lensmodel.report.documents import comparison_html, to_csv, to_html
+from lensmodel.report.tables import to_csv
 
 router = APIRouter(tags=["lenses"])
 
-Form = Literal["json", "csv", "html", "pdf"]
+Form = Literal["json", "csv", "pdf"]
 MEDIA_TYPES: Final[dict[Form, str]] = {
     "json": "application/json",
     "csv": "text/csv; charset=utf-8",
-    "html": "text/html; charset=utf-8",
     "pdf": "application/pdf",
 }
-POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"
-"""Content security policy of a report: one file that loads and runs nothing."""
-
 _CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for kind in MEDIA_TYPES.values()}
 
 
@@ -86,7 +82,6 @@ def read_report(
     headers = {
         "ETag": tag,
         "Cache-Control": "private, no-cache",
-        "Content-Security-Policy": POLICY,
         "X-Content-Type-Options": "nosniff",
         "Content-Disposition": _disposition(test.name, form),
     }
@@ -105,8 +100,6 @@ def _written(test: LensReport, form: Form) -> bytes:
         return json.dumps(to_json(test)).encode()
     if form == "csv":
         return to_csv(test).encode()
-    if form == "html":
-        return to_html(test).encode()
     from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
 
     return to_pdf(pages(test))
@@ -128,8 +121,6 @@ def _compared(
         Side(_named(first, first_curves.settings.aperture, second), first_curves, first.facts),
         Side(_named(second, second_curves.settings.aperture, first), second_curves, second.facts),
     )
-    if form == "html":
-        return comparison_html(comparison).encode()
     if form == "pdf":
         from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
 
@@ -159,5 +150,5 @@ def _figures(comparison: Comparison) -> dict[str, Any]:
 
 def _disposition(name: str, form: Form) -> str:
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-") or "lens"
-    how = "inline" if form in {"html", "pdf"} else "attachment"
+    how = "inline" if form == "pdf" else "attachment"
     return f"{how}; filename=\"{plain}-report.{form}\"; filename*=UTF-8''{quote(name, safe='')}-report.{form}"

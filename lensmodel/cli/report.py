@@ -42,7 +42,7 @@ from lensmodel.report import (
     psf_grid,
     widest,
 )
-from lensmodel.report.documents import comparison_html, to_csv, to_html
+from lensmodel.report.tables import to_csv
 from lensmodel.workflow.correcting import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
@@ -50,8 +50,8 @@ Aspect = Annotated[
     float, typer.Option(min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture.")
 ]
 
-FILES: Final = ("report.html", "report.pdf", "report.png", "report.csv", "report.json")
-COMPARED: Final = ("comparison.html", "comparison.pdf")
+FILES: Final = ("report.pdf", "report.png", "report.csv", "report.json")
+COMPARED: Final = "comparison.pdf"
 _NAMED: Final = 8  # photos that the page names (chosen: two lines)
 
 
@@ -103,7 +103,7 @@ def report(
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
-        names = (*FILES, *(COMPARED if against else ()))
+        names = (*FILES, *([COMPARED] if against else ()))
         files.refuse_existing(*(output / name for name in names), force=force)
     elif against is not None or photo:
         option = "--photo" if against is None else "--against"
@@ -175,7 +175,6 @@ def write(folder: Path, found: LensReport, document: str) -> None:
     save(drawn[0], folder / "report.png")
     for name, content in (
         ("report.pdf", to_pdf(drawn)),
-        ("report.html", to_html(found).encode()),
         ("report.csv", to_csv(found).encode()),
         ("report.json", document.encode()),
     ):
@@ -187,8 +186,7 @@ def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
     from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
 
     both = compare(*(Side(one_of.name, one_of.tested[0], one_of.facts) for one_of in (one, two)))
-    write_atomically(folder / COMPARED[0], comparison_html(both).encode())
-    write_atomically(folder / COMPARED[1], to_pdf([comparison_page(both)]))
+    write_atomically(folder / COMPARED, to_pdf([comparison_page(both)]))
 
 
 def export_psfs(

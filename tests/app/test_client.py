@@ -194,7 +194,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
 ) -> None:
     lens_id = steps.lens_id(steps.counted(patches=6))
     with pytest.raises(ServiceProblemError, match="not_ready"):
-        api.save_report(lens_id, tmp_path / "report.html")
+        api.save_report(lens_id, tmp_path / "report.pdf")
     _, stored = store.samples.of_lens(lens_id)
     model = LensModel.fit([one.sample for one in stored])
     test = lens_report(model, "A lens", rows=5, size=15, channels=("g",))
@@ -203,10 +203,10 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)
     Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())
 
-    page = api.save_report(lens_id, tmp_path / "report.html").read_text(encoding="utf-8")
+    pages = api.save_report(lens_id, tmp_path / "report.pdf").read_bytes()
     table = api.save_report(lens_id, tmp_path / "figures", form="csv").read_text(encoding="utf-8")
 
-    assert page.lower().startswith("<!doctype html>")
+    assert pages.startswith(b"%PDF-")
     assert "," in table.splitlines()[0]
 
 

@@ -88,7 +88,7 @@ def body_of(path: str, method: str, ids: dict[str, str]) -> dict[str, Any]:
 
 PARTS = {
     "suffix": "json",
-    "form": "html",
+    "form": "pdf",
     "which": "after",
     "name": "before",
     "half": "0",

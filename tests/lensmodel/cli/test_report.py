@@ -83,11 +83,7 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, g
     run("report", NAME, "-o", "out", "--against", NAME)
 
     names = {p.name for p in (folder / "out").iterdir()}
-    both = {"comparison.html", "comparison.pdf"}
-    assert names == {f"report.{ending}" for ending in ("html", "pdf", "png", "csv", "json")} | both
-    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    assert "At f/2 this copy is" in page
-    assert "about the same in the centre" in (folder / "out" / "comparison.html").read_text(encoding="utf-8")
+    assert names == {"comparison.pdf", *(f"report.{ending}" for ending in ("pdf", "png", "csv", "json"))}
     stored = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
     with (folder / "out" / "report.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
@@ -175,6 +171,5 @@ def test_lateral_colour_is_measured_on_a_photo_of_the_lens(folder: Path, green_a
     assert found["photos"] == 1
     assert found["red"][-1] == pytest.approx(0.005 * math.hypot(rows, cols) / 2.0, abs=0.25)
     assert abs(found["blue"][-1]) < 0.25
-    assert "Lateral colour" in Path("report/report.html").read_text()
     with pytest.raises(UsageError, match="--photo needs --output"):
         CliRunner().invoke(app, ["report", NAME, "--photo", "fringes.tif"], catch_exceptions=False)

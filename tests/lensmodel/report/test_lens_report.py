@@ -24,9 +24,9 @@ from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import LensReport, SensorGeometry, Side, compare, lens_report
-from lensmodel.report.documents import comparison_html, place_table, to_csv, to_html
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
 from lensmodel.report.plots import charts, comparison_page, pages, save, to_pdf
+from lensmodel.report.tables import place_table, to_csv
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
 SIZE = 15
@@ -183,10 +183,6 @@ def test_a_point_within_a_pixel_is_reported_as_at_least_nyquist(tmp_path: Path) 
 
 def test_all_documents_hold_the_same_figures(soft: LensReport) -> None:
     assert from_json(LensReport, json.loads(json.dumps(to_json(soft), allow_nan=False))) == soft
-    page = to_html(soft)
-    assert page.count("<img") == len(charts(soft, None))
-    assert "http" not in page
-    assert soft.verdict in page
     rows = list(csv.DictReader(io.StringIO(to_csv(soft))))
     first = next(row for row in rows if row["quantity"] == "MTF50" and row["channel"] == "g")
     assert float(first["value"]) == pytest.approx(soft.tested[0].tangential[0], rel=1e-5)
@@ -240,10 +236,6 @@ def test_two_copies_are_compared(soft: LensReport) -> None:
     assert "sharper in the corners" in found.verdict
     same = compare(Side("one", soft.tested[0]), Side("one", soft.tested[0]))
     assert same.verdict.startswith("Compared with one (1), one (2) is about the same in the centre")
-    page = comparison_html(found)
-    assert "sharper in the corners" in page
-    assert f"{sharp.samples} blur samples" in page
-    assert page.count("<img") == 3
     assert to_pdf([comparison_page(found)]).startswith(b"%PDF-")
     # a name as long as makers give leaves room for the chart: matplotlib would warn
     long = compare(*[Side("Simulated Optics Simulated Astigmatism 85mm f/2", soft.tested[0])] * 2)

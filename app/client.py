@@ -334,9 +334,13 @@ class Client:
         """Call a lens by a name of its owner's; None takes the name away."""
         return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"label": label})
 
-    def merge_lens(self, lens_id: str, into: str) -> s.LensOut:
-        """Let a lens become a part of another, which is returned; it is forgotten itself."""
-        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"merge_into": into})
+    def merge_lens(self, lens_id: str, into: str, *, any_lens: bool = False) -> s.LensOut:
+        """Let a lens become a part of another, which is returned; it is forgotten itself.
+
+        One that seems to be another lens is refused without `any_lens`.
+        """
+        asked = {"merge_into": into, "any_lens": any_lens}
+        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", asked)
 
     def go_back(self, lens_id: str, version: int) -> s.LensOut:
         """Leave out the photos that joined a lens after a version of `calibrations`."""

@@ -166,7 +166,9 @@ def test_lenses_are_named_merged_and_set_back(api: Client, steps: Steps) -> None
 
     assert api.rename_lens(first, "Old one").label == "Old one"
     assert api.rename_lens(first, None).label is None
-    merged = api.merge_lens(first, into=second)
+    with pytest.raises(ServiceProblemError, match="other_lens"):
+        api.merge_lens(first, into=second)
+    merged = api.merge_lens(first, into=second, any_lens=True)
     assert (merged.id, merged.photos) == (second, 3)
     assert [lens.id for lens in api.lenses()] == [second]
     assert [event.version for event in api.calibrations(second)][:2] == [1, 2]

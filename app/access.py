@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from starlette.requests import Request
 
 from app.errors import ForbiddenError, NotSignedInError, QuotaError
-from app.store import keys
-from app.store.keys import SCOPES, Holder, KeyStore, Scope
+from app.store import accounts
+from app.store.accounts import SCOPES, Accounts, Holder, Scope
 from app.store.owners import LOCAL
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Gate:
     Blocking: it reads the database.
     """
 
-    def __init__(self, settings: Settings, store: KeyStore) -> None:
+    def __init__(self, settings: Settings, store: Accounts) -> None:
         self._settings, self._store = settings, store
         self._closed = settings.needs_keys
         self._looked = -FRESH_S
@@ -85,7 +85,7 @@ class Gate:
         if self._closed or self._settings.auth == "none":
             return self._closed
         if time.monotonic() - self._looked > FRESH_S:
-            self._closed = self._store.any_made()
+            self._closed = self._store.has_keys()
             self._looked = time.monotonic()
         return self._closed
 
@@ -95,7 +95,7 @@ class Gate:
             fresh = self._settings.auth == "none" or time.monotonic() - self._looked <= FRESH_S
             return EVERYBODY if fresh else None
         shown = shown_by(request)
-        return None if shown is None else self._remembered(keys.digest_of(shown))
+        return None if shown is None else self._remembered(accounts.digest_of(shown))
 
     def who(self, request: Request) -> Who:
         """Return who asks."""
@@ -126,7 +126,7 @@ class Gate:
 
     def require(self, who: Who, scope: Scope) -> None:
         """Refuse a key without a scope."""
-        if not keys.covers(who.scopes, scope):
+        if not accounts.covers(who.scopes, scope):
             raise ForbiddenError(
                 f"this key may {' and '.join(who.scopes)}, and this takes {scope}: use another key"
             )
@@ -145,20 +145,20 @@ class Gate:
 
     def sign_in(self, text: str) -> tuple[Who, str]:
         """Begin a session with a key; return its owner, and the token for the browser."""
-        who = self._look_up(text) if keys.prefix_of(text) else None
+        who = self._look_up(text) if accounts.prefix_of(text) else None
         if who is None or who.key_id is None:
             raise NotSignedInError("this key is not valid, or no longer: look for a blank or a missing end")
         token = secrets.token_urlsafe(32)
-        self._store.sign_in(who.key_id, keys.digest_of(token), SESSION)
+        self._store.sign_in(who.key_id, accounts.digest_of(token), SESSION)
         return who, token
 
     def sign_out(self, request: Request) -> None:
         """End the session of a browser."""
         token = request.cookies.get(COOKIE)
         if token:
-            self._store.sign_out(keys.digest_of(token))
+            self._store.sign_out(accounts.digest_of(token))
             with self._guard:
-                self._known.pop(keys.digest_of(token), None)
+                self._known.pop(accounts.digest_of(token), None)
 
     def _remembered(self, digest: str) -> Who | None:
         with self._guard:
@@ -166,11 +166,11 @@ class Gate:
         return entry[1] if entry is not None and time.monotonic() - entry[0] <= FRESH_S else None
 
     def _look_up(self, shown: str) -> Who | None:
-        digest = keys.digest_of(shown)
+        digest = accounts.digest_of(shown)
         known = self._remembered(digest)
         if known is not None:
             return known
-        find = self._store.by_session if keys.prefix_of(shown) is None else self._store.by_hash
+        find = self._store.by_session if accounts.prefix_of(shown) is None else self._store.by_hash
         holder = find(digest)
         if holder is None:
             return None

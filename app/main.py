@@ -15,7 +15,7 @@ from app.access import Gate
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.dependencies import Fresh, Places, Services, call_of
-from app.http.middleware import JsonBodies, OwnNames, RequestLog, SameSite
+from app.http.middleware import BodySize, OwnNames, RequestLog, SameSite
 from app.http.model_cache import ModelCache
 from app.routes import (
     account,
@@ -55,7 +55,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             storage,
             cache,
             Places(photos.MAX_UPLOADS),
-            Gate(chosen, store.keys),
+            Gate(chosen, store.accounts),
             Fresh(health.FRESH_S),
         )
         yield
@@ -69,7 +69,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,  # it would load scripts from another site: the pages have their own
         redoc_url=None,
     )
-    app.add_middleware(JsonBodies)
+    app.add_middleware(BodySize, max_upload_mb=chosen.max_upload_mb)
     app.add_middleware(SameSite, allowed=chosen.hosts)
     app.add_middleware(OwnNames, allowed=chosen.hosts)
     app.add_middleware(RequestLog)  # the last is the outermost

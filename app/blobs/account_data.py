@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from app.blobs.storage import Storage
 from app.store import Store
-from app.store.accounts import AccountStore
+from app.store.accounts import Accounts
 from app.store.tables import Base, CorrectionRow, EventRow, KeyRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 TABLES: Final[Mapping[str, type[Base]]] = {
@@ -123,7 +123,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of any type
     return base64.b64encode(value).decode("ascii") if isinstance(value, bytes) else value
 
 
-def erase(accounts: AccountStore, storage: Storage, owner_key: int) -> None:
+def erase(accounts: Accounts, storage: Storage, owner_key: int) -> None:
     """Erase what is left of an owner, rows before blobs. If killed, a later call continues."""
     while (prefixes := accounts.erase_some(owner_key)) is not None:
         for prefix in prefixes:

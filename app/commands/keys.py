@@ -17,7 +17,8 @@ from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from app.store.keys import KeyStore, Listed
+    from app.store.accounts import Accounts
+    from app.store.tables import KeyRow
 
 keys = typer.Typer(
     help="""Make, list, renew and end the keys of a service that others can reach.
@@ -52,18 +53,18 @@ def _span_or_none(text: str | None) -> timedelta | None:
 
 
 @contextmanager
-def _opened(data: Data) -> Iterator[KeyStore]:
+def _opened(data: Data) -> Iterator[Accounts]:
     """Open the keys of an installation, its schema brought up to date."""
     from app.store import migrate  # noqa: PLC0415 - only these commands need the service
+    from app.store.accounts import Accounts  # noqa: PLC0415 - same
     from app.store.database import Database  # noqa: PLC0415 - same
-    from app.store.keys import KeyStore  # noqa: PLC0415 - same
 
     settings = settings_from(data)
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     database = Database(settings.database)
     try:
         migrate.upgrade(database)
-        yield KeyStore(database)
+        yield Accounts(database)
     finally:
         database.close()
 
@@ -121,7 +122,7 @@ def create(
         )
     lasts = _span_or_none(expires)
     with _opened(data) as store:
-        new_key = store.create(
+        new_key = store.create_key(
             name,
             [scope],  # type: ignore[list-item]  # the option takes no other
             label=label,
@@ -148,8 +149,10 @@ def listed(
 
     Exit status: 0 listed, 1 it could not be, 2 called wrongly.
     """
+    from app.store.owners import ANY_OWNER  # noqa: PLC0415 - as above
+
     with _opened(data) as store:
-        rows = [_described(key) for key in store.listed(owner)]
+        rows = [_described(key) for key in store.keys(owner or ANY_OWNER)]
     if json_output:
         typer.echo(json.dumps(rows, indent=2))
         return
@@ -160,12 +163,12 @@ def listed(
         typer.echo("no keys: lensmodel keys create makes one", err=True)
 
 
-def _described(listed_key: Listed) -> dict[str, str | None]:
-    key, now = listed_key.key, datetime.now(UTC)
+def _described(key: KeyRow) -> dict[str, str | None]:
+    now = datetime.now(UTC)
     ended = key.expires_at is not None and key.expires_at <= now
     return {
         "prefix": key.prefix,
-        "owner": listed_key.owner,
+        "owner": key.owner.name,
         "state": "revoked" if key.revoked_at else "expired" if ended else "valid",
         "scope": key.scopes,
         "label": key.label,
@@ -204,7 +207,7 @@ def rotate(
     Exit status: 0 made, 1 there is no such valid key, 2 called wrongly.
     """
     with _opened(data) as store:
-        new_key = store.rotate(_prefix(prefix), keep=_span(keep))
+        new_key = store.rotate_key(_prefix(prefix), keep=_span(keep))
     if new_key is None:
         raise InvalidInputError(f"no valid key begins with {_prefix(prefix)}: lensmodel keys list shows them")
     _show(new_key.text)
@@ -221,6 +224,6 @@ def revoke(prefix: Prefix, data: Data = None) -> None:
     Exit status: 0 ended, 1 there is no such key, 2 called wrongly.
     """
     with _opened(data) as store:
-        if not store.revoke(_prefix(prefix)):
+        if not store.revoke_key(_prefix(prefix)):
             raise InvalidInputError(f"no key begins with {_prefix(prefix)}: lensmodel keys list shows them")
     typer.echo(f"key {_prefix(prefix)} is revoked")

@@ -5,26 +5,25 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from inspect import iscoroutinefunction
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Request, Response, Security
-from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from app.access import Gate, Who
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
-from app.schemas import Question, Readiness
+from app.schemas import Readiness
 from app.store import Store
 
 T = TypeVar("T")
-Q = TypeVar("Q", bound=Question)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,34 +140,21 @@ ProbeDep = Annotated[Call, Depends(probe_of)]
 CallDep = Annotated[Call, Depends(call_of)]
 
 
-@dataclass(frozen=True, slots=True)
-class QueryModel(Generic[Q]):
-    """A dependency that reads query parameters by their schema; the last value of a repeated name counts.
+class OneSession(APIRoute):
+    """A route whose reads are all of one session of the database, and so of one moment.
 
-    FastAPI validates them field by field, which takes as long as a quick answer. `/openapi.json` describes
-    them in the same way; see `described`.
+    Not those of routes that wait: between two looks others must be able to change what they look at.
     """
 
-    kind: type[Q]
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return what answers a request, in a session that ends before the answer is sent."""
+        answer = super().get_route_handler()
+        if iscoroutinefunction(self.endpoint):
+            return answer
 
-    async def __call__(self, request: Request) -> Q:
-        """Read the parameters; raise `RequestValidationError` as FastAPI does."""
-        try:
-            return self.kind.model_validate(dict(request.query_params))
-        except ValidationError as error:
-            errors = error.errors(include_url=False)
-            raise RequestValidationError(
-                [{**entry, "loc": ("query", *entry["loc"])} for entry in errors]
-            ) from None
+        async def in_session(request: Request) -> Response:
+            services: Services = request.app.state.services
+            with services.store.database.scope():
+                return await answer(request)
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """Parameters for `openapi_extra`, described as FastAPI describes its own."""
-        schema = self.kind.model_json_schema()
-        required = schema.get("required", ())
-        parameters = []
-        for name, field in schema["properties"].items():
-            described = {"description": field["description"]} if "description" in field else {}
-            entry = {"name": name, "in": "query", "required": name in required, "schema": field}
-            parameters.append(entry | described)
-        return {"parameters": parameters}
+        return in_session

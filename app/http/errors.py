@@ -173,7 +173,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> Response:
-        code = CODE_OF_STATUS.get(error.status_code, "invalid_request")
+        code = getattr(error, "code", "") or CODE_OF_STATUS.get(error.status_code, "invalid_request")
         detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json for what there is"
         return respond(request, error.status_code, code, detail, headers=error.headers)
 

@@ -15,12 +15,13 @@ from typing import Final
 from urllib.parse import quote, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect, Request
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars, clear_contextvars
 
 from app.errors import SlowBodyError
-from app.http.errors import HEADERS, REQUEST_ID, respond, status_of
+from app.http.errors import HEADERS, REQUEST_ID, respond
 from app.runtime import logs, metrics
 from app.store.database import new_id
 
@@ -29,23 +30,22 @@ log = logging.getLogger("app.access")
 MAX_LOGGED: Final = 500
 """Characters of a path in the log at most (chosen): no path of the interface has as many."""
 
+MIB: Final = 1 << 20
 MAX_JSON_BYTES: Final = 64 * 1024
 """Longest JSON body (chosen): far longer than any request; parsed, it takes some ten times as much memory."""
 
-JSON_SECONDS: Final = 60.0
-"""Longest time that a JSON body may take (chosen): 64 KiB come within it by the slowest mobile connection."""
+MAX_PROFILE_BYTES: Final = 64 * MIB
+"""Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
 
-UPLOADS: Final = {
-    "POST": re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements"),
-    "PUT": re.compile(r"/v1/lenses/[^/]+/profile"),
-}
-"""Paths whose routes read the body themselves and bound it, by method."""
+MAX_FORM_BYTES: Final = 64 * 1024
+"""Bytes of all form fields of an upload at most (chosen): far more than they can have."""
+
+_PHOTO: Final = re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements")
+_PROFILE: Final = re.compile(r"/v1/lenses/[^/]+/profile")
 
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 CLOSE: Final = {"Connection": "close"}
 """Header of a refusal before the body is read: the rest of it is not waited for."""
-
-_TOO_LONG: Final = f"the body has more than {MAX_JSON_BYTES} bytes: no question needs as many"
 
 _ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 
@@ -198,7 +198,7 @@ def is_local(host: str) -> bool:
 
 @asynccontextmanager
 async def within(seconds: float) -> AsyncIterator[None]:
-    """Bound the time in which a body comes."""
+    """Bound the time in which an upload comes."""
     try:
         async with asyncio.timeout(seconds) as limit:
             yield
@@ -209,69 +209,74 @@ async def within(seconds: float) -> AsyncIterator[None]:
         raise SlowBodyError(text, headers=CLOSE) from error
 
 
-class JsonBodies:
-    """Middleware that refuses bodies that are too long or not JSON."""
+class BodyError(HTTPException):
+    """A body that is refused; FastAPI passes on no other error of the reading."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    def __init__(self, status: int, code: str, detail: str) -> None:
+        super().__init__(status, detail, CLOSE)
+        self.code = code
+
+
+class BodySize:
+    """Middleware that refuses bodies that are too long, by their declared length or while they come.
+
+    Uploads are bytes or forms, all others JSON.
+    """
+
+    def __init__(self, app: ASGIApp, max_upload_mb: int) -> None:
+        self._app, self._max_upload_mb = app, max_upload_mb
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on with its body complete, or refuse it."""
-        if scope["type"] != "http" or scope["method"] in SAFE or _is_upload(scope):
+        """Pass the request on, or refuse it."""
+        if scope["type"] != "http" or scope["method"] in SAFE:
             await self._app(scope, receive, send)
             return
-        refusal, body = _refusal(Headers(scope=scope)), b""
-        try:
-            if refusal is None:
-                async with within(JSON_SECONDS):
-                    body = await _read(receive)
-        except SlowBodyError as error:
-            refusal = (status_of(error), error.code, str(error))
-        except ClientDisconnect:
-            return
-        if refusal is None and len(body) > MAX_JSON_BYTES:
-            refusal = (413, "body_too_large", _TOO_LONG)
+        most, too_long = self._limit(scope)
+        refusal = _refusal(Headers(scope=scope), most, too_long, is_json=most == MAX_JSON_BYTES)
         if refusal is not None:
-            await respond(Request(scope), *refusal, headers=CLOSE)(scope, receive, send)
+            answer = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
+            await answer(scope, receive, send)
             return
-        await self._app(scope, _replayed(body, receive), send)
+        received = 0
+
+        async def counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > most:
+                raise too_long
+            return message
+
+        await self._app(scope, counted, send)
+
+    def _limit(self, scope: Scope) -> tuple[int, BodyError]:
+        """Return how many bytes there may be, and the error of more."""
+        code, most, remedy = "body_too_large", MAX_JSON_BYTES, "no question needs as many"
+        if scope["method"] == "POST" and _PHOTO.fullmatch(scope["path"]):
+            code, most = "image_too_large", self._max_upload_mb * MIB + 2 * MAX_FORM_BYTES
+            remedy = "send a smaller file, or raise LENS_MAX_UPLOAD_MB where you run the service"
+        elif scope["method"] == "PUT" and _PROFILE.fullmatch(scope["path"]):
+            code, most, remedy = "image_too_large", MAX_PROFILE_BYTES, "send a smaller profile"
+        return most, BodyError(413, code, f"the body has more than {most} bytes: {remedy}")
 
 
-async def _read(receive: Receive) -> bytes:
-    """Return the body, or of a longer one its beginning."""
-    body = bytearray()
-    while len(body) <= MAX_JSON_BYTES:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        body += message.get("body", b"")
-        if not message.get("more_body", False):
-            break
-    return bytes(body)
-
-
-def _is_upload(scope: Scope) -> bool:
-    pattern = UPLOADS.get(scope["method"])
-    return pattern is not None and pattern.fullmatch(scope["path"]) is not None
-
-
-def _refusal(headers: Headers) -> tuple[int, str, str] | None:
-    """Return why a body is refused by its headers alone: status, code, detail; None if it is not."""
+def declared_length(headers: Headers) -> int | None:
+    """Return the declared length of a body in bytes, 0 where none is declared; None where it is no number."""
     declared = headers.get("content-length", "0")
-    if not declared.isdecimal() or len(declared) > 18:
-        return 400, "invalid_request", f"Content-Length {declared[:40]!r} is no number"
-    if int(declared) > MAX_JSON_BYTES:
-        return 413, "body_too_large", f"Content-Length {declared}: {_TOO_LONG}"
+    return int(declared) if declared.isdecimal() and len(declared) <= 18 else None
+
+
+def _refusal(headers: Headers, most: int, too_long: BodyError, *, is_json: bool) -> BodyError | None:
+    """Return why a body is refused by its headers alone; None if it is not."""
+    declared = declared_length(headers)
+    if declared is None:
+        sent = headers["content-length"][:40]
+        text = f"Content-Length {sent!r} is no number: send the number of bytes"
+        return BodyError(400, "invalid_request" if is_json else "malformed_upload", text)
+    if declared > most:
+        return too_long
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    if (int(declared) == 0 and "transfer-encoding" not in headers) or kind == "application/json":
+    empty = declared == 0 and "transfer-encoding" not in headers
+    if not is_json or empty or kind == "application/json":
         return None
-    return 415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json"
-
-
-def _replayed(body: bytes, receive: Receive) -> Receive:
-    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
-
-    async def replay() -> Message:
-        return messages.pop() if messages else await receive()
-
-    return replay
+    return BodyError(415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json")

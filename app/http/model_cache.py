@@ -67,7 +67,7 @@ class ModelCache:
 
         `state` is that of the lens if the caller has just read it.
         """
-        state = self._store.samples.state_of(lens_id) if state is None else state
+        state = self._store.lenses.state_of(lens_id) if state is None else state
         if state is None:
             raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
         if version is not None and version != state.version:
@@ -78,17 +78,17 @@ class ModelCache:
             return fitted
         with self._lock_of(lens_id):  # one thread fits, the others wait for its result
             fitted = self._recall((lens_id, None))
-            if fitted is not None and fitted.state == self._store.samples.state_of(lens_id):
+            if fitted is not None and fitted.state == self._store.lenses.state_of(lens_id):
                 return fitted
             metrics.MODELS.labels("fitted" if fitted is None else "extended").inc()
             return self._keep((lens_id, None), self._build(lens_id, fitted))
 
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
         if old is not None:
-            state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
+            state, samples = self._store.lenses.samples_of(lens_id, after_version=old.state.version)
             if (state.rebuild_epoch, state.way) == (old.state.rebuild_epoch, old.state.way):
                 return Fitted(lens_id, state, old.model.added([stored.sample for stored in samples]))
-        return _fit(lens_id, *self._store.samples.of_lens(lens_id))
+        return _fit(lens_id, *self._store.lenses.samples_of(lens_id))
 
     def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
         check_version(self._store, lens_id, version, state)
@@ -97,7 +97,7 @@ class ModelCache:
             fitted = self._recall(key)
             if fitted is not None and fitted.state.rebuild_epoch == state.rebuild_epoch:
                 return fitted
-            _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
+            _, samples = self._store.lenses.samples_of(lens_id, up_to_version=version)
             return self._keep(key, _fit(lens_id, replace(state, version=version), samples))
 
     def _lock_of(self, lens_id: str) -> threading.Lock:

@@ -10,9 +10,8 @@ from app import distances
 from app import schemas as s
 from app.http.errors import problem_of
 from app.schemas import V1
-from app.store.corrections import CorrectionPlan
 from app.store.owners import now
-from app.store.tables import Base, EventRow, LensRow, PatchRow, PhotoRow
+from app.store.tables import Base, CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow
 
 M = TypeVar("M", bound=s.Model)
 
@@ -38,14 +37,14 @@ def _of(model: type[M], row: Base, **more: object) -> M:
     return model.model_validate({**shared, **more})
 
 
-def photo_out(row: PhotoRow, lens_id: str | None, candidates: Sequence[str] = ()) -> s.PhotoOut:
+def photo_out(row: PhotoRow, candidates: Sequence[str] = ()) -> s.PhotoOut:
     """Describe a photo."""
     camera = " ".join(part for part in (row.camera_maker, row.camera_model) if part)
     return _of(
         s.PhotoOut,
         row,
         id=row.public_id,
-        lens_id=lens_id,
+        lens_id=None if row.lens is None else row.lens.public_id,
         focal_length_mm=row.focal_mm,
         focus_distance_m=None if row.focus_m == distances.INFINITY else row.focus_m,
         camera=camera or None,
@@ -76,7 +75,7 @@ def patch_out(row: PatchRow) -> s.PatchOut:
     return _of(s.PatchOut, row, index=row.idx)
 
 
-def photo_job(row: PhotoRow, lens_id: str | None, candidates: Sequence[str] = ()) -> s.JobOut:
+def photo_job(row: PhotoRow, candidates: Sequence[str] = ()) -> s.JobOut:
     """Describe the work on a photo."""
     state = JOB_STATES[row.state]
     estimating = row.state == "estimating"
@@ -95,16 +94,15 @@ def photo_job(row: PhotoRow, lens_id: str | None, candidates: Sequence[str] = ()
         links={
             "self": f"{V1}/jobs/{row.public_id}",
             "photo": f"{V1}/photos/{row.public_id}",
-            "lens": None if lens_id is None else f"{V1}/lenses/{lens_id}",
+            "lens": None if row.lens is None else f"{V1}/lenses/{row.lens.public_id}",
             "correction": None,
             "result": None,
         },
     )
 
 
-def correction_job(plan: CorrectionPlan) -> s.JobOut:
+def correction_job(row: CorrectionRow) -> s.JobOut:
     """Describe the work on a correction."""
-    row = plan.correction
     running = row.state == "running"
     own = f"{V1}/corrections/{row.public_id}"
     since = row.started_at if running else None
@@ -117,34 +115,32 @@ def correction_job(plan: CorrectionPlan) -> s.JobOut:
         progress={"done": row.progress_done, "total": row.progress_total, "unit": "tiles"},
         eta_seconds=None if since is None else _eta(since, row.progress_done, row.progress_total),
         attempt=max(row.attempt, 1),
-        error=_correction_problem(plan),
+        error=_correction_problem(row),
         links={
             "self": f"{V1}/jobs/{row.public_id}",
-            "photo": f"{V1}/photos/{plan.photo.public_id}",
-            "lens": f"{V1}/lenses/{plan.lens.public_id}",
+            "photo": f"{V1}/photos/{row.photo.public_id}",
+            "lens": f"{V1}/lenses/{row.lens.public_id}",
             "correction": own,
             "result": f"{own}/result" if row.state == "succeeded" else None,
         },
     )
 
 
-def correction_out(plan: CorrectionPlan) -> s.CorrectionOut:
+def correction_out(row: CorrectionRow) -> s.CorrectionOut:
     """Describe a correction."""
-    row = plan.correction
     asked = {name: row.params[name] for name in ("method", "strength", "output", "roi")}
     return _of(
         s.CorrectionOut,
         row,
         id=row.public_id,
-        photo_id=plan.photo.public_id,
-        lens_id=plan.lens.public_id,
-        error=_correction_problem(plan),
+        photo_id=row.photo.public_id,
+        lens_id=row.lens.public_id,
+        error=_correction_problem(row),
         **asked,
     )
 
 
-def _correction_problem(plan: CorrectionPlan) -> s.Problem | None:
-    row = plan.correction
+def _correction_problem(row: CorrectionRow) -> s.Problem | None:
     if row.state == "cancelled":
         return problem_of("cancelled", "cancelled by its owner; ask for the correction again to start anew")
     return None if row.error_code is None else problem_of(row.error_code, row.error_detail)

@@ -63,31 +63,27 @@ class Inspected(Answer):
     metadata: Metadata
 
 
-class Position(Answer):
-    """A field position."""
+class Window(Answer):
+    """A square of a photo, in pixels and as a field position."""
 
+    row: Pixel
+    col: Pixel
+    size: Annotated[int, Field(ge=1, le=10_000)]
     r: Annotated[float, Field(ge=0, le=2)]
     phi: Annotated[float, Field(ge=-4, le=4)]
 
 
-class ChosenPatch(Answer):
+class ChosenPatch(Window):
     """A patch to estimate."""
 
-    row: Pixel
-    col: Pixel
-    size: Annotated[int, Field(ge=1, le=10_000)]
-    position: Position
     score: Annotated[float, Field(ge=-1e9, le=1e9)]
     cell: Annotated[int, Field(ge=0, le=100_000)]
 
 
-class RejectedWindow(Position):
-    """A window that was looked at and left out."""
+class RejectedWindow(Window):
+    """A window that was looked at and left out, and why."""
 
-    row: Pixel
-    col: Pixel
-    size: Annotated[int, Field(ge=1, le=10_000)]
-    reason: Annotated[str, Field(max_length=60)]
+    rejected: Annotated[str, Field(max_length=60)]
 
 
 class Lateral(Answer):

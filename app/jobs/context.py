@@ -24,7 +24,6 @@ from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
-from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.core.types import ignore_step
 
@@ -189,7 +188,7 @@ class JobContext:
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
                 for name in (R_MAP, SHOWN):
                     if (folder / name).is_file():
-                        self.storage.put_file(f"{photo_folder(photo)}{name}", folder / name)
+                        self.storage.put_file(f"{photo.folder}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete, or absent
             return target

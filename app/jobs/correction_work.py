@@ -23,12 +23,12 @@ from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
-from app.store.corrections import CorrectionPlan, Result, Run, run_folder
+from app.store.jobs import Result, Run
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
 from app.store.samples import LensState
-from app.store.tables import LensRow
+from app.store.tables import CorrectionRow, LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
 from lensmodel.correction import Bounds
@@ -55,30 +55,30 @@ class CorrectionWork:
 
     def __init__(self, context: JobContext) -> None:
         self._context = context
-        self._corrections = context.store.corrections
+        self._jobs = context.store.jobs
 
     def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
 
         def wanted() -> bool:
-            return self._corrections.is_live(correction_id, epoch)
+            return self._jobs.is_live(correction_id, epoch)
 
-        run = self._corrections.start(correction_id, epoch)
-        plan = None if run is None else self._corrections.plan(correction_id, ANY_OWNER)
-        if run is None or plan is None:
+        run = self._jobs.start(correction_id, epoch)
+        row = None if run is None else self._jobs.correction(correction_id, ANY_OWNER)
+        if run is None or row is None:
             return
         try:
-            self._correct(run, plan, wanted)
+            self._correct(run, row, wanted)
         except NotWantedError:
             log.info("correction %s is not wanted any more", correction_id)
         except JobFailedError as error:
-            self._corrections.fail(correction_id, error.code, error.detail, epoch=epoch)
+            self._jobs.fail(correction_id, error.code, error.detail, epoch=epoch)
 
-    def _correct(self, run: Run, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
-        photo, params = plan.photo, plan.correction.params
-        self._corrections.progress(run, 0, 0, "developing")
+    def _correct(self, run: Run, row: CorrectionRow, wanted: Callable[[], bool]) -> None:
+        photo, params = row.photo, row.params
+        self._jobs.progress(run, 0, 0, "developing")
         developed = self._context.developed(photo, wanted)
-        self._corrections.progress(run, 0, 0, "correcting")
+        self._jobs.progress(run, 0, 0, "correcting")
         settings = self._context.settings
         limits = self._context.limits(photo, settings.task_seconds, 120)
         limits = replace(
@@ -99,11 +99,11 @@ class CorrectionWork:
             "roi": params.get("roi"),
             "layers": params.get("layers", False),
             "workers": settings.worker_slots,
-            "description": _description(plan),
-            "lens": plan.lens.label or "",
+            "description": _description(row),
+            "lens": row.lens.label or "",
         }
         with self._context.sandbox.folder() as folder:
-            lens_id, version = plan.lens.public_id, plan.correction.lens_version
+            lens_id, version = row.lens.public_id, row.lens_version
             state = self._samples(lens_id, version, folder)
             arguments["mode"] = PRESETS[state.way].mode
             done = self._context.attempt(
@@ -117,11 +117,11 @@ class CorrectionWork:
                 on_progress=self._progress_of(run),
             )
             done = checked(Corrected, done)
-            self._store_result(run, plan, folder / Path(done["file"]).name, done["report"])
+            self._store_result(run, row, folder / Path(done["file"]).name, done["report"])
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
         try:
-            state, stored = self._context.store.samples.of_lens(lens_id, up_to_version=version)
+            state, stored = self._context.store.lenses.samples_of(lens_id, up_to_version=version)
         except NoSamplesError as error:
             raise JobFailedError(error.code, str(error)) from error
         if not stored:
@@ -138,22 +138,22 @@ class CorrectionWork:
             if time.monotonic() - last > PROGRESS_S or done == total:
                 last = time.monotonic()
                 with missable():
-                    self._corrections.progress(run, done, total)
+                    self._jobs.progress(run, done, total)
 
         return tell
 
-    def _store_result(self, run: Run, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
-        if path.suffix != SUFFIX[plan.correction.params["output"]["format"]] or not path.is_file():
+    def _store_result(self, run: Run, row: CorrectionRow, path: Path, report: dict[str, Any]) -> None:
+        if path.suffix != SUFFIX[row.params["output"]["format"]] or not path.is_file():
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        base = run_folder(plan.correction)
+        base = row.run_folder
         key = f"{base}result{path.suffix}"
         self._context.storage.put_file(key, path)
         for shown in (*SIDES.values(), *LAYER_FILES.values()):
             if (path.parent / shown).is_file():
                 self._context.storage.put_file(f"{base}{shown}", path.parent / shown)
-        stem = PurePath(plan.photo.filename).stem or "photo"
+        stem = PurePath(row.photo.filename).stem or "photo"
         result = Result(
             key=key,
             etag=digest,
@@ -161,7 +161,7 @@ class CorrectionWork:
             size=path.stat().st_size,
             name=f"{stem}-corrected{path.suffix}",
         )
-        if not self._corrections.finish(run, result, report):
+        if not self._jobs.finish(run, result, report):
             self._context.storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
     def measure(self, lens_id: str, version: int) -> None:
@@ -240,11 +240,11 @@ def _bounds(params: dict[str, Any]) -> dict[str, float]:
     return {name: params[name] for name in ("halo", "texture", "denoise") if name in params}
 
 
-def _description(plan: CorrectionPlan) -> str:
-    params = plan.correction.params
-    lens = plan.lens.label or full_name(plan.lens.maker, plan.lens.model) or "unknown lens"
+def _description(row: CorrectionRow) -> str:
+    params = row.params
+    lens = row.lens.label or full_name(row.lens.maker, row.lens.model) or "unknown lens"
     return (
-        f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
+        f"lens blur corrected by lensmodel: {lens}, version {row.lens_version}, "
         f"method {params['method']}, strength {params['strength']:g}"
         f"{Bounds(**_bounds(params)).described}"
     )

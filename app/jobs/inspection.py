@@ -20,7 +20,6 @@ from app.jobs.task_files import CLEANED, THUMBNAIL
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName
 from app.store.owners import ANY_OWNER
-from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.core.names import name_key, serial_key
 
@@ -80,7 +79,7 @@ def _keep_thumbnail(
             "thumbnail", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
         )
         if outcome.ending == "ok" and (folder / THUMBNAIL).is_file():
-            context.storage.put_file(f"{photo_folder(photo)}{THUMBNAIL}", folder / THUMBNAIL)
+            context.storage.put_file(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
 
 
 def remove_location(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
@@ -106,7 +105,7 @@ def _record_location(context: JobContext, photo: PhotoRow, found: Any, cleaned: 
     if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
         with cleaned.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        key = f"{photo_folder(photo)}cleaned-{digest[:16]}"
+        key = f"{photo.folder}cleaned-{digest[:16]}"
         context.storage.put_file(key, cleaned)
         photos.record_location(photo, word, key=key, digest=digest)
     else:

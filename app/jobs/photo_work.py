@@ -16,19 +16,21 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.jobs import inspection
-from app.jobs.answers import Selected, checked
-from app.jobs.context import JobContext, JobFailedError, NotWantedError
-from app.jobs.measurement_work import MeasurementWork
-from app.jobs.profile_work import read_in
-from app.jobs.queue import Job, JobEngine
+from app.jobs.answers import ReadProfile, Selected, checked
+from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
+from app.jobs.queue import JobEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
+from app.other_lens import REMEDY, Described, difference
+from app.sandbox.outcome import TaskLimits
 from app.store import NewPatch, NewSample, Store
+from app.store.jobs import Job
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, PhotoRow
 from app.ways import configured_way
-from lensmodel.core.errors import NoUsablePatchesError
-from lensmodel.core.types import FieldPosition
+from lensmodel.core import codec
+from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
+from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
 from lensmodel.workflow.sampling import Preset
@@ -46,6 +48,23 @@ SELECTOR: Final = "r-map"
 """Who chooses the patches of a photo that names nobody, of `lensmodel.patches.selectors`."""
 
 
+MAX_PLACES: Final = 1000
+"""Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken."""
+
+WAIT_FOR_REFERENCE_S: Final = 60.0
+"""How long the open photo of a pair waits until the closed one is inspected (chosen): that takes
+seconds, unless many photos are before it."""
+
+_UNREAD: Final = ("received", "inspecting")
+_MEASURING: Final = 96  # bytes a pixel (chosen, by counting): two mapped photos, a float64 plane of each
+
+COPIES: Final = 8
+"""Times the unpacked size that reading takes (chosen, by counting): bytes, float32, float64, the model."""
+
+MAX_UNPACKED: Final = 256 << 20
+"""Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has."""
+
+
 class PhotoWork:
     """Jobs of photos and of their cells."""
 
@@ -60,7 +79,7 @@ class PhotoWork:
         try:
             photo = _begun(self._store, photo_id, epoch)
             if photo.kind == PROFILE_FILE:
-                read_in(self._context, photo)
+                _read_profile(self._context, photo)
                 return
             steps = _Measured if photo.given.get("kind") else _Steps
             steps(self._context, self._engine, photo).run()
@@ -71,7 +90,7 @@ class PhotoWork:
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
-        rows = self._context.store.patches.begin_cell(photo_id, epoch, cell)
+        rows = self._context.store.photos.begin_cell(photo_id, epoch, cell)
         if not rows:
             return
         numbers = [row.idx for row in rows]
@@ -83,12 +102,13 @@ class PhotoWork:
             log.info("cell %d of photo %s: %s: %s", cell, photo_id, error.code, error.detail)
             rejected = error.code in {"no_samples", "no_usable_patches", "invalid_parameter"}
             reason = "not-enough-evidence" if rejected else error.code
-            self._store.patches.fail(photo_id, epoch, numbers, reason, rejected=rejected)
+            self._store.photos.fail_patches(photo_id, epoch, reason, indices=numbers, rejected=rejected)
             return
-        self._store.patches.finish(photo_id, epoch, samples)
+        self._store.photos.add_samples(photo_id, epoch, samples)
         left = set(numbers) - {sample.idx for sample in samples}
         if left:
-            self._store.patches.fail(photo_id, epoch, sorted(left), "not-enough-evidence", rejected=True)
+            reason = "not-enough-evidence"
+            self._store.photos.fail_patches(photo_id, epoch, reason, indices=sorted(left), rejected=True)
 
     def _samples(self, photo: PhotoRow, rows: list[PatchRow]) -> list[NewSample]:
         def wanted() -> bool:
@@ -100,7 +120,7 @@ class PhotoWork:
         arguments = {
             "developed": str(developed),
             "photo": photo.public_id,
-            "patches": [_described(row) for row in rows],
+            "patches": [codec.to_json(_patch_of(row)) for row in rows],
             "numbers": [row.idx for row in rows],
             "settings": stored_settings(photo),
             "estimator": way.estimator,
@@ -196,7 +216,7 @@ class _Steps:
     def select(self) -> None:
         """Choose the patches, and measure the lateral colour."""
         photo, developed = self._photo, self._developed
-        if self._store.patches.all_of(photo.public_id, photo.epoch):
+        if self._store.photos.patches(photo.public_id, photo.epoch):
             return
         limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
         arguments = {
@@ -219,7 +239,7 @@ class _Steps:
         selection = checked(Selected, selection)
         if selection["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, photo.epoch, selection["lateral"])
-        self._store.patches.add(photo.public_id, photo.epoch, _plan_of(selection))
+        self._store.photos.plan_patches(photo.public_id, photo.epoch, _plan_of(selection))
 
     def estimate(self) -> None:
         """Hand out the cells and wait until each is done, rejected or given up."""
@@ -227,13 +247,13 @@ class _Steps:
         owner = f"owner-{photo.owner_id}"
         jobs = {
             cell: Job("cell", (photo.public_id, photo.epoch, cell), owner)
-            for cell in self._store.patches.cells(photo.public_id, photo.epoch)
+            for cell in self._store.photos.cells(photo.public_id, photo.epoch)
         }
         for job in jobs.values():
             self._engine.enqueue(job)
         looked = time.monotonic()
         while self._wanted():
-            still_open = self._store.patches.cells(photo.public_id, photo.epoch)
+            still_open = self._store.photos.cells(photo.public_id, photo.epoch)
             if not still_open:
                 return
             if time.monotonic() - looked > LOOK_AFTER_S:
@@ -252,14 +272,12 @@ class _Steps:
         if status == "unknown":
             self._engine.enqueue(job)
         elif status in {"done", "lost"}:
-            rows = self._store.patches.of_cell(photo.public_id, photo.epoch, cell)
-            numbers = [row.idx for row in rows]
-            self._store.patches.fail(photo.public_id, photo.epoch, numbers, "crashed_repeatedly")
+            self._store.photos.fail_patches(photo.public_id, photo.epoch, "crashed_repeatedly", cell=cell)
 
     def count(self) -> None:
         """Count the photo, if enough of its patches gave a PSF, and not all in one place."""
         photo = self._photo
-        rows = self._store.patches.all_of(photo.public_id, photo.epoch)
+        rows = self._store.photos.patches(photo.public_id, photo.epoch)
         tried = [row for row in rows if row.cell is not None]
         done = [row for row in tried if row.state == "done"]
         if done:
@@ -281,8 +299,48 @@ class _Measured(_Steps):
     """A photo that was made to measure the lens: one task measures all over it."""
 
     def select(self) -> None:
-        """Measure; the places are the patches, and their samples are there at once."""
-        MeasurementWork(self._context).measure(self._photo, self._developed, self._wanted)
+        """Measure; the places are the patches, and their samples are there at once.
+
+        A repeated call adds nothing twice.
+        """
+        photo, settings = self._photo, self._context.settings
+        folders = [self._developed, *self._reference()]
+        arguments = {
+            "kind": photo.given["kind"],
+            "developed": [str(folder) for folder in folders],
+            "photo": photo.public_id,
+            "settings": stored_settings(photo),
+            "size": self._way.kernel_size,
+        }
+        limits = self._context.limits(photo, settings.task_seconds, _MEASURING)
+        with self._context.sandbox.folder() as folder:
+            listed = self._context.attempt(
+                "measure-lens", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=folders
+            )
+            patches, samples = _measured(listed, folder)
+        photos, which = self._store.photos, (photo.public_id, photo.epoch)
+        photos.plan_patches(*which, patches)
+        photos.set_state(photo.public_id, ("selecting",), "estimating", epoch=photo.epoch)
+        photos.add_samples(*which, samples)
+
+    def _reference(self) -> list[Path]:
+        """Return the folder of the developed closed photo of a pair."""
+        name, photos = self._photo.given.get("reference_id"), self._store.photos
+        if name is None:
+            return []
+        row, end = photos.get(name, ANY_OWNER), time.monotonic() + WAIT_FOR_REFERENCE_S
+        while row is not None and row.state in _UNREAD and time.monotonic() < end and self._wanted():
+            time.sleep(WAIT_S)
+            row = photos.get(name, ANY_OWNER)
+        if row is None or row.owner_id != self._photo.owner_id:
+            raise JobFailedError(
+                "unknown_photo", f"the reference photo {name} is not there any more; send both photos again"
+            )
+        if row.width is None:
+            raise JobFailedError(
+                "not_ready", f"the reference photo {name} was not read yet; send the open photo again"
+            )
+        return [self._context.developed(row, self._wanted)]
 
     def estimate(self) -> None:
         """Nothing is left to estimate."""
@@ -359,46 +417,10 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
 
 def _plan_of(selection: dict[str, Any]) -> list[NewPatch]:
     """Return the patches and windows of the task `select` as rows to insert."""
-    chosen = [
-        NewPatch(
-            idx=number,
-            row=patch["row"],
-            col=patch["col"],
-            size=patch["size"],
-            r=patch["position"]["r"],
-            phi=patch["position"]["phi"],
-            cell=patch["cell"],
-            score=patch["score"],
-        )
-        for number, patch in enumerate(selection["patches"])
+    return [
+        NewPatch(idx=number, **window)
+        for number, window in enumerate([*selection["patches"], *selection["rejected"]])
     ]
-    rejected = [
-        NewPatch(
-            idx=len(chosen) + number,
-            row=window["row"],
-            col=window["col"],
-            size=window["size"],
-            r=window["r"],
-            phi=window["phi"],
-            rejected=window["reason"],
-        )
-        for number, window in enumerate(selection["rejected"])
-    ]
-    return chosen + rejected
-
-
-def _described(row: PatchRow) -> dict[str, Any]:
-    """Return a patch as JSON for a task."""
-    place = {"r": row.r, "phi": row.phi}
-    score = row.score or 0.0
-    return {
-        "row": row.row,
-        "col": row.col,
-        "size": row.size,
-        "position": place,
-        "score": score,
-        "cell": row.cell,
-    }
 
 
 def _patch_of(row: PatchRow) -> Patch:
@@ -417,3 +439,76 @@ def _why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:
         "no_usable_patches",
         f"{good} of {len(tried)} patches gave a PSF: use a photo with more fine detail in focus",
     )
+
+
+def _measured(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON
+    """Validate the measurements of a child as untrusted input."""
+    try:
+        if not 0 < len(listed) <= MAX_PLACES * len(CHANNELS):
+            raise InvalidInputError(f"{len(listed)} samples")
+        patches: dict[int, NewPatch] = {}
+        samples = []
+        for sample, entry in zip(returned_samples(folder, count=len(listed)), listed, strict=True):
+            number, error = int(entry["idx"]), sample.error
+            if error is None or not error <= 1.0 or not 0 <= number < MAX_PLACES:
+                raise InvalidInputError(f"a sample of place {number} with error {error}")
+            patches.setdefault(
+                number,
+                NewPatch(
+                    idx=number,
+                    row=int(entry["row"]),
+                    col=int(entry["col"]),
+                    size=int(entry["side"]),
+                    r=sample.position.r,
+                    phi=sample.position.phi,
+                    cell=number,
+                    score=1.0 - error,
+                ),
+            )
+            samples.append(NewSample(number, sample))
+    except DAMAGED as error:
+        raise JobFailedError("internal_error", f"the measurement gave no kernels: {error}") from error
+    return list(patches.values()), samples
+
+
+def _read_profile(context: JobContext, file: PhotoRow) -> None:
+    """Let the samples of a profile join the lens that `file` names."""
+    store, settings = context.store, context.settings
+
+    def wanted() -> bool:
+        return store.photos.is_live(file.public_id, file.epoch)
+
+    limits = TaskLimits(
+        memory_mb=SPARE_MB + COPIES * (MAX_UNPACKED >> 20), wall_s=settings.develop_seconds, scratch_mb=1024
+    )
+    with context.original(file) as path, context.sandbox.folder() as folder:
+        arguments = {"path": str(path), "max_unpacked": MAX_UNPACKED}
+        try:
+            answer = context.attempt(
+                "profile", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
+            )
+        except JobFailedError as error:
+            if error.code != "invalid_parameter":
+                raise
+            raise JobFailedError("malformed_upload", error.detail) from error
+        read = checked(ReadProfile, answer)
+        try:
+            samples = returned_samples(folder, count=read["samples"])
+        except DAMAGED as error:
+            raise JobFailedError("internal_error", f"the profile gave no kernels: {error}") from error
+    lens = store.lenses.get(file.given["lens_id"], ANY_OWNER)
+    if lens is None:
+        raise JobFailedError("unknown_lens", "the lens was deleted meanwhile: send the profile to another")
+    if configured_way(settings, lens.way).mode != read["mode"]:
+        text = f"the profile was learned with the model {read['mode']}, lens {lens.public_id} with {lens.way}"
+        raise JobFailedError("conflict", f"{text}: send it to a lens of that model")
+    if not file.given.get("any_lens"):
+        focals = store.lenses.coverage_of([lens])[lens.id][1]
+        named = {name: read["lens"].get(name) for name in ("maker", "model", "serial")}
+        other = Described(**named, focals_mm={s.settings.focal_mm for s in samples if s.settings.focal_mm})
+        why = difference(Described(lens.maker, lens.model, lens.serial, focals_mm=focals), other)
+        if why is not None:
+            raise JobFailedError("other_lens", f"the profile seems to be of another lens: {why}; {REMEDY}")
+    names = {key: name for key, name in read["photos"].items() if name.isprintable()}
+    if store.photos.take_in(file, samples, names) is None:
+        raise NotWantedError

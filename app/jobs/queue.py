@@ -3,7 +3,8 @@
 The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. No other
 module uses it. A job is a name with a few ids and numbers; what it did is recorded in our own
 tables, so that running a job twice is harmless and the engine can be replaced, or its database
-lost, without losing a photo.
+lost, without losing a photo. The library itself starts the jobs of a dead process again only where that
+process starts again; here others resume them, once the tables say that its lease has expired.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ import sqlite3
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from datetime import datetime
-from typing import Final, Literal, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Literal, ParamSpec, Protocol, TypeAlias, TypeVar
 
 from dbos import DBOS, DBOSConfig, EnqueueOptions
 from dbos import Serializer as DBOSSerializer
 from sqlalchemy import make_url
+
+from app.store.jobs import Job, Kind
 
 log = logging.getLogger(__name__)
 
 JOB_PROTOCOL: Final = 1
 """Raised when jobs of an older program can no longer be finished by this one."""
 
-Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
 Status: TypeAlias = Literal["unknown", "waiting", "done", "lost"]
 Handler: TypeAlias = Callable[..., None]
 P = ParamSpec("P")
@@ -40,31 +41,17 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
     "correction": "corrections",
     "measure": "patches",
 }
-MAX_STARTS: Final[Mapping[Kind, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
-"""Restarts of a job after deaths of its worker, before it is given up (chosen): the job of a photo only
-waits for others and hardly kills one, the others may be what killed it."""
+MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
+"""Deaths of its worker after which a job is started again (chosen): the job of a photo only waits for others
+and hardly kills one, the others may be what killed it."""
+
+_DEATHS: Final = "deaths"
+"""Attribute of a job: how many workers have died of it, or while it ran."""
 
 POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
 """Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core."""
 
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One job: its kind, the ids and numbers of its subject, and the owner for whom it runs.
-
-    The id is made of kind and arguments: enqueuing a job twice runs it once.
-    """
-
-    kind: Kind
-    arguments: tuple[str | int, ...]
-    owner: str = "local"
-
-    @property
-    def id(self) -> str:
-        """The engine's id of this job."""
-        return "/".join([self.kind, *map(str, self.arguments)])
 
 
 class JobEngine(Protocol):
@@ -79,8 +66,8 @@ class JobEngine(Protocol):
     def status(self, job: Job) -> Status:
         """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
 
-    def take_over(self, executor_id: str) -> int:
-        """Put the running jobs of a dead worker back into the queue; return how many it still holds."""
+    def take_over(self, executor_id: str) -> None:
+        """Put the running jobs of a dead worker back into the queue, or give them up."""
 
     def holders(self) -> set[str]:
         """Return the workers that run jobs, as far as the engine knows."""
@@ -140,7 +127,7 @@ class DbosEngine:
         }
         DBOS(config=config)
         for kind, handler in handlers.items():
-            DBOS.workflow(name=kind, max_recovery_attempts=MAX_STARTS[kind])(_plain(handler))
+            DBOS.workflow(name=kind)(_plain(handler))
         DBOS.launch()
         for queue, limit in self._concurrency.items():
             DBOS.register_queue(
@@ -176,40 +163,31 @@ class DbosEngine:
             return "unknown"
         if record.status in _WAITING:
             return "waiting"
-        return "lost" if record.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else "done"
+        return "lost" if record.status == "CANCELLED" else "done"
 
-    def take_over(self, executor_id: str) -> int:
-        """Requeue the running jobs of a dead worker. See `JobEngine`.
+    def take_over(self, executor_id: str) -> None:
+        """Resume the running jobs of a dead worker in their queues. See `JobEngine`.
 
-        The library's call is private and swallows errors of single jobs; jobs that
-        still name the dead worker afterwards are counted, so that the caller can try again.
+        Interrupted, it can be done again. Two workers that do it at once may both start a job: the tables
+        count what it did once.
         """
-        DBOS._recover_pending_workflows([executor_id])  # noqa: SLF001 - contract-tested; no public way
-        return sum(holder == executor_id for holder in self._running())
+        for row in _listed(status="PENDING", executor_id=executor_id, app_version=str(JOB_PROTOCOL)):
+            deaths = (row.attributes or {}).get(_DEATHS, 0) + 1
+            if deaths > MAX_DEATHS[row.name]:
+                _outside(DBOS.cancel_workflow, row.workflow_id)
+            else:
+                _outside(DBOS.update_workflow_attributes, row.workflow_id, {_DEATHS: deaths})
+                _outside(DBOS.resume_workflow, row.workflow_id, queue_name=row.queue_name)
 
     def holders(self) -> set[str]:
         """Return the workers that run jobs. See `JobEngine`."""
-        return set(self._running())
-
-    def _running(self) -> list[str]:
-        rows = _outside(
-            DBOS.list_workflows,
-            status="PENDING",
-            app_version=str(JOB_PROTOCOL),
-            load_input=False,
-            load_output=False,
-        )
-        return [row.executor_id for row in rows if row.executor_id is not None]
+        running = _listed(status="PENDING", app_version=str(JOB_PROTOCOL))
+        return {row.executor_id for row in running if row.executor_id is not None}
 
     def forget(self, before: datetime) -> int:
         """Delete old records. See `JobEngine`."""
-        ended = _outside(
-            DBOS.list_workflows,
-            status=["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"],
-            completed_before=before.isoformat(),
-            limit=1000,
-            load_input=False,
-            load_output=False,
+        ended = _listed(
+            status=["SUCCESS", "ERROR", "CANCELLED"], completed_before=before.isoformat(), limit=1000
         )
         ids = [row.workflow_id for row in ended]
         if ids:
@@ -230,6 +208,10 @@ def _plain(handler: Handler) -> Handler:
         handler(*arguments)
 
     return run
+
+
+def _listed(**which: Any) -> list[Any]:  # noqa: ANN401 - of `DBOS.list_workflows`
+    return _outside(DBOS.list_workflows, load_input=False, load_output=False, **which)
 
 
 def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:

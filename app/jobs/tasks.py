@@ -41,12 +41,13 @@ from lensmodel import measured as lens_measure
 from lensmodel.blind import estimators
 from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
-from lensmodel.core.types import LensSettings, Planes
+from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch, selectors
+from lensmodel.patches.windows import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.tags.location import find_location
 from lensmodel.report import lens_report
@@ -137,18 +138,21 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
         estimator=arguments["estimator"],
         on_step=progress,
     )
+    patches = [
+        {**_window(patch, patch.position), "score": patch.score, "cell": patch.cell}
+        for patch in selection.patches
+    ]
     rejected = []
     for window in selection.rejected:
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
-        position = developed.frame.position(*centre)
-        place = {"row": window.row, "col": window.col, "size": window.size}
-        rejected.append({**place, "r": position.r, "phi": position.phi, "reason": window.reason})
+        place = _window(window, developed.frame.position(*centre))
+        rejected.append({**place, "rejected": window.reason})
     try:
         lateral = codec.to_json(correcting.lateral_of(developed))
     except LensModelError as error:
         log.info("no lateral colour: %s", error)
         lateral = None
-    return {"patches": codec.to_json(selection.patches), "rejected": rejected, "lateral": lateral}
+    return {"patches": patches, "rejected": rejected, "lateral": lateral}
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
@@ -323,6 +327,11 @@ TASKS: Final[Mapping[str, Task]] = {
 for _registry in (estimators, selectors, correction.deconvolvers):
     _registry.load_installed()  # in the fork server: a confined child may no longer read their files
 FieldNetwork.load()  # nor the weights, which all children share
+
+
+def _window(window: Patch | Rejection, place: FieldPosition) -> dict[str, Any]:
+    square = {"row": window.row, "col": window.col, "size": window.size}
+    return {**square, "r": place.r, "phi": place.phi}
 
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:

@@ -9,21 +9,23 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
+
+from structlog.contextvars import bound_contextvars
 
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
 from app.jobs.context import JobContext, JobFailedError, drop_developed
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
-from app.jobs.job_log import JobRecord, accounted
 from app.jobs.photo_work import PhotoWork
-from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
+from app.jobs.queue import DbosEngine, Handler, JobEngine
 from app.jobs.task_files import R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
@@ -31,10 +33,10 @@ from app.runtime.outage import Patience, is_outage
 from app.runtime.processes import end_with_parent, is_running, on_signals, started_at
 from app.runtime.settings import Settings
 from app.sandbox import account, confine
-from app.sandbox.budget import Budget
-from app.sandbox.runner import Sandbox
+from app.sandbox.runner import Budget, Sandbox
 from app.store import Store
 from app.store.database import new_id
+from app.store.jobs import Job, Kind
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 
@@ -74,8 +76,42 @@ class Ending:
         return cls("internal_error", _OURS)
 
 
-Broke: TypeAlias = Callable[..., None]
-"""Called as `broke(ending, *arguments of the job)`."""
+_SUBJECT: Final = {
+    "photo": "photo_id",
+    "cell": "photo_id",
+    "correction": "correction_id",
+    "measure": "lens_id",
+}
+
+
+@dataclass
+class JobRecord:
+    """Kind and ending of one job."""
+
+    kind: str
+    ending: str = "done"
+
+    def retries(self, error: BaseException) -> None:
+        """Count a retry of the job after an error."""
+        metrics.RETRIES.labels(self.kind, "outage" if is_outage(error) else "unforeseen").inc()
+
+
+@contextmanager
+def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[JobRecord]:
+    """Provide the record of a job; inside, each log line carries the ids of the job and its subject."""
+    record = JobRecord(kind)
+    ids = {"job_id": "/".join([kind, *map(str, arguments)])}
+    if kind in _SUBJECT:
+        ids[_SUBJECT[kind]] = str(arguments[0])
+    began = time.monotonic()
+    with bound_contextvars(**ids):
+        try:
+            yield record
+        except BaseException:
+            record.ending = "raised"
+            raise
+        finally:
+            metrics.JOB_SECONDS.labels(kind, record.ending).observe(time.monotonic() - began)
 
 
 class Worker:
@@ -126,7 +162,7 @@ class Worker:
         host = socket.gethostname()
         began = started_at(os.getpid())
         self._insist(
-            lambda: self._store.workers.register(
+            lambda: self._store.jobs.register(
                 self.id, host=host, pid=os.getpid(), pid_started=began, confined=self._confined
             )
         )
@@ -136,36 +172,32 @@ class Worker:
         lease = self._start_thread(beat_s, self._keep_lease)
         self._insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
         photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
-        self._engine.start(
-            {
-                "photo": self._safe(photos.photo, self._photo_broke),
-                "cell": self._safe(photos.cell, self._cell_broke),
-                "correction": self._safe(corrections.correction, self._correction_broke),
-                "measure": self._safe(corrections.measure, self._measure_broke),
-            }
-        )
+        handlers: dict[Kind, Handler] = {
+            "photo": photos.photo,
+            "cell": photos.cell,
+            "correction": corrections.correction,
+            "measure": corrections.measure,
+        }
+        self._engine.start({kind: self._safe(handler, kind) for kind, handler in handlers.items()})
         self._take_over_gone(host)
-        self._start_thread(TIDY_S, self._tidy)  # deleting may take long
-        duties = (
-            (SWEEP_S, self._sweep),
-            (beat_s, self._take_over_silent),
-            (RECONCILE_S, self._reconcile),
-        )
-        due = [0.0, 0.0, time.monotonic() + RECONCILE_S]
-        while not self._stop.is_set():
-            for number, (period, duty) in enumerate(duties):
-                if time.monotonic() >= due[number]:
-                    self._do(duty)
-                    due[number] = time.monotonic() + period
-            self._stop.wait(max(min(due) - time.monotonic(), 0.01))
+        self._start_thread(SWEEP_S, self._sweep)
+        self._start_thread(beat_s, self._take_over_silent)
+        self._start_thread(RECONCILE_S, self._reconcile, first_s=RECONCILE_S)
+        self._start_thread(TIDY_S, self._tidy)
+        self._stop.wait()
         lease.join(beat_s)  # or it would see our row dead and conclude that others had taken over
         self._leave()
 
-    def _start_thread(self, period: float, duty: Callable[[], None]) -> threading.Thread:
+    def _start_thread(
+        self, period_s: float, duty: Callable[[], None], *, first_s: float = 0.0
+    ) -> threading.Thread:
+        """Do a duty again and again, so that none delays another."""
+
         def repeat() -> None:
+            self._stop.wait(first_s)
             while not self._stop.is_set():
                 self._do(duty)
-                self._stop.wait(period)
+                self._stop.wait(period_s)
 
         thread = threading.Thread(target=repeat, daemon=True)
         thread.start()
@@ -178,7 +210,7 @@ class Worker:
 
     def _leave(self) -> None:
         self._sandbox.stop()
-        self._do(lambda: self._store.workers.bury(self.id))
+        self._do(lambda: self._store.jobs.bury(self.id))
         shutil.rmtree(self._scratch / self.id, ignore_errors=True)
         logging.shutdown()
         os._exit(0)  # threads in the middle of a job must not go on to report it finished
@@ -211,11 +243,11 @@ class Worker:
         while self._stop.is_set():
             time.sleep(1.0)
 
-    def _safe(self, handler: Handler, broke: Broke) -> Handler:
+    def _safe(self, handler: Handler, kind: Kind) -> Handler:
         """Wrap a job: failures are retried, and the last one ends the job with a reason."""
 
         def run(*arguments: str | int) -> None:
-            with accounted(handler.__name__, arguments) as record:
+            with accounted(kind, arguments) as record:
                 work(record, *arguments)
 
         def work(record: JobRecord, *arguments: str | int) -> None:
@@ -226,7 +258,7 @@ class Worker:
                 except Exception as error:
                     self._hold_while_stopping()
                     pause = patience.pause_after(error)
-                    name = f"{handler.__name__}{arguments}"
+                    name = f"{kind}{arguments}"
                     if is_outage(error):
                         log.warning("job %s: %s: %s", name, type(error).__name__, error)
                     else:
@@ -239,7 +271,7 @@ class Worker:
                     self._rest(pause)
                 else:
                     return
-            self._insist(lambda: broke(ending, *arguments))
+            self._insist(lambda: self._end(Job(kind, arguments), ending))
             self._hold_while_stopping()
 
         return run
@@ -249,33 +281,27 @@ class Worker:
         self._stop.wait(seconds)
         self._hold_while_stopping()
 
-    def _photo_broke(self, ending: Ending, photo_id: str, epoch: int) -> None:
-        self._store.photos.fail(photo_id, epoch, ending.code, ending.detail)
-
-    def _cell_broke(self, ending: Ending, photo_id: str, epoch: int, cell: int) -> None:
-        if ending.code == OUTAGE:  # this says nothing about the patches: the photo can be retried as a whole
-            self._photo_broke(ending, photo_id, epoch)
-            return
-        rows = self._store.patches.of_cell(photo_id, epoch, cell)
-        self._store.patches.fail(photo_id, epoch, [row.idx for row in rows], ending.code)
-
-    def _correction_broke(self, ending: Ending, correction_id: str, epoch: int) -> None:
-        self._store.corrections.fail(correction_id, ending.code, ending.detail, epoch=epoch)
-
-    def _measure_broke(self, ending: Ending, lens_id: str, version: int) -> None:
-        unknown = {"error": None, "coverage": None, "problem": ending.code}
-        self._store.lenses.record_metrics(lens_id, version, unknown)
+    def _end(self, job: Job, ending: Ending) -> None:
+        """End the work of a job with a reason; changes nothing where that has ended meanwhile."""
+        why, subject = (ending.code, ending.detail), str(job.arguments[0])
+        number = int(job.arguments[1])
+        if job.kind == "correction":
+            self._store.jobs.fail(subject, *why, epoch=number)
+        elif job.kind == "measure":
+            unknown = {"error": None, "coverage": None, "problem": ending.code}
+            self._store.lenses.record_metrics(subject, number, unknown)
+        elif job.kind == "photo" or ending.code == OUTAGE:
+            # of a cell: an outage says nothing about its patches, the photo can be retried as a whole
+            self._store.photos.fail(subject, number, *why)
+        else:
+            self._store.photos.fail_patches(subject, number, ending.code, cell=int(job.arguments[2]))
 
     # --- duties -------------------------------------------------------------------------------
 
     def _sweep(self) -> None:
         """Enqueue the jobs that the tables ask for; those already queued stay as they are."""
-        for photo_id, epoch, owner in self._store.photos.to_do():
-            self._engine.enqueue(Job("photo", (photo_id, epoch), owner))
-        for correction_id, epoch, owner in self._store.corrections.to_do():
-            self._engine.enqueue(Job("correction", (correction_id, epoch), owner))
-        for lens_id, version in self._store.lenses.unmeasured():
-            self._engine.enqueue(Job("measure", (lens_id, version)))
+        for job in self._store.jobs.to_do():
+            self._engine.enqueue(job)
 
     def _keep_lease(self) -> None:
         """Renew the lease; stop at once if this worker was declared dead."""
@@ -283,7 +309,7 @@ class Worker:
             if _identity(path) != identity:
                 self._die(f"{path} was replaced while this worker ran")
         try:
-            alive = self._store.workers.beat(self.id)
+            alive = self._store.jobs.beat(self.id)
         except Exception as error:
             late = time.monotonic() - self._last_beat > self._settings.lease_seconds
             if late and is_outage(error):
@@ -295,41 +321,33 @@ class Worker:
 
     def _take_over_silent(self) -> None:
         """Take over from workers whose lease has expired."""
-        for dead in self._store.workers.bury_stale(self._settings.lease_seconds):
+        for dead in self._store.jobs.bury_stale(self._settings.lease_seconds):
             self._take_over(dead)
 
     def _take_over(self, dead: str) -> None:
-        if dead != self.id and self._engine.take_over(dead) == 0:
-            self._store.workers.forget(dead)
+        if dead != self.id:
+            self._engine.take_over(dead)
+            self._store.jobs.forget(dead)
             shutil.rmtree(self._scratch / dead, ignore_errors=True)
             metrics.TAKEN_OVER.inc()
             log.info("took over the work of worker %s", dead)
 
     def _take_over_gone(self, host: str) -> None:
         """Take over at once from workers of this machine whose process is gone."""
-        for row in self._store.workers.all():
+        for row in self._store.jobs.workers():
             if row.id != self.id and row.host == host and not is_running(row.pid, row.pid_started):
-                self._store.workers.bury(row.id)
+                self._store.jobs.bury(row.id)
                 self._take_over(row.id)
 
     def _reconcile(self) -> None:
         """End jobs that the engine lost or gave up, so that none stays unfinished for ever."""
-        known = {row.id for row in self._store.workers.all()}
-        for holder in self._engine.holders() - known:
+        holders = self._engine.holders()  # first: a worker has its row before it holds anything
+        for holder in holders - {row.id for row in self._store.jobs.workers()}:
             self._engine.take_over(holder)
-        photos, corrections = self._store.photos, self._store.corrections
-        for photo_id, epoch, owner in [*photos.to_do(), *photos.running()]:
-            ended = self._lost(Job("photo", (photo_id, epoch), owner))
-            if ended:  # changes nothing if it has ended meanwhile
-                photos.fail(photo_id, epoch, ended.code, ended.detail)
-        for correction_id, epoch, owner in [*corrections.to_do(), *corrections.running()]:
-            ended = self._lost(Job("correction", (correction_id, epoch), owner))
+        for job in self._store.jobs.to_do(begun=True):
+            ended = self._lost(job)
             if ended:
-                corrections.fail(correction_id, ended.code, ended.detail, epoch=epoch)
-        for lens_id, version in self._store.lenses.unmeasured():
-            ended = self._lost(Job("measure", (lens_id, version)))
-            if ended:
-                self._measure_broke(ended, lens_id, version)
+                self._end(job, ended)
 
     def _lost(self, job: Job) -> Ending | None:
         status = self._engine.status(job)
@@ -350,10 +368,10 @@ class Worker:
         for photo in self._store.photos.unsearched():
             self._do(partial(self._search, photo))
         expired = datetime.now(UTC) - timedelta(days=self._settings.keep_results_days)
-        for correction_id in self._store.corrections.ended_before(expired):
-            self._do(partial(self._store.corrections.delete, correction_id, ANY_OWNER))
+        for correction_id in self._store.jobs.ended_before(expired):
+            self._do(partial(self._store.jobs.delete, correction_id, ANY_OWNER))
         self._do(self._store.accounts.purge)
-        for prefix in self._store.workers.garbage():
+        for prefix in self._store.jobs.garbage():
             self._do(partial(self._delete, prefix))  # one failure does not prevent the others
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
         developed = self._context.developed_folder("x").parent
@@ -366,13 +384,13 @@ class Worker:
             self._store.photos.record_location(photo, "unknown")
 
     def _delete(self, prefix: str) -> None:
-        if not self._store.workers.claim_garbage(prefix):
+        if not self._store.jobs.claim_garbage(prefix):
             return  # an upload that ended meanwhile has kept it
         if prefix.endswith("/"):
             self._context.storage.delete(prefix)
         else:
             self._context.storage.remove(prefix)
-        self._store.workers.forget_garbage(prefix)
+        self._store.jobs.forget_garbage(prefix)
 
     def _database_files(self) -> list[Path]:
         return [self._store.database.path] if self._store.database.is_sqlite else []

@@ -13,17 +13,17 @@ from fastapi.responses import HTMLResponse, StreamingResponse
 
 from app.errors import NotReadyError
 from app.http import views
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.pages.rendering import page
-from app.routes.corrections import find_plan
-from app.store.corrections import CorrectionPlan
+from app.routes.corrections import find_correction
+from app.store.tables import CorrectionRow
 
 MAX_LENGTH: Final = 4000
 """Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have."""
 
 Ids = Annotated[str, Query(max_length=MAX_LENGTH)]
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
 def state(call: Call, ids: str) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def batch_page(ids: Ids, call: CallDep) -> HTMLResponse:
 @router.get("/batch.zip")
 def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
     """Return the files of the corrections that are done."""
-    plans = [plan for plan in _plans(call, ids) if plan.correction.state == "succeeded"]
+    plans = [plan for plan in _plans(call, ids) if plan.state == "succeeded"]
     if not plans:
         raise NotReadyError("none of these corrections is done yet: wait for them")
     headers = {
@@ -63,8 +63,8 @@ def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
     return StreamingResponse(_zipped(call, plans), media_type="application/zip", headers=headers)
 
 
-def _plans(call: Call, ids: str) -> list[CorrectionPlan]:
-    return [find_plan(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
+def _plans(call: Call, ids: str) -> list[CorrectionRow]:
+    return [find_correction(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
 
 
 class _Sent(io.RawIOBase):
@@ -85,16 +85,15 @@ class _Sent(io.RawIOBase):
         return taken
 
 
-def _zipped(call: Call, plans: Sequence[CorrectionPlan]) -> Iterator[bytes]:
+def _zipped(call: Call, plans: Sequence[CorrectionRow]) -> Iterator[bytes]:
     """Yield an archive of files that are compressed already, part by part: none is held as a whole."""
     sent, used = _Sent(), set[str]()
     with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
-        for plan in plans:
-            row = plan.correction
+        for row in plans:
             assert row.result_key is not None
             assert row.result_bytes is not None
             entry = zipfile.ZipInfo(
-                unused_name(row.result_name or row.public_id, used), plan.photo.received_at.timetuple()[:6]
+                unused_name(row.result_name or row.public_id, used), row.photo.received_at.timetuple()[:6]
             )
             with archive.open(entry, "w", force_zip64=True) as file:
                 for part in call.storage.stream(row.result_key, 0, row.result_bytes):

@@ -12,7 +12,7 @@ from fastapi.responses import HTMLResponse
 from pydantic import TypeAdapter, ValidationError
 
 from app.errors import InvalidParameterError, NotReadyError
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.pages import shown, words
 from app.pages.rendering import page
 from app.routes import lenses as lens_routes
@@ -36,7 +36,7 @@ DEFAULT_ASPECT: Final = 1.5
 
 _APERTURE: Final = TypeAdapter[float](Aperture)
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
 @router.get("/lenses/{lens_id}")
@@ -195,4 +195,4 @@ def _spots(positions: list[FieldPosition], aspect: float) -> list[tuple[float, f
 
 def _positions(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
     """Return where patches of counted photos gave a PSF."""
-    return call.store.patches.places_of([photo.id for photo in photos if photo.state == "counted"])
+    return call.store.photos.places_of([photo.id for photo in photos if photo.state == "counted"])

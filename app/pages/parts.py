@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 from fastapi import APIRouter, Response
 
 from app.http import views
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.pages import batch, shown, words
 from app.pages.rendering import fragment
 from app.routes import corrections as correction_routes
@@ -17,7 +17,7 @@ from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.routes.common import matches_tag
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 Page = Literal["home", "photo", "correction", "batch", "lens"]
 
@@ -58,7 +58,7 @@ def _photo(call: Call, photo_id: str) -> Part:
 
 
 def _correction(call: Call, correction_id: str) -> Part:
-    plan = correction_routes.find_plan(call, correction_id)
+    plan = correction_routes.find_correction(call, correction_id)
     correction, job = views.correction_out(plan), views.correction_job(plan)
     values = {"correction": correction, "job": job}
     return "_correction_state.html", values, job.state not in {"queued", "running"}

@@ -12,7 +12,7 @@ from pydantic import Field
 from app.blobs import tiles
 from app.errors import InvalidParameterError
 from app.http import views
-from app.http.dependencies import CallDep
+from app.http.dependencies import CallDep, OneSession
 from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown, words
 from app.pages.rendering import page
@@ -20,8 +20,6 @@ from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import CorrectionIn, Id, PhotoOut, Region
-from app.store.corrections import run_folder
-from app.store.photos import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.workflow.correcting import SEEN_DB
 
@@ -35,7 +33,7 @@ NAMES: Final = (
 MAX_PREVIEW_PIXELS: Final = 1_500_000
 """Pixels of a preview at most (chosen): a second or two of work while the user waits."""
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
 def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
@@ -50,7 +48,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
     row = photo_routes.find_photo(call, photo_id)
     photo = photo_routes.described_photo(call, row)
-    patches = [views.patch_out(patch) for patch in call.store.patches.listed(photo_id)]
+    patches = [views.patch_out(patch) for patch in call.store.photos.windows(photo_id)]
     if row.height and row.width:
         turned = row.orientation or 1
         patches = [pictures.upright_patch(patch, row.height, row.width, turned) for patch in patches]
@@ -69,7 +67,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     return page(
         "photo.html",
         photo=_upright(photo, row),
-        can_look=pictures.exists(call.storage, f"{photo_folder(row)}{SHOWN}"),
+        can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
         gently=row.kind == "jpeg",
         patches=patches,
         used=sum(patch.state == "done" for patch in patches),
@@ -125,13 +123,11 @@ def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
 @router.get("/corrections/{correction_id}")
 def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
-    plan = correction_routes.find_plan(call, correction_id)
+    plan = correction_routes.find_correction(call, correction_id)
     correction = views.correction_out(plan)
     report = correction.report or {}
     photo, row = photo_routes.described_photo(call, plan.photo), plan.photo
-    can_look = correction.roi is None and pictures.exists(
-        call.storage, f"{run_folder(plan.correction)}{SIDES['after']}"
-    )
+    can_look = correction.roi is None and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
     changed = not report.get("nothing_to_correct")
     can_look = can_look and changed
     zones, most_gain = words.gain_bars(report.get("zones") or {})

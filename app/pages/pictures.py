@@ -13,13 +13,12 @@ from fastapi import APIRouter, Path, Response
 from app.blobs import tiles
 from app.blobs.storage import Storage
 from app.errors import InvalidParameterError, NotReadyError
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.jobs.task_files import LAYER_FILES, R_MAP, SHOWN, SIDES, THUMBNAIL
 from app.routes import corrections as correction_routes
 from app.routes import photos as photo_routes
 from app.schemas import PatchOut, Region
-from app.store.corrections import CorrectionPlan, run_folder
-from app.store.photos import photo_folder
+from app.store.tables import CorrectionRow
 
 Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
 Number = Annotated[int, Path(ge=0, le=10_000)]
@@ -33,7 +32,7 @@ NOTHING: Final = (
 
 N = TypeVar("N", int, float)
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
 def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
@@ -50,7 +49,7 @@ def _stored(call: Call, key: str) -> bytes:
 @router.get("/ui/photos/{photo_id}/thumbnail.jpg")
 def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
     """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
-    folder = photo_folder(photo_routes.find_photo(call, photo_id))
+    folder = photo_routes.find_photo(call, photo_id).folder
     with suppress(FileNotFoundError):
         return _picture(call.storage.get(f"{folder}{THUMBNAIL}"))
     with suppress(NotReadyError):
@@ -61,12 +60,12 @@ def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
 @router.get("/ui/photos/{photo_id}/r-map.png")
 def photo_r_map(photo_id: str, call: CallDep) -> Response:
     """Show where the edges of a photo tell about the blur."""
-    key = f"{photo_folder(photo_routes.find_photo(call, photo_id))}{R_MAP}"
+    key = f"{photo_routes.find_photo(call, photo_id).folder}{R_MAP}"
     return _picture(_stored(call, key), "image/png")
 
 
 def _shown(call: Call, photo_id: str) -> str:
-    return f"{photo_folder(photo_routes.find_photo(call, photo_id))}{SHOWN}"
+    return f"{photo_routes.find_photo(call, photo_id).folder}{SHOWN}"
 
 
 @router.get("/ui/photos/{photo_id}/preview.jpg")
@@ -88,15 +87,15 @@ def photo_tile(photo_id: str, half: Half, col: Number, row: Number, call: CallDe
     return _picture(tiles.tile(call.storage, _shown(call, photo_id), half, col, row))
 
 
-def _compared(call: Call, correction_id: str) -> CorrectionPlan:
-    plan = correction_routes.find_plan(call, correction_id)
-    if plan.correction.state != "succeeded":
-        raise NotReadyError(f"correction {correction_id} is {plan.correction.state}: wait for its job")
-    return plan
+def _compared(call: Call, correction_id: str) -> CorrectionRow:
+    row = correction_routes.find_correction(call, correction_id)
+    if row.state != "succeeded":
+        raise NotReadyError(f"correction {correction_id} is {row.state}: wait for its job")
+    return row
 
 
 def _side(call: Call, correction_id: str, which: Which) -> str:
-    return f"{run_folder(_compared(call, correction_id).correction)}{SIDES[which]}"
+    return f"{_compared(call, correction_id).run_folder}{SIDES[which]}"
 
 
 @router.get("/ui/corrections/{correction_id}/tiles/{which}/whole.jpg")
@@ -124,12 +123,12 @@ def correction_layer(
     correction_id: str, name: Literal["before", "after", "smooth", "clean"], call: CallDep
 ) -> Response:
     """Show a part of a photo as the sliders of a preview mix it."""
-    plan = _compared(call, correction_id)
-    if plan.correction.params.get("roi") is None:
+    row = _compared(call, correction_id)
+    if row.params.get("roi") is None:
         raise InvalidParameterError(f"correction {correction_id} is of a whole photo: it has tiles")
-    if name in {"smooth", "clean"} and not plan.correction.params.get("layers"):
+    if name in {"smooth", "clean"} and not row.params.get("layers"):
         raise InvalidParameterError(f"correction {correction_id} has no layers")
-    return _picture(_stored(call, f"{run_folder(plan.correction)}{LAYER_FILES[name]}"), "image/png")
+    return _picture(_stored(call, f"{row.run_folder}{LAYER_FILES[name]}"), "image/png")
 
 
 def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:

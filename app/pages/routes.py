@@ -15,15 +15,15 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
-from app.http.dependencies import CallDep, call_of
+from app.http.dependencies import CallDep, OneSession, call_of
 from app.pages import batch, lens_pages, parts, photo_pages, pictures, words
 from app.pages.rendering import page
 from lensmodel.core.errors import LensModelError
 
 HERE: Final = Path(__file__).parent
 
-router = APIRouter(include_in_schema=False)
-strangers = APIRouter(include_in_schema=False)
+router = APIRouter(include_in_schema=False, route_class=OneSession)
+strangers = APIRouter(include_in_schema=False, route_class=OneSession)
 """What whoever is not signed in yet may see."""
 
 

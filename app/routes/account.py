@@ -12,14 +12,14 @@ from starlette.responses import StreamingResponse
 
 from app.access import COOKIE, SESSION
 from app.blobs.account_data import erase, exported
-from app.http.dependencies import CallDep, ProbeDep
+from app.http.dependencies import CallDep, OneSession, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import most
 from app.runtime.settings import LOOPBACK
 from app.schemas import AccountOut, SessionOut, SignIn
 
-router = APIRouter(tags=["account"])
-sign_ins = APIRouter(tags=["account"])
+router = APIRouter(tags=["account"], route_class=OneSession)
+sign_ins = APIRouter(tags=["account"], route_class=OneSession)
 """Open to strangers, of whom one may be about to sign in."""
 
 HTTPS: Final = "https"

@@ -19,7 +19,7 @@ from app.errors import (
     UnknownCorrectionError,
 )
 from app.http import views
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
 from app.routes import photos as photo_routes
@@ -27,6 +27,7 @@ from app.routes.common import (
     Cursor,
     Limit,
     OnlyId,
+    cut,
     described_lens,
     find_lens,
     matches_tag,
@@ -35,16 +36,15 @@ from app.routes.common import (
 )
 from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
 from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
-from app.store.corrections import CorrectionPlan
 from app.store.photos import stored_settings
 from app.store.samples import LensState
-from app.store.tables import LensRow, PhotoRow
+from app.store.tables import CorrectionRow, LensRow, PhotoRow
 from app.ways import configured_way
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.core.names import camera_name
 from lensmodel.correction import deconvolvers
 
-router = APIRouter(tags=["corrections"])
+router = APIRouter(tags=["corrections"], route_class=OneSession)
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 
 
@@ -86,18 +86,18 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     params |= options.model_dump(
         mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
     )
-    row, created = call.store.corrections.create(photo, lens, version, params)
+    row, created = call.store.jobs.correct(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
     call.response.headers["Location"] = f"{V1}/corrections/{row.public_id}"
-    return views.correction_out(CorrectionPlan(row, photo, lens))
+    return views.correction_out(row)
 
 
 def _admit(call: Call) -> None:
     """Refuse a correction whose owner has too many unfinished ones, or stores too much."""
     most_bytes, _ = most(call.settings, call.store.accounts.quota_of(call.owner))
     check_stored(call.store.photos.load_of(call.owner)[1], most_bytes)
-    unfinished = call.store.corrections.unfinished_of(call.owner)
+    unfinished = call.store.jobs.unfinished_of(call.owner)
     if unfinished >= photo_routes.MAX_UNFINISHED:
         raise QuotaError(
             f"{unfinished} corrections are unfinished, {photo_routes.MAX_UNFINISHED} may be: wait",
@@ -135,7 +135,7 @@ def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
 def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     if lens_id is not None:
         return find_lens(call, lens_id)
-    lens = call.store.photos.lens_of(photo) or call.store.lenses.by_identity(photo)
+    lens = photo.lens or call.store.lenses.by_identity(photo)
     if lens is not None:
         return lens
     raise MetadataMissingError(
@@ -171,12 +171,12 @@ def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
     return lens.version
 
 
-def find_plan(call: Call, correction_id: str) -> CorrectionPlan:
+def find_correction(call: Call, correction_id: str) -> CorrectionRow:
     """Return a correction of the owner with its photo and lens."""
-    plan = call.store.corrections.plan(correction_id, call.owner)
-    if plan is None:
+    row = call.store.jobs.correction(correction_id, call.owner)
+    if row is None:
         raise UnknownCorrectionError(f"there is no correction {correction_id[:60]}: it may be deleted")
-    return plan
+    return row
 
 
 @router.get("/corrections", operation_id="listCorrections", responses=problems(404, 422))
@@ -188,16 +188,15 @@ def list_corrections(
 ) -> CorrectionPage:
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)
-    plans = call.store.corrections.page(call.owner, before=cursor, limit=limit + 1, photo=photo)
-    following = plans[limit - 1].correction.public_id if len(plans) > limit else None
-    items = [views.correction_out(plan) for plan in plans[:limit]]
-    return CorrectionPage(items=items, next=next_link(call, following))
+    rows = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1, photo=photo)
+    page, following = cut(rows, limit)
+    return CorrectionPage(items=[*map(views.correction_out, page)], next=next_link(call, following))
 
 
 @router.get("/corrections/{correction_id}", operation_id="getCorrection", responses=problems(404, 422))
 def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
     """Return one correction."""
-    return views.correction_out(find_plan(call, correction_id))
+    return views.correction_out(find_correction(call, correction_id))
 
 
 @router.delete(
@@ -208,7 +207,7 @@ def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
 )
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
-    prefix = call.store.corrections.delete(correction_id, call.owner)
+    prefix = call.store.jobs.delete(correction_id, call.owner)
     if prefix is None:
         raise UnknownCorrectionError(
             f"there is no correction {correction_id[:60]}: it may be deleted already"
@@ -240,7 +239,7 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
 )
 def read_result(correction_id: str, call: CallDep) -> Response:
     """Return the corrected photo, whole or in part."""
-    row = find_plan(call, correction_id).correction
+    row = find_correction(call, correction_id)
     if row.state != "succeeded":
         raise NotReadyError(
             f"correction {correction_id} is {row.state}: "

@@ -11,7 +11,7 @@ from typing import Final, get_args
 
 from fastapi import APIRouter, Response, status
 
-from app.http.dependencies import Call, CallDep, ProbeDep
+from app.http.dependencies import Call, CallDep, OneSession, ProbeDep
 from app.routes.common import problems
 from app.routes.jobs import LONG_POLL_S
 from app.routes.photos import GIB, MAX_UNFINISHED
@@ -39,8 +39,8 @@ FRESH_S: Final = 2.0
 READY_S: Final = 3.0
 """Seconds for all checks (chosen): less than the 5 s that container engines usually wait."""
 
-probes = APIRouter(tags=["service"])
-router = APIRouter(tags=["service"])
+probes = APIRouter(tags=["service"], route_class=OneSession)
+router = APIRouter(tags=["service"], route_class=OneSession)
 
 
 @probes.get("/healthz", operation_id="getHealth")
@@ -116,7 +116,7 @@ def _storage(call: Call) -> None:
 
 def _worker(call: Call) -> dict[str, bool]:
     """Return which measures confine the children of all workers."""
-    live = call.store.workers.live(call.settings.lease_seconds)
+    live = call.store.jobs.live(call.settings.lease_seconds)
     if not live:
         raise RuntimeError(
             f"no worker was heard of for {call.settings.lease_seconds:g} s: run `lensmodel worker`"

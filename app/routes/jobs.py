@@ -14,13 +14,13 @@ from starlette.concurrency import run_in_threadpool
 
 from app.errors import ConflictError, UnknownJobError
 from app.http import views
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.routes.common import Cursor, Limit, next_link, problems
 from app.routes.photos import SEND_AGAIN, candidates
 from app.runtime.outage import CODE as OUTAGE
 from app.schemas import JobOut, JobPage, RetriedOut
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(tags=["jobs"], route_class=OneSession)
 
 LONG_POLL_S: Final = 20.0
 """Longest that a question for a job waits for a change of it (chosen): proxies end requests after 30 s."""
@@ -35,12 +35,11 @@ def find_job(call: Call, job_id: str) -> JobOut:
     """Return the job of a photo or of a correction."""
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None:
-        lens = call.store.photos.lens_of(photo)
-        return views.photo_job(photo, None if lens is None else lens.public_id, candidates(call, photo))
-    plan = call.store.corrections.plan(job_id, call.owner)
-    if plan is None:
+        return views.photo_job(photo, candidates(call, photo))
+    correction = call.store.jobs.correction(job_id, call.owner)
+    if correction is None:
         raise UnknownJobError(f"there is no job {job_id[:60]}: its photo or correction may be deleted")
-    return views.correction_job(plan)
+    return views.correction_job(correction)
 
 
 def fingerprint(job: JobOut) -> str:
@@ -56,16 +55,11 @@ def list_jobs(
 ) -> JobPage:
     """List jobs of photos and corrections, newest first."""
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
-    plans = call.store.corrections.page(call.owner, before=cursor, limit=limit + 1)
-    lenses = call.store.photos.lens_ids(photos)
-    jobs: list[tuple[str, JobOut]] = [
-        *((row.public_id, views.photo_job(row, lenses.get(row.lens_id or 0))) for row in photos),
-        *((plan.correction.public_id, views.correction_job(plan)) for plan in plans),
-    ]
-    newest = sorted(jobs, key=lambda entry: entry[0], reverse=True)
-    page = [job for _, job in newest[:limit]]
-    following = page[-1].id if len(newest) > limit else None
-    return JobPage(items=page, next=next_link(call, following))
+    corrections = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1)
+    jobs = [*map(views.photo_job, photos), *map(views.correction_job, corrections)]
+    newest = sorted(jobs, key=lambda job: job.id, reverse=True)
+    following = newest[limit - 1].id if len(newest) > limit else None
+    return JobPage(items=newest[:limit], next=next_link(call, following))
 
 
 @router.get(
@@ -110,7 +104,7 @@ async def read_job(
 )
 def cancel_job(job_id: str, call: CallDep) -> JobOut:
     """Cancel a job: running parts of it stop within a second, nothing of it counts."""
-    done = call.store.photos.cancel(job_id, call.owner) or call.store.corrections.cancel(job_id, call.owner)
+    done = call.store.photos.cancel(job_id, call.owner) or call.store.jobs.cancel(job_id, call.owner)
     job = find_job(call, job_id)
     if not done:
         raise ConflictError(f"job {job_id} is finished ({job.state}): there is nothing left to cancel")
@@ -129,7 +123,7 @@ def retry_job(job_id: str, call: CallDep) -> JobOut:
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {job_id} is no longer kept: {SEND_AGAIN}")
-    done = call.store.photos.retry(job_id, call.owner) or call.store.corrections.retry(job_id, call.owner)
+    done = call.store.photos.retry(job_id, call.owner) or call.store.jobs.retry(job_id, call.owner)
     job = find_job(call, job_id)
     if not done:
         raise ConflictError(
@@ -155,7 +149,7 @@ def retry_jobs(
 
     Call it again until it says 0 where there are more than `limit`.
     """
-    photos, corrections = call.store.photos, call.store.corrections
+    photos, corrections = call.store.photos, call.store.jobs
     retried = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
     rest = corrections.failed_by(call.owner, code, limit - retried) if retried < limit else []
     return RetriedOut(retried=retried + sum(corrections.retry(key, call.owner) for key in rest))

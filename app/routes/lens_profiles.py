@@ -22,7 +22,7 @@ from app.errors import (
     UnknownLensError,
 )
 from app.http import upload
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.routes import jobs
 from app.routes.common import find_lens, problems
 from app.routes.lenses import read_lens
@@ -32,10 +32,7 @@ from app.store.tables import PHOTO_FINAL, PROFILE_FILE, PhotoRow
 from lensmodel.core.names import full_name
 from lensmodel.model.profile import LensProfile, write_profile
 
-router = APIRouter(tags=["lenses"])
-
-MAX_BYTES: Final = 64 << 20
-"""Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
+router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 _PAGE: Final = 200
 """Photos that are read at once (chosen): bounds the memory that a large lens takes."""
@@ -100,7 +97,7 @@ async def add_lens_profile(
     """
     await run_in_threadpool(find_lens, call, lens_id)
     async with receiving(call) as (public_id, key):
-        digest, size = await upload.receive_profile(call.request, call.storage, key, limit=MAX_BYTES)
+        digest, size = await upload.receive_profile(call.request, call.storage, key)
     file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
     end = time.monotonic() + jobs.LONG_POLL_S
     while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Query, Response, status
 
 from app.errors import NotReadyError
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.routes.common import find_lens, matches_tag, problems
 from app.schemas import Aperture, OptionalId
 from app.store.lenses import report_key
@@ -22,7 +22,7 @@ from lensmodel.core.types import Channel
 from lensmodel.report import Comparison, LensReport, Side, compare
 from lensmodel.report.tables import to_csv
 
-router = APIRouter(tags=["lenses"])
+router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 Form = Literal["json", "csv", "pdf"]
 MEDIA_TYPES: Final[dict[Form, str]] = {

@@ -10,13 +10,13 @@ from pydantic import Field
 
 from app.errors import ConflictError, InvalidParameterError, OtherLensError, UnknownLensError
 from app.http import views
-from app.http.dependencies import CallDep
+from app.http.dependencies import CallDep, OneSession
 from app.other_lens import REMEDY, difference
 from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link, problems
 from app.schemas import MAX_VERSION, CalibrationPage, Id, LateralOut, LensOut, LensPage, Name, Question
 from lensmodel.core.errors import NoSamplesError
 
-router = APIRouter(tags=["lenses"])
+router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 
 @router.get("/lenses", operation_id="listLenses", responses=problems(422))

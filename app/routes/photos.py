@@ -23,7 +23,7 @@ from app.errors import (
     UnknownPhotoError,
 )
 from app.http import middleware, upload, views
-from app.http.dependencies import Call, CallDep
+from app.http.dependencies import Call, CallDep, OneSession
 from app.http.middleware import CLOSE
 from app.routes.common import Cursor, Limit, OnlyId, cut, find_lens, next_link, problems
 from app.runtime.settings import MIB, Settings
@@ -31,12 +31,12 @@ from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotosChang
 from app.store import LensName
 from app.store.accounts import Quota
 from app.store.database import new_id
-from app.store.photos import GIVEN_SETTINGS, NewCopy, Received, photo_folder
+from app.store.photos import GIVEN_SETTINGS, NewCopy, Received
 from app.store.tables import LensRow, PhotoRow
 from lensmodel.core.errors import UnknownMethodError
 from lensmodel.patches import selectors
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=OneSession)
 GIB = 1024 * MIB  # bytes
 UPLOAD_S: Final = 3600.0
 """Longest that a photo may be on its way to us in seconds (chosen): 512 MiB come within it at 1.2 Mbit/s."""
@@ -132,8 +132,7 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
 async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
     """Receive a photo; with a lens, it must be a measurement of that lens."""
     async with receiving(call) as (public_id, key):
-        limit = call.settings.max_upload_bytes
-        uploaded = await upload.receive(call.request, call.storage, key, limit=limit)
+        uploaded = await upload.receive(call.request, call.storage, key)
     if lens_id is not None:
         fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
         uploaded = replace(uploaded, fields=fields)
@@ -196,7 +195,7 @@ def _admit(call: Call) -> None:
     """Refuse an upload before its body is read: no disk space, or a quota is used up."""
     limits = call.settings
     free = call.storage.free_bytes()
-    coming = min(upload.declared_length(call.request), limits.max_upload_bytes)
+    coming = middleware.declared_length(call.request.headers) or 0
     if free is not None and free - coming < limits.min_free_mb * MIB:
         raise StorageFullError(
             f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "
@@ -252,7 +251,7 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
         given=given,
     )
     if received.photo.public_id != public_id and not received.fresh:
-        _check_model(fields, call.store.photos.lens_of(received.photo))
+        _check_model(fields, received.photo.lens)
     return described_photo(call, received.photo), received.fresh
 
 
@@ -263,7 +262,7 @@ def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  
     )
     if received.photo.public_id != public_id:
         if received.wants_file:  # its file was given up: this is the same one
-            kept = f"{photo_folder(received.photo)}original-{public_id}"
+            kept = f"{received.photo.folder}original-{public_id}"
             call.storage.rename(key, kept)
             call.store.photos.restore_file(received.photo.public_id, kept, again=received.fresh)
         call.storage.delete(_folder(key))  # the same bytes are stored already
@@ -278,8 +277,7 @@ def _folder(key: str) -> str:
 
 def described_photo(call: Call, photo: PhotoRow) -> PhotoOut:
     """Return a photo with its lens, or with the candidates."""
-    lens = call.store.photos.lens_of(photo)
-    return views.photo_out(photo, None if lens is None else lens.public_id, candidates(call, photo))
+    return views.photo_out(photo, candidates(call, photo))
 
 
 def candidates(call: Call, photo: PhotoRow) -> list[str]:
@@ -308,9 +306,7 @@ def list_photos(
     """List photos, newest first."""
     rows = call.store.photos.page(call.owner, before=cursor, limit=limit + 1, lens_id=lens_id, state=state)
     page, following = cut(rows, limit)
-    lenses = call.store.photos.lens_ids(page)
-    items = [views.photo_out(row, lenses.get(row.lens_id or 0)) for row in page]
-    return PhotoPage(items=items, next=next_link(call, following))
+    return PhotoPage(items=[views.photo_out(row) for row in page], next=next_link(call, following))
 
 
 @router.get("/photos/{photo_id}", operation_id="getPhoto", responses=problems(404, 422))
@@ -323,7 +319,7 @@ def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
 def list_patches(photo_id: str, call: CallDep) -> PatchPage:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
     photo = find_photo(call, photo_id)
-    return PatchPage(items=[views.patch_out(row) for row in call.store.patches.listed(photo.public_id)])
+    return PatchPage(items=[views.patch_out(row) for row in call.store.photos.windows(photo.public_id)])
 
 
 @router.delete(

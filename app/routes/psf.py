@@ -6,11 +6,11 @@ import hashlib
 import math
 from typing import Annotated, Final, Literal
 
-from fastapi import APIRouter, Depends, Response, status
+from fastapi import APIRouter, Query, Response, status
 
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
 from app.http import psf_formats
-from app.http.dependencies import Call, CallDep, QueryModel
+from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import Fitted
 from app.routes.common import Answers, matches_tag, problems
 from app.runtime import metrics
@@ -19,7 +19,7 @@ from app.store.samples import LensState
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.types import FieldPosition, LensSettings
 
-router = APIRouter(tags=["psf"])
+router = APIRouter(tags=["psf"], route_class=OneSession)
 
 Format = Literal["json", "png", "npy", "tiff"]
 MEDIA_TYPES: Final[dict[Format, str]] = {
@@ -34,9 +34,6 @@ MAX_GRID: Final = 25
 MAX_FIELD_PIXELS: Final = 2_000_000
 """Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s
 (measured once, no command repeats it)."""
-
-_PSF: Final = QueryModel(PsfQuery)
-_FIELD: Final = QueryModel(FieldQuery)
 
 _CONTENT = {
     name: {"schema": {"type": "string", "format": "binary"}}
@@ -56,10 +53,9 @@ _ANSWERS: Final[Answers] = {
     "/lenses/{lens_id}/psf",
     operation_id="getPsf",
     response_class=Response,
-    openapi_extra=_PSF.described,
     responses=problems(404, 406, 409, 422, also=_ANSWERS),
 )
-def read_psf(lens_id: str, at: Annotated[PsfQuery, Depends(_PSF)], call: CallDep) -> Response:
+def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
     with metrics.QUERY_SECONDS.time():
         return _answer(lens_id, at, accepted(call.request.headers.get("accept", "*/*")), call)
@@ -69,13 +65,12 @@ def read_psf(lens_id: str, at: Annotated[PsfQuery, Depends(_PSF)], call: CallDep
     "/lenses/{lens_id}/psf.{suffix}",
     operation_id="getPsfAs",
     response_class=Response,
-    openapi_extra=_PSF.described,
     responses=problems(404, 409, 422, also=_ANSWERS),
 )
 def read_psf_as(
     lens_id: str,
     suffix: Format,
-    at: Annotated[PsfQuery, Depends(_PSF)],
+    at: Annotated[PsfQuery, Query()],
     call: CallDep,
 ) -> Response:
     """Return the PSF in the format of the suffix."""
@@ -132,7 +127,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
 
 
 def _known(call: Call, lens_id: str) -> LensState:
-    known = call.store.samples.known_of(lens_id, call.owner)
+    known = call.store.lenses.known_of(lens_id, call.owner)
     if known is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
     return known
@@ -148,7 +143,6 @@ def etag(fitted: Fitted, question: str) -> str:
     "/lenses/{lens_id}/field.png",
     operation_id="getFieldMap",
     response_class=Response,
-    openapi_extra=_FIELD.described,
     responses=problems(
         404,
         409,
@@ -163,7 +157,7 @@ def etag(fitted: Fitted, question: str) -> str:
         },
     ),
 )
-def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: CallDep) -> Response:
+def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
     """Return a picture of the kernels all over the field, each scaled to its own peak."""
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):

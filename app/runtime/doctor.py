@@ -98,8 +98,8 @@ def _tables(store: Store, *, repair: bool) -> Iterator[Violation]:
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:
-    waiting = sum(store.workers.load().jobs.values())
-    if waiting and not store.workers.live(settings.lease_seconds):
+    waiting = sum(store.jobs.load().jobs.values())
+    if waiting and not store.jobs.live(settings.lease_seconds):
         says = f"{waiting} jobs are unfinished and no worker lives"
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")
 

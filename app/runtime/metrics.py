@@ -79,7 +79,7 @@ class Tables(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield the present values."""
-        load = self._store.workers.load()
+        load = self._store.jobs.load()
         depth = GaugeMetricFamily("lensmodel_queue_jobs", "Unfinished jobs.", labels=("kind", "state"))
         for (kind, state), count in load.jobs.items():
             depth.add_metric((kind, state), count)
@@ -89,7 +89,7 @@ class Tables(Collector):
         for kind, seconds in load.oldest_s.items():
             age.add_metric((kind,), seconds)
         workers = GaugeMetricFamily("lensmodel_workers", "Workers heard of within their lease.")
-        workers.add_metric((), len(self._store.workers.live(self._lease_s)))
+        workers.add_metric((), len(self._store.jobs.live(self._lease_s)))
         garbage = GaugeMetricFamily("lensmodel_garbage", "Groups of blobs that wait to be deleted.")
         garbage.add_metric((), load.garbage)
         rows = GaugeMetricFamily("lensmodel_rows", "Rows that are not deleted.", labels=("table",))

@@ -29,8 +29,8 @@ from app.runtime.processes import PARENT, on_signals
 from app.runtime.settings import PREFIX, Settings
 from app.sandbox import confine
 from app.store import migrate
+from app.store.accounts import Accounts
 from app.store.database import Database
-from app.store.keys import KeyStore
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
@@ -88,7 +88,7 @@ def _prepare(settings: Settings) -> None:
     _migrate(settings)
     database = Database(settings.database)
     try:
-        usable = not settings.needs_keys or KeyStore(database).any_valid()
+        usable = not settings.needs_keys or Accounts(database).has_valid_key()
     finally:
         database.close()
     if usable:

@@ -17,14 +17,15 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, BinaryIO, Final, TypeAlias
 
 from app.sandbox import confine
 from app.sandbox.account import SystemAccount
+from lensmodel.core import files
 from lensmodel.core.errors import LensModelError
 
 ProgressHook: TypeAlias = Callable[[int, int], None]
@@ -32,6 +33,9 @@ Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
 """Called as `task(arguments, folder, progress)`; returns what JSON can write."""
 
 RESULT: Final = "result.json"
+COMPILED: Final = "compiled"
+"""Folder in that of a task with what it has compiled, as Numba keeps it."""
+
 MAX_TEXT: Final = 4000
 """Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes."""
 
@@ -58,8 +62,8 @@ def main(order: dict[str, Any], line: Connection, said: Connection) -> None:
     """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions.
 
     `reads` are files and folders that it may read; None leaves the file system, the network and other
-    programs open to it. `cache` is a folder for compiled code that it may write besides its own, `account`
-    the uid and gid that it changes to, if any. What it prints goes to `said`.
+    programs open to it. `cache` is one of them with compiled code, `account` the uid and gid that it changes
+    to, if any. What it prints goes to `said`.
     """
     for stream in (1, 2):
         os.dup2(said.fileno(), stream)
@@ -67,7 +71,8 @@ def main(order: dict[str, Any], line: Connection, said: Connection) -> None:
     folder = Path(order["folder"])
     tasks = importlib.import_module(order["module"])  # our own code, not readable after this
     if order["cache"]:
-        _keep_compiled(order["cache"])
+        _keep_compiled(order["cache"], folder / COMPILED)
+    _write_in_place()
     contain(folder, order["limits"], order["niceness"])
     if order["reads"] is not None:
         _confine(folder, order)
@@ -108,16 +113,50 @@ def _report(line: Connection, folder: Path, work: Callable[[], Any]) -> None:
         sys.stderr.flush()
 
 
-def _keep_compiled(folder: str) -> None:
-    """Let Numba keep its code in a folder of the owner, also that of loops that the fork server has imported.
+def _write_in_place() -> None:
+    """Let the library write files in place: a task may rename nothing, and its folder is read at its end."""
 
-    Code that one owner's photo could write must not run beside the photos of another.
+    @contextlib.contextmanager
+    def in_place(path: Path) -> Iterator[Path]:
+        yield path
+
+    vars(files)["replacing"] = in_place
+
+
+def _keep_compiled(kept: str, own: Path) -> None:
+    """Let Numba load compiled code from a folder of the owner, and save its own to that of the task.
+
+    The worker adds that to the owner's: a task that could replace files there could hide what it writes, and
+    code that one owner's photo could write must not run beside the photos of another.
     """
     try:
+        caching = importlib.import_module("numba.core.caching")
         dispatcher = importlib.import_module("numba.core.dispatcher")
     except ImportError:
         return
-    vars(importlib.import_module("numba.core.config"))["CACHE_DIR"] = folder
+    file = caching.IndexDataCacheFile
+    load_index = file._load_index  # noqa: SLF001 - Numba has no public way, as below
+
+    def moved(path: str) -> Path:
+        return own / Path(path).parent.name / Path(path).name
+
+    @contextlib.contextmanager
+    def open_for_write(_: object, path: str) -> Iterator[BinaryIO]:
+        moved(path).parent.mkdir(parents=True, exist_ok=True)
+        with moved(path).open("wb") as out:
+            yield out
+
+    def load_own_index(self: Any) -> Any:  # noqa: ANN401 - of Numba
+        path = self._index_path
+        self._index_path = str(moved(path)) if moved(path).is_file() else path
+        try:
+            return load_index(self)
+        finally:
+            self._index_path = path
+
+    file._open_for_write, file._load_index = open_for_write, load_own_index  # noqa: SLF001
+    caching._CacheLocator.ensure_cache_path = lambda _: None  # noqa: SLF001 - it tries to write
+    vars(importlib.import_module("numba.core.config"))["CACHE_DIR"] = kept
     for name, module in list(sys.modules.items()):
         if not name.startswith(("numba", "numpy", "scipy")):
             for value in list(vars(module).values()) if module is not None else ():
@@ -126,12 +165,10 @@ def _keep_compiled(folder: str) -> None:
 
 
 def _confine(folder: Path, order: dict[str, Any]) -> None:
-    writes = [folder, *([Path(order["cache"])] if order["cache"] else [])]
     account = SystemAccount(*order["account"]) if order["account"] else None
     if account is not None:
         os.umask(0o007)  # the worker reads its files as a member of its group
-    # caches of compiled code are replaced; who decodes files has none, and may hide none of its own
-    confine.confine(writes, map(Path, order["reads"]), account, removes=bool(order["cache"]))
+    confine.confine(folder, map(Path, order["reads"]), account)
     _die_with_parent()  # again: the kernel clears it when credentials change
 
 

@@ -21,7 +21,7 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -70,27 +70,19 @@ class _Beneath(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def confine(
-    writes: Sequence[Path],
-    reads: Iterable[Path] = (),
-    account: SystemAccount | None = None,
-    *,
-    removes: bool = False,
-) -> list[str]:
-    """Give up access to all but the program itself, `reads`, and `writes`; return the measures in force.
+def confine(folder: Path, reads: Iterable[Path] = (), account: SystemAccount | None = None) -> list[str]:
+    """Give up access to all but the program itself, `reads`, and a folder; return the measures in force.
 
     Call it while the process has a single thread: others would keep their permissions.
 
     Parameters
     ----------
-    writes : sequence of Path
-        Folders where files may be created, changed and removed; the first is the task's own.
+    folder : Path
+        Where files may be created and changed; none loses its name, so that who counts them sees all.
     reads : iterable of Path
         Files and folders that may be read besides the libraries.
     account : SystemAccount, optional
         Account to change to; OSError if that is refused.
-    removes : bool
-        Whether files may be removed and replaced; else all that it ever wrote lies in `writes`.
     """
     in_force = []
     if account is not None:
@@ -101,8 +93,8 @@ def confine(
     tried: dict[str, Callable[[], object]] = {
         "no_new_privs": lambda: _prctl(_PR_SET_NO_NEW_PRIVS, 1),
         "namespaces": _separate,
-        "files": lambda: _restrict_files(writes, reads),
-        "system_calls": lambda: seccomp.refuse(removes=removes),
+        "files": lambda: _restrict_files(folder, reads),
+        "system_calls": seccomp.refuse,
     }
     for name, measure in tried.items():
         with contextlib.suppress(OSError):
@@ -170,7 +162,7 @@ def _separate() -> None:
     resource.setrlimit(resource.RLIMIT_NPROC, (MAX_PROCESSES, MAX_PROCESSES))
 
 
-def _restrict_files(writes: Sequence[Path], reads: Iterable[Path]) -> None:
+def _restrict_files(folder: Path, reads: Iterable[Path]) -> None:
     version = _check(_libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION))
     handled = sum(rights for since, rights in _HANDLED.items() if version >= since)
     ruleset = _Ruleset(
@@ -183,9 +175,8 @@ def _restrict_files(writes: Sequence[Path], reads: Iterable[Path]) -> None:
         _libc.syscall(_CREATE_RULESET, ctypes.byref(ruleset), ctypes.c_size_t(ctypes.sizeof(ruleset)), 0)
     )
     try:
-        for path in writes:
-            _allow(rules, path, handled & ~_EXECUTE)
-        for path in [*_program(writes[0]), *reads]:
+        _allow(rules, folder, handled & ~_EXECUTE)
+        for path in [*_program(folder), *reads]:
             _allow(rules, path, _READ & handled)
         for name in _DEVICES:
             _allow(rules, Path(name), handled & (_READ | 1 << 1))
@@ -220,7 +211,7 @@ def _allow(rules: int, path: Path, rights: int) -> None:
 def _trial(user: str, data: Path) -> list[str]:
     account = accounts.find(user)
     of_use = account is not None and account.is_of_use(data)
-    return confine([Path("/nonexistent")], account=account if of_use else None)
+    return confine(Path("/nonexistent"), account=account if of_use else None)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import stat
 import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing import forkserver
@@ -32,8 +33,8 @@ from typing import Any, Final
 
 from app.sandbox import child
 from app.sandbox.account import SystemAccount
-from app.sandbox.budget import POLL_S, Budget
 from app.sandbox.outcome import Outcome, TaskLimits, cancelled, outcome_of
+from lensmodel.core.files import replacing
 from lensmodel.core.types import ignore_step
 
 MAX_MESSAGE: Final = 64 * 1024
@@ -51,6 +52,57 @@ MAX_SAID: Final = 64 * 1024
 log = logging.getLogger(__name__)
 
 
+POLL_S: Final = 0.25
+"""Seconds between two questions whether a task is still wanted (chosen): each reads a row."""
+
+
+class Budget:
+    """Slots and memory that children share, first come, first served."""
+
+    def __init__(self, slots: int, memory_mb: int) -> None:
+        self._changed = threading.Condition()
+        self._queue: deque[object] = deque()
+        self._slots, self._memory = slots, memory_mb
+        self.memory_mb = memory_mb
+
+    @contextlib.contextmanager
+    def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
+        """Wait for a slot and memory; yield False if the task is no longer wanted.
+
+        A task that needs more memory than the whole budget runs alone.
+        """
+        memory = min(memory_mb, self.memory_mb)
+        ticket = object()
+        entered = self._enter(ticket, memory, wanted)
+        try:
+            yield entered
+        finally:
+            if entered:
+                with self._changed:
+                    self._slots += 1
+                    self._memory += memory
+                    self._changed.notify_all()
+
+    def _enter(self, ticket: object, memory: int, wanted: Callable[[], bool]) -> bool:
+        with self._changed:
+            self._queue.append(ticket)
+        entered = False
+        try:
+            while not entered and wanted():
+                with self._changed:
+                    if self._queue[0] is ticket and self._slots > 0 and self._memory >= memory:
+                        self._slots -= 1
+                        self._memory -= memory
+                        entered = True
+                    else:
+                        self._changed.wait(POLL_S)
+        finally:
+            with self._changed:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
+        return entered
+
+
 @dataclass(slots=True)
 class _Watched:
     """One running child: its process, the connections to it, where it writes, its deadline, its last word."""
@@ -58,7 +110,7 @@ class _Watched:
     process: ForkServerProcess
     line: Connection
     said: Connection
-    folders: tuple[Path, ...]
+    folder: Path
     deadline: float
     ended: dict[str, Any] | None = None
     text: bytes = b""
@@ -100,8 +152,8 @@ class Sandbox:
     confined : bool
         Whether children are kept from files, network and programs; see `app.sandbox.confine`.
     cache : Path, optional
-        Where tasks that decode no untrusted file keep compiled code, unless the environment names another
-        folder, which is ignored with an `account` that might not reach it.
+        Where the compiled code of each owner is kept, unless the environment names another folder, which is
+        ignored with an `account` that might not reach it.
     account : SystemAccount, optional
         Account of confined children; None keeps that of this process.
     niceness : int, optional
@@ -206,7 +258,7 @@ class Sandbox:
         reads : sequence of Path
             Files and folders that the task may read besides its own.
         compiles : str, optional
-            Owner whose cache of compiled code it may use and add to: a name for a folder.
+            Owner whose compiled code it may use; what it compiles joins that once it has succeeded.
         wanted : callable
             Called every `POLL_S`; once it returns False, the child is killed.
         on_progress : callable
@@ -223,13 +275,14 @@ class Sandbox:
             said, far_said = self._context.Pipe(duplex=False)
             with line, said:
                 order = self._order(task, arguments, folder, limits)
+                cache = self._cache_of(compiles)
+                reads = [*reads, *([] if cache is None else [cache])]
                 order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
-                order["cache"] = self._cache_of(compiles)
+                order["cache"] = None if cache is None else str(cache)
                 self._open_to_child(folder, reads)
                 process = self._start(order, far_end, far_said)
                 try:
-                    folders = (folder, *([Path(order["cache"])] if order["cache"] else []))
-                    watched = _Watched(process, line, said, folders, time.monotonic() + limits.wall_s)
+                    watched = _Watched(process, line, said, folder, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
                     status = 0 if cut else self._exit_status(process)
                 finally:
@@ -237,16 +290,17 @@ class Sandbox:
                 while said.poll() and watched.receive():  # not until all ends are closed: one may live on
                     pass
                 _leave_plain_files(folder)
-                return cut or outcome_of(watched.ended, status, folder, limits)
+                outcome = cut or outcome_of(watched.ended, status, folder, limits)
+                if cache is not None and outcome.ending == "ok":
+                    _keep_compiled(folder / child.COMPILED, cache)
+                return outcome
 
-    def _cache_of(self, owner: str | None) -> str | None:
+    def _cache_of(self, owner: str | None) -> Path | None:
         if owner is None or self._cache is None:
             return None
         folder = (self._cache / owner).resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        if self.account is not None:
-            self.account.may_change(folder)
-        return str(folder)
+        return folder
 
     def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
         if self.account is not None:
@@ -300,7 +354,7 @@ class Sandbox:
                 last_check = time.monotonic()
                 if not wanted():
                     return cancelled()
-                if _overflows(watched.folders, limits):
+                if _overflows(watched.folder, limits):
                     text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
                     return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
             if time.monotonic() > watched.deadline:
@@ -329,19 +383,26 @@ def _number(value: object) -> int:
     return min(max(value, 0), MAX_NUMBER) if isinstance(value, int) else 0
 
 
-def _overflows(written: Sequence[Path], limits: TaskLimits) -> bool:
-    """Say whether a task has written more to its folders than it may, or hides what it wrote."""
+def _overflows(written: Path, limits: TaskLimits) -> bool:
+    """Say whether a task has written more to its folder than it may, or hides what it wrote."""
     files = blocks = 0
     hidden: list[OSError] = []
-    for top in written:
-        for place, folders, names in os.walk(top, onerror=hidden.append):
-            for name in [*folders, *names]:
-                with contextlib.suppress(OSError):  # gone meanwhile
-                    blocks += Path(place, name).lstat().st_blocks
-                files += 1
-                if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
-                    return True
+    for place, folders, names in os.walk(written, onerror=hidden.append):
+        for name in [*folders, *names]:
+            with contextlib.suppress(OSError):  # gone meanwhile
+                blocks += Path(place, name).lstat().st_blocks
+            files += 1
+            if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
+                return True
     return any(isinstance(error, PermissionError) for error in hidden)
+
+
+def _keep_compiled(compiled: Path, cache: Path) -> None:
+    """Add to an owner's cache what a task has compiled; each file appears complete."""
+    for path in compiled.glob("*/*"):
+        (cache / path.parent.name).mkdir(exist_ok=True)
+        with replacing(cache / path.parent.name / path.name) as part:
+            shutil.copyfile(path, part)
 
 
 def _leave_plain_files(folder: Path) -> None:

@@ -124,15 +124,15 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_uint16), ("first", ctypes.POINTER(_Instruction)))
 
 
-def refuse(*, removes: bool) -> None:
+def refuse() -> None:
     """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set.
 
-    Without `removes` every file that a task makes keeps its name, so that whoever counts its folder sees it.
+    Every file that a task makes keeps its name, so that whoever counts its folder sees it.
     """
     processor = _PROCESSORS.get(platform.machine())
     if processor is None:
         raise OSError(errno.ENOSYS, f"no filter was written for {platform.machine()}")
-    steps = _steps(processor, removes=removes)
+    steps = _steps(processor)
     listed = (_Instruction * len(steps))(*(_Instruction(*step) for step in steps))
     program = _Program(len(steps), listed)
     libc = ctypes.CDLL(None, use_errno=True)
@@ -141,7 +141,7 @@ def refuse(*, removes: bool) -> None:
         raise OSError(number, os.strerror(number))
 
 
-def _steps(processor: _Processor, *, removes: bool) -> list[tuple[int, int, int, int]]:
+def _steps(processor: _Processor) -> list[tuple[int, int, int, int]]:
     """Return the filter: `(code, jump if so, jump if not, value)`."""
     no, gone = _REFUSE | errno.EPERM, _REFUSE | errno.ENOSYS
     steps = [
@@ -154,10 +154,10 @@ def _steps(processor: _Processor, *, removes: bool) -> list[tuple[int, int, int,
         (_EQUAL, 0, 1, _CLONE3),
         (_RETURN, 0, 0, gone),  # the C library then falls back to clone, whose flags can be read
     ]
-    for name in (*REFUSED, *(() if removes else REMOVING)):
+    for name in (*REFUSED, *REMOVING):
         if name in processor.numbers:
             steps += [(_EQUAL, 0, 1, processor.numbers[name]), (_RETURN, 0, 0, no)]
-    for name, position in () if removes else _UNNAMED.items():
+    for name, position in _UNNAMED.items():
         if name in processor.numbers:
             steps += [
                 (_EQUAL, 0, 4, processor.numbers[name]),

@@ -3,7 +3,7 @@
 By default the SQLite driver opens a transaction at the first write, so that two processes
 which read, add one and write lose updates silently. Here every writing transaction
 begins with BEGIN IMMEDIATE: one writer at a time, waiting rather than failing. Readers see a
-consistent snapshot (WAL) and cannot write at all.
+consistent snapshot (WAL) and cannot write at all. What a request reads is of one session (`scope`).
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from __future__ import annotations
 import secrets
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Concatenate, Final, ParamSpec, TypeVar
 from uuid import UUID
 
-from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy import Connection, Engine, Executable, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -67,8 +69,23 @@ class Database:
             )
 
     @contextmanager
+    def scope(self) -> Iterator[None]:
+        """Let all that is read in the block be read in one session: that of a request."""
+        scope = _Scope(self)
+        token = _SCOPE.set(scope)
+        try:
+            yield
+        finally:
+            _SCOPE.reset(token)
+            scope.end()
+
+    @contextmanager
     def reading(self) -> Iterator[Session]:
-        """Give a session that sees one consistent state and cannot change it."""
+        """Give the session of the request, or one of its own, which sees one state and cannot change it."""
+        scope = _SCOPE.get()
+        if scope is not None and scope.database is self:
+            yield scope.session
+            return
         with Session(self.reader, expire_on_commit=False) as session, session.begin():
             yield session
 
@@ -79,14 +96,82 @@ class Database:
         `durable` also survives loss of power: for what a caller may rely on afterwards, such as
         an accepted upload whose memory card is formatted next.
         """
-        engine = self.durable if durable else self.writer
+        engine, scope = self.durable if durable else self.writer, _SCOPE.get()
         with Session(engine, expire_on_commit=False) as session, session.begin():
             yield session
+        if scope is not None and scope.database is self:
+            scope.end()  # what the request reads next is of after the change
 
     def close(self) -> None:
         """Close all connections."""
         for engine in (self.writer, self.durable, self.reader):
             engine.dispose()
+
+
+class _Scope:
+    """The reading session of one request, opened when it first reads."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+        self._session: Session | None = None
+
+    @property
+    def session(self) -> Session:
+        if self._session is None:
+            self._session = Session(self.database.reader, expire_on_commit=False)
+        return self._session
+
+    def end(self) -> None:
+        if self._session is not None:
+            self._session.close()
+        self._session = None
+
+
+_SCOPE: ContextVar[_Scope | None] = ContextVar("scope", default=None)
+
+P = ParamSpec("P")
+T = TypeVar("T")
+R = TypeVar("R", bound="Repository")
+
+
+class Repository:
+    """Queries and changes of one subject: each a transaction, or one of the reads of a request."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+
+
+def reads(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+    """Give a method the session that reads."""
+
+    @wraps(method)
+    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
+        with self.database.reading() as session:
+            return method(self, session, *args, **options)
+
+    return run
+
+
+def writes(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+    """Give a method a transaction of its own."""
+
+    @wraps(method)
+    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
+        with self.database.writing() as session:
+            return method(self, session, *args, **options)
+
+    return run
+
+
+def writes_durably(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+    """Give a method a transaction of its own that survives loss of power once it has returned."""
+
+    @wraps(method)
+    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
+        with self.database.writing(durable=True) as session:
+            return method(self, session, *args, **options)
+
+    return run
 
 
 def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
@@ -127,6 +212,11 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
     for row in rows:  # values given here, not in the statement, which else is made anew for each row
         inserted += len(connection.execute(statement, row).all())
     return inserted
+
+
+def changed(session: Session, statement: Executable) -> int:
+    """Execute an UPDATE or DELETE; return how many rows it changed."""
+    return session.connection().execute(statement).rowcount
 
 
 def new_id() -> str:

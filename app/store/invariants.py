@@ -14,7 +14,7 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, or_, select, t
 from sqlalchemy.orm import Session
 
 from app.store.lenses import give_back, join, recount_samples
-from app.store.samples import recount_patches
+from app.store.patches import recount_patches
 from app.store.tables import CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 Find: TypeAlias = Callable[[Session], Sequence[str]]

@@ -11,18 +11,29 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final, Literal
 
-from sqlalchemy import and_, delete, func, select, update
+from sqlalchemy import and_, bindparam, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import BusyError
-from app.store.database import Database, insert_new, new_id
-from app.store.owners import ANY_OWNER, LATE, Owner, ensure_owner, find_owned, find_to_change, now, owned
+from app.store.database import Repository, changed, insert_new, new_id, reads, writes
+from app.store.owners import (
+    ANY_OWNER,
+    Owner,
+    discard,
+    ensure_owner,
+    find_owned,
+    find_to_change,
+    is_id,
+    now,
+    owned,
+)
+from app.store.samples import COLUMNS, LensState, StoredSample, sample_in
 from app.store.tables import (
     PHOTO_RUNNING,
     CorrectionRow,
     EventRow,
-    GarbageRow,
     LensRow,
+    OwnerRow,
     PatchRow,
     PhotoRow,
     SampleRow,
@@ -39,6 +50,13 @@ time its last photo must have been deleted in between."""
 
 STILL_WRITTEN: Final = timedelta(minutes=30)
 """How long the previous version is kept (chosen): a worker may still be reporting of it."""
+
+_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch, LensRow.way).where(
+    LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
+)
+_KNOWN: Final = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
+    OwnerRow.name == bindparam("owner")
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +75,18 @@ def identity_key(maker: str | None, model: str | None, serial: str | None) -> st
     return f"{name_key(maker)}|{name_key(model)}|{serial_key(serial)}"
 
 
-class LensStore:
-    """Lenses of all owners. `ANY_OWNER` asks as the service itself."""
+class Lenses(Repository):
+    """Lenses of all owners and their samples. `ANY_OWNER` asks as the service itself."""
 
-    def __init__(self, database: Database) -> None:
-        self._db = database
-
-    def get(self, lens_id: str, owner: Owner) -> LensRow | None:
+    @reads
+    def get(self, session: Session, lens_id: str, owner: Owner) -> LensRow | None:
         """Return one lens, or None."""
-        with self._db.reading() as session:
-            return find_owned(session, LensRow, lens_id, owner)
+        return find_owned(session, LensRow, lens_id, owner)
 
+    @reads
     def page(
         self,
+        session: Session,
         owner: str,
         *,
         before: str | None,
@@ -85,193 +102,212 @@ class LensStore:
             query = query.where(func.lower(LensRow.model) == model.lower())
         if serial is not None:
             query = query.where(func.lower(LensRow.serial) == serial.lower())
-        with self._db.reading() as session:
-            return list(session.scalars(query))
+        return list(session.scalars(query))
 
-    def with_photos_beyond(self, states: Collection[str], lens_ids: Collection[str]) -> set[str]:
+    @reads
+    def with_photos_beyond(
+        self, session: Session, states: Collection[str], lens_ids: Collection[str]
+    ) -> set[str]:
         """Return which of these lenses have photos in other states."""
         query = (
             select(LensRow.public_id)
             .join(PhotoRow, PhotoRow.lens_id == LensRow.id)
             .where(LensRow.public_id.in_(lens_ids), PhotoRow.deleted_at.is_(None))
             .where(PhotoRow.state.not_in(states))
-            .distinct()
         )
-        with self._db.reading() as session:
-            return set(session.scalars(query))
+        return set(session.scalars(query.distinct()))
 
-    def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
+    @reads
+    def candidates(self, session: Session, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
         """Return the owner's lenses that a photo without a serial may belong to."""
         query = select(LensRow).where(LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
         if photo.lens_model:
             query = query.where(func.lower(LensRow.model) == photo.lens_model.lower())
-        with self._db.reading() as session:
-            return list(session.scalars(query.order_by(LensRow.public_id.desc()).limit(limit)))
+        return list(session.scalars(query.order_by(LensRow.public_id.desc()).limit(limit)))
 
-    def by_identity(self, photo: PhotoRow) -> LensRow | None:
+    @reads
+    def by_identity(self, session: Session, photo: PhotoRow) -> LensRow | None:
         """Return the lens that the serial of an inspected photo identifies, if it exists by now."""
         if photo.lens_serial is None:
             return None
         key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
-        with self._db.reading() as session:
-            return session.scalar(
-                select(LensRow).where(
-                    LensRow.owner_id == photo.owner_id,
-                    LensRow.identity_key == key,
-                    LensRow.deleted_at.is_(None),
-                )
-            )
+        return session.scalar(select(LensRow).where(*_same(photo.owner_id, key)))
 
-    def coverage_of(self, lenses: Sequence[LensRow]) -> dict[int, tuple[list[float], list[float]]]:
+    @reads
+    def coverage_of(
+        self, session: Session, lenses: Sequence[LensRow]
+    ) -> dict[int, tuple[list[float], list[float]]]:
         """Return the apertures and focal lengths of the counted photos of lenses, by key."""
         keys = [row.id for row in lenses]
-        query = (
-            select(PhotoRow.lens_id, PhotoRow.aperture, PhotoRow.focal_mm)
-            .where(PhotoRow.lens_id.in_(keys), TEACHES)
-            .distinct()
+        query = select(PhotoRow.lens_id, PhotoRow.aperture, PhotoRow.focal_mm).where(
+            PhotoRow.lens_id.in_(keys), TEACHES
         )
-        apertures: dict[int, set[float]] = {key: set() for key in keys}
-        focals: dict[int, set[float]] = {key: set() for key in keys}
-        with self._db.reading() as session:
-            for key, aperture, focal in session.execute(query):
-                assert key is not None
-                apertures[key] |= set() if aperture is None else {aperture}
-                focals[key] |= set() if focal is None else {focal}
-        return {key: (sorted(apertures[key]), sorted(focals[key])) for key in keys}
+        rows = session.execute(query.distinct()).all()
+        return {
+            key: (
+                sorted({aperture for lens, aperture, _ in rows if lens == key and aperture is not None}),
+                sorted({focal for lens, _, focal in rows if lens == key and focal is not None}),
+            )
+            for key in keys
+        }
 
-    def lateral_of(self, lens: LensRow) -> list[dict[str, Any]]:
+    @reads
+    def lateral_of(self, session: Session, lens: LensRow) -> list[dict[str, Any]]:
         """Return the lateral colour of each counted photo of a lens that shows it."""
         query = select(PhotoRow.lateral).where(PhotoRow.lens_id == lens.id, TEACHES)
-        with self._db.reading() as session:
-            return [lateral for lateral in session.scalars(query) if lateral]
+        return [lateral for lateral in session.scalars(query) if lateral]
 
-    def shape_of(self, lens: LensRow) -> tuple[int, int] | None:
+    @reads
+    def shape_of(self, session: Session, lens: LensRow) -> tuple[int, int] | None:
         """Return the commonest height and width of the photos of a lens in pixels, in sensor orientation."""
-        count = func.count()
         query = (
             select(PhotoRow.height, PhotoRow.width)
             .where(PhotoRow.lens_id == lens.id, TEACHES)
             .where(PhotoRow.width.is_not(None), PhotoRow.height.is_not(None))
             .group_by(PhotoRow.height, PhotoRow.width)
-            .order_by(count.desc(), PhotoRow.width.desc())
+            .order_by(func.count().desc(), PhotoRow.width.desc())
             .limit(1)
         )
-        with self._db.reading() as session:
-            row = session.execute(query).one_or_none()
-            return None if row is None else (row[0] or 0, row[1] or 0)
+        row = session.execute(query).one_or_none()
+        return None if row is None else (row[0] or 0, row[1] or 0)
 
-    def history(self, lens: LensRow, *, after: int = 0, limit: int = 1000) -> list[EventRow]:
+    @reads
+    def history(
+        self, session: Session, lens: LensRow, *, after: int = 0, limit: int = 1000
+    ) -> list[EventRow]:
         """Return the events of a lens beyond version `after`, oldest first."""
-        query = (
-            select(EventRow)
-            .where(EventRow.lens_id == lens.id, EventRow.version > after)
-            .order_by(EventRow.version)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return list(session.scalars(query))
+        query = select(EventRow).where(EventRow.lens_id == lens.id, EventRow.version > after)
+        return list(session.scalars(query.order_by(EventRow.version).limit(limit)))
 
-    def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
+    # --- samples ----------------------------------------------------------------------------------
+
+    def state_of(self, lens_id: str) -> LensState | None:
+        """Return the version of a lens by one read through its key; None if there is no such lens."""
+        with self.database.reader.connect() as connection:
+            row = connection.execute(_STATE, {"lens": lens_id}).one_or_none()
+            return None if row is None else LensState(*row)
+
+    def known_of(self, lens_id: str, owner: str) -> LensState | None:
+        """Return `state_of` a lens of an owner by one read; None if the owner has no such lens.
+
+        Without a session, which costs time: part of every request that a cached model answers.
+        """
+        if not is_id(lens_id):
+            return None
+        with self.database.reader.connect() as connection:
+            row = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).one_or_none()
+            return None if row is None else LensState(*row)
+
+    def samples_of(
+        self, lens_id: str, *, after_version: int = 0, up_to_version: int | None = None
+    ) -> tuple[LensState, list[StoredSample]]:
+        """Return the state of a lens and its samples that joined after a version.
+
+        Both are of one moment. Versions grow under the lens's row lock, so no sample of a
+        version that was seen can turn up later.
+        """
+        query = (
+            select(SampleRow.id, SampleRow.version_added, *COLUMNS)
+            .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
+            .join(PatchRow, PatchRow.id == SampleRow.patch_id)
+            .join(LensRow, LensRow.id == SampleRow.lens_id)
+            .where(LensRow.public_id == lens_id, SampleRow.version_added > after_version)
+            .order_by(SampleRow.version_added, SampleRow.id)
+        )
+        if up_to_version is not None:
+            query = query.where(SampleRow.version_added <= up_to_version)
+        with self.database.reading() as session:
+            state = session.execute(_STATE, {"lens": lens_id}).one_or_none()
+            if state is None:
+                return LensState(0, 0), []
+            rows = session.execute(query)
+            return LensState(*state), [StoredSample(r.id, r.version_added, sample_in(r)) for r in rows]
+
+    # --- measuring --------------------------------------------------------------------------------
+
+    @writes
+    def record_metrics(self, session: Session, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
         """Store the metrics of one version, once: held-out `error` and `coverage`."""
-        with self._db.writing() as session:
-            lens = find_owned(session, LensRow, lens_id, ANY_OWNER)
-            if lens is not None:
-                session.execute(
-                    update(EventRow)
-                    .where(EventRow.lens_id == lens.id, EventRow.version == version)
-                    .where(EventRow.metrics.is_(None))
-                    .values(metrics=metrics)
-                )
+        lens = find_owned(session, LensRow, lens_id, ANY_OWNER)
+        if lens is not None:
+            of_version = (EventRow.lens_id == lens.id, EventRow.version == version)
+            statement = update(EventRow).where(*of_version, EventRow.metrics.is_(None))
+            session.execute(statement.values(metrics=metrics))
 
-    def unmeasured(self, limit: int = 10) -> list[tuple[str, int]]:
-        """Return `(lens_id, version)` of the newest versions that were not measured yet."""
-        query = (
-            select(LensRow.public_id, LensRow.version)
-            .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
-            .where(EventRow.metrics.is_(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return [(row[0], row[1]) for row in session.execute(query)]
+    # --- changes ----------------------------------------------------------------------------------
 
-    def create(self, owner: str, label: str) -> str:
+    @writes
+    def create(self, session: Session, owner: str, label: str) -> str:
         """Create a lens of that name; return its id."""
-        with self._db.writing() as session:
-            name = LensName(None, None, None, label=label)
-            return named(session, ensure_owner(session, owner), name).public_id
+        name = LensName(None, None, None, label=label)
+        return named(session, ensure_owner(session, owner), name).public_id
 
-    def rename(self, lens_id: str, owner: str, label: str | None) -> bool:
+    @writes
+    def rename(self, session: Session, lens_id: str, owner: str, label: str | None) -> bool:
         """Set or remove the name that an owner gives a lens; False if there is no such lens."""
-        with self._db.writing() as session:
-            lens = find_to_change(session, LensRow, lens_id, owner)
-            if lens is None:
-                return False
+        lens = find_to_change(session, LensRow, lens_id, owner)
+        if lens is not None:
             lens.label = label
-            return True
+        return lens is not None
 
-    def merge(self, lens_id: str, into: str, owner: str) -> bool:
+    @writes
+    def merge(self, session: Session, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along.
 
         False if one of the two does not exist, photos of the first are still being learned from, or the two
         have different models.
         """
-        with self._db.writing() as session:
-            # always locked in the same order: two merges at once must not wait for each other
-            rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
-            lens, target = rows[lens_id], rows[into]
-            if lens is None or target is None or lens.id == target.id or lens.way != target.way:
-                return False
-            query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
-            photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
-            if any(photo.state in LEARNING for photo in photos):
-                return False
-            for photo in photos:
-                move_photo(session, photo, target)
-            target.complete(lens.maker, lens.model)
-            session.flush()
-            _forget(session, lens)
-            return True
+        # always locked in the same order: two merges at once must not wait for each other
+        rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
+        lens, target = rows[lens_id], rows[into]
+        if lens is None or target is None or lens.id == target.id or lens.way != target.way:
+            return False
+        query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+        photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
+        if any(photo.state in LEARNING for photo in photos):
+            return False
+        for photo in photos:
+            move_photo(session, photo, target)
+        target.complete(lens.maker, lens.model)
+        session.flush()
+        _forget(session, lens)
+        return True
 
-    def go_back(self, lens_id: str, owner: str, version: int) -> int | None:
+    @writes
+    def go_back(self, session: Session, lens_id: str, owner: str, version: int) -> int | None:
         """Exclude the photos that joined a lens after a version; return how many, None without a lens.
 
         They stay, and can be included again one by one.
         """
-        with self._db.writing() as session:
-            lens = find_to_change(session, LensRow, lens_id, owner)
-            if lens is None:
-                return None
-            events = select(EventRow).where(EventRow.lens_id == lens.id).order_by(EventRow.version)
-            joined: dict[str, int] = {}
-            for event in session.scalars(events):
-                if event.photo_public_id is not None and event.kind in {"photo_added", "photo_included"}:
-                    joined[event.photo_public_id] = event.version
-            later = [key for key, at in joined.items() if at > version]
-            photos = session.scalars(
-                select(PhotoRow).where(PhotoRow.public_id.in_(later), PhotoRow.lens_id == lens.id)
-            )
-            return sum(switch(session, photo, "excluded") for photo in photos)
+        lens = find_to_change(session, LensRow, lens_id, owner)
+        if lens is None:
+            return None
+        joining = EventRow.kind.in_(("photo_added", "photo_included"))
+        events = select(EventRow).where(EventRow.lens_id == lens.id, joining).order_by(EventRow.version)
+        joined = {event.photo_public_id: event.version for event in session.scalars(events)}
+        later = [key for key, at in joined.items() if at > version]
+        photos = select(PhotoRow).where(PhotoRow.public_id.in_(later), PhotoRow.lens_id == lens.id)
+        return sum(switch(session, photo, "excluded") for photo in session.scalars(photos))
 
-    def delete(self, lens_id: str, owner: Owner) -> bool:
+    @writes
+    def delete(self, session: Session, lens_id: str, owner: Owner) -> bool:
         """Delete a lens with all that was learned of it; its photos stay and can be corrected with another.
 
         Work on photos that would teach it is cancelled. False if there is no such lens.
         """
-        with self._db.writing() as session:
-            lens = find_to_change(session, LensRow, lens_id, owner)
-            if lens is None:
-                return False
-            taught = select(PhotoRow).where(PhotoRow.lens_id == lens.id).with_for_update()
-            for photo in session.scalars(taught):
-                _unlearn(session, photo)
-            session.execute(
-                update(CorrectionRow)
-                .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(("queued", "running")))
-                .values(state="cancelled", finished_at=now())
-            )
-            session.flush()
-            _forget(session, lens)
-            return True
+        lens = find_to_change(session, LensRow, lens_id, owner)
+        if lens is None:
+            return False
+        for photo in session.scalars(select(PhotoRow).where(PhotoRow.lens_id == lens.id).with_for_update()):
+            _unlearn(session, photo)
+        session.execute(
+            update(CorrectionRow)
+            .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(("queued", "running")))
+            .values(state="cancelled", finished_at=now())
+        )
+        session.flush()
+        _forget(session, lens)
+        return True
 
 
 # --- identity -------------------------------------------------------------------------------------
@@ -303,6 +339,10 @@ def named(session: Session, owner_id: int, name: LensName, *, way: str | None = 
     return lens
 
 
+def _same(owner_id: int, key: str) -> tuple[Any, ...]:
+    return LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+
+
 def _found(
     session: Session, owner_id: int, name: LensName, *, way: str | None, creates: bool
 ) -> LensRow | None:
@@ -320,12 +360,11 @@ def _found(
         "created_at": now(),
         **dict.fromkeys(("version", "rebuild_epoch", "photo_count", "sample_count"), 0),
     }
-    same = (LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None))
     for _ in range(TRIES):
         if creates:
             insert_new(session, LensRow, [fresh])
         # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
-        lens = session.scalar(select(LensRow).where(*same).with_for_update())
+        lens = session.scalar(select(LensRow).where(*_same(owner_id, key)).with_for_update())
         if lens is not None or not creates:
             return lens
     return None
@@ -396,8 +435,7 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
         .returning(LensRow.version, LensRow.rebuild_epoch, LensRow.public_id)
     ).one()
     if version > 1:  # before the first there was nothing to report
-        outdated = _reports_prefix(public_id, version - 1, epoch - raised)
-        insert_new(session, GarbageRow, [{"prefix": outdated, "not_before": now() + STILL_WRITTEN}])
+        discard(session, _reports_prefix(public_id, version - 1, epoch - raised), after=STILL_WRITTEN)
     return int(version)
 
 
@@ -413,10 +451,9 @@ def report_key(lens_id: str, version: int, epoch: int) -> str:
 def _set_samples(session: Session, photo: PhotoRow, **columns: int | None) -> int:
     """Let the samples of a photo belong to its lens, or to none; return how many."""
     assert photo.lens_id is not None
-    statement = update(SampleRow).where(SampleRow.photo_id == photo.id).values(**columns)
-    changed = session.connection().execute(statement).rowcount
+    count = changed(session, update(SampleRow).where(SampleRow.photo_id == photo.id).values(**columns))
     recount_samples(session, photo.lens_id)
-    return changed
+    return count
 
 
 def recount_samples(session: Session, lens_id: int) -> None:
@@ -486,10 +523,14 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     photo.stage_at = now()
     photo.lens_id, photo.counted_at = None, None
     photo.given = {name: value for name, value in photo.given.items() if name != "lens_id"}
+    forget_patches(session, photo)
+
+
+def forget_patches(session: Session, photo: PhotoRow) -> None:
+    """Delete the patches and samples of a photo."""
+    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))  # and by the key its samples
     photo.patches_total = photo.patches_done = photo.patches_rejected = 0
     photo.windows, photo.windows_rejected = None, 0
-    session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
-    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
 
 
 def _forget(session: Session, lens: LensRow) -> None:
@@ -503,13 +544,4 @@ def _forget(session: Session, lens: LensRow) -> None:
     lens.identity_key = f"deleted|{lens.public_id}"
     lens.photo_count = lens.sample_count = 0
     lens.deleted_at = now()
-    models = f"models/{lens.public_id}/"
-    insert_new(session, GarbageRow, [{"prefix": models, "not_before": now() + STILL_WRITTEN}])
-
-
-def delete_corrections(session: Session, photo: PhotoRow) -> None:
-    """Remove a photo's corrections; their blobs become garbage."""
-    keys = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id == photo.id))
-    rows = [{"prefix": f"corrections/{key}/", "not_before": now() + LATE} for key in keys]
-    insert_new(session, GarbageRow, rows)
-    session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
+    discard(session, f"models/{lens.public_id}/", after=STILL_WRITTEN)

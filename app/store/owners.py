@@ -6,12 +6,13 @@ from datetime import UTC, datetime, timedelta
 from enum import Enum
 from typing import Final, TypeAlias, TypeVar
 
-from sqlalchemy import Select, select
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, Select, select
+from sqlalchemy.orm import Session, joinedload
+from sqlalchemy.orm.interfaces import ORMOption
 
 from app.errors import NotSignedInError
 from app.store.database import insert_new
-from app.store.tables import CorrectionRow, LensRow, OwnerRow, PhotoRow
+from app.store.tables import Base, CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 LOCAL: Final = "local"
 """The one owner in a service without sign-in."""
@@ -31,6 +32,13 @@ Owner: TypeAlias = str | AnyOwner
 """Whose rows are asked for; there is no default, so that nobody asks for everybody's by leaving it out."""
 
 Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
+
+_WITH: Final[dict[type[Base], tuple[ORMOption, ...]]] = {
+    PhotoRow: (joinedload(PhotoRow.lens),),
+    LensRow: (),
+    CorrectionRow: (joinedload(CorrectionRow.photo), joinedload(CorrectionRow.lens)),
+}
+"""What is read with a row: what nearly all who ask for it need of it."""
 
 
 def now() -> datetime:
@@ -57,12 +65,15 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
 
 def owned(table: type[Owned], owner: Owner) -> Select[Owned]:
     """Select the rows of one owner, or of `ANY_OWNER`, that are not deleted."""
-    query: Select[Owned] = select(table)
-    if issubclass(table, PhotoRow | LensRow):  # corrections are removed outright
-        query = query.where(table.deleted_at.is_(None))
+    query: Select[Owned] = select(table).options(*_WITH[table]).where(*present(table))
     if owner is not ANY_OWNER:
         query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
     return query
+
+
+def present(table: type[PhotoRow | LensRow | CorrectionRow]) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions of rows that are not deleted; corrections are removed outright."""
+    return () if issubclass(table, CorrectionRow) else (table.deleted_at.is_(None),)
 
 
 def find_owned(session: Session, table: type[Owned], public_id: str, owner: Owner) -> Owned | None:
@@ -78,6 +89,12 @@ def find_to_change(session: Session, table: type[Owned], public_id: str, owner: 
     if not is_id(public_id):
         return None
     return session.scalar(_by_id(table, public_id, owner).with_for_update(of=table))
+
+
+def discard(session: Session, *prefixes: str, after: timedelta = LATE) -> None:
+    """Have blobs deleted after a while: all keys with one of the prefixes, or a single key."""
+    due = now() + after
+    insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due} for prefix in prefixes])
 
 
 def is_id(text: str) -> bool:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final, Literal
 
 from sqlalchemy import case, delete, func, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, joinedload
 
+from app import distances
 from app.errors import BusyError, ConflictError, UnknownPhotoError
 from app.store import lenses
-from app.store.database import Database, insert_new
-from app.store.lenses import LensName, delete_corrections, forget_if_empty, give_back, join, may_move
-from app.store.owners import ANY_OWNER, LATE, Owner, ensure_owner, find_owned, find_to_change, now, owned
+from app.store.database import changed, insert_new, new_id, reads, writes, writes_durably
+from app.store.lenses import LensName, forget_if_empty, forget_patches, give_back, join, may_move
+from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, owned
+from app.store.patches import Patches
+from app.store.samples import PROFILE, columns_of
 from app.store.tables import (
     PHOTO_FINAL,
     PHOTO_RUNNING,
@@ -27,6 +32,8 @@ from app.store.tables import (
     PhotoRow,
     SampleRow,
 )
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import LensSettings
 
 WORKED_ON: Final = ("received", *PHOTO_RUNNING)
 """States that cost computing time; a photo that waits for its owner costs space only."""
@@ -87,34 +94,23 @@ class Received:
     """Whether the photo is known without its file, which has now come again."""
 
 
-class PhotoStore:
-    """Photos of all owners. `ANY_OWNER` asks as the service itself."""
+class Photos(Patches):
+    """Photos of all owners, with their patches. `ANY_OWNER` asks as the service itself."""
 
-    def __init__(self, database: Database) -> None:
-        self._db = database
+    @reads
+    def get(self, session: Session, photo_id: str, owner: Owner) -> PhotoRow | None:
+        """Return one photo with its lens, or None."""
+        return find_owned(session, PhotoRow, photo_id, owner)
 
-    def get(self, photo_id: str, owner: Owner) -> PhotoRow | None:
-        """Return one photo, or None."""
-        with self._db.reading() as session:
-            return find_owned(session, PhotoRow, photo_id, owner)
-
-    def newest_file(self) -> str | None:
+    @reads
+    def newest_file(self, session: Session) -> str | None:
         """Return the key of the file of the newest photo, or None where there is no file."""
-        kept = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
-        with self._db.reading() as session:
-            return session.scalar(
-                select(PhotoRow.blob_key).where(*kept).order_by(PhotoRow.id.desc()).limit(1)
-            )
+        return session.scalar(select(PhotoRow.blob_key).where(*_FILED).order_by(PhotoRow.id.desc()).limit(1))
 
-    def lens_of(self, photo: PhotoRow) -> LensRow | None:
-        """Return the lens that a photo was taken with, where that is known."""
-        if photo.lens_id is None:
-            return None
-        with self._db.reading() as session:
-            return session.get(LensRow, photo.lens_id)
-
+    @reads
     def page(
         self,
+        session: Session,
         owner: str,
         *,
         before: str | None,
@@ -122,65 +118,35 @@ class PhotoStore:
         lens_id: str | None = None,
         state: str | None = None,
     ) -> list[PhotoRow]:
-        """Return photos, newest first, that came before the photo `before`."""
+        """Return photos with their lenses, newest first, that came before the photo `before`."""
         query = owned(PhotoRow, owner).where(PhotoRow.kind != PROFILE_FILE)
-        query = query.order_by(PhotoRow.public_id.desc()).limit(limit)
         if before is not None:
             query = query.where(PhotoRow.public_id < before)
         if lens_id is not None:
-            query = query.join(LensRow, LensRow.id == PhotoRow.lens_id).where(LensRow.public_id == lens_id)
+            query = query.where(PhotoRow.lens.has(LensRow.public_id == lens_id))
         if state is not None:
             query = query.where(PhotoRow.state == state)
-        with self._db.reading() as session:
-            return list(session.scalars(query))
+        return list(session.scalars(query.order_by(PhotoRow.public_id.desc()).limit(limit)))
 
-    def lens_ids(self, photos: Sequence[PhotoRow]) -> dict[int, str]:
-        """Return the public ids of the lenses of these photos, by key."""
-        keys = {photo.lens_id for photo in photos if photo.lens_id is not None}
-        with self._db.reading() as session:
-            rows = session.execute(select(LensRow.id, LensRow.public_id).where(LensRow.id.in_(keys)))
-            return {row.id: row.public_id for row in rows}
-
-    def load_of(self, owner: str) -> tuple[int, int, int]:
+    @reads
+    def load_of(self, session: Session, owner: str) -> tuple[int, int, int]:
         """Return `(unfinished photos, bytes of stored files and results, all photos)` of an owner."""
-        results = (
-            select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0))
-            .join(OwnerRow, OwnerRow.id == CorrectionRow.owner_id)
-            .where(OwnerRow.name == owner, CorrectionRow.state == "succeeded")
+        results = select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0)).where(
+            CorrectionRow.owner.has(OwnerRow.name == owner), CorrectionRow.state == "succeeded"
         )
-        with self._db.reading() as session:
-            made = session.scalar(results) or 0
-            row = session.execute(
-                select(
-                    func.count().filter(PhotoRow.state.in_(WORKED_ON)),
-                    func.coalesce(func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None)), 0),
-                    func.count(),
-                )
-                .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
-                .where(OwnerRow.name == owner, PhotoRow.deleted_at.is_(None))
-            ).one()
-            return int(row[0]), int(row[1]) + int(made), int(row[2])
-
-    def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
-        """Return `(photo_id, epoch, owner)` of received photos, oldest first: the intent sweep."""
-        return self._in_states(("received",), limit)
-
-    def running(self, limit: int = 1000) -> list[tuple[str, int, str]]:
-        """Return `(photo_id, epoch, owner)` of photos that a worker is busy with."""
-        return self._in_states(PHOTO_RUNNING, limit)
-
-    def _in_states(self, states: Sequence[str], limit: int) -> list[tuple[str, int, str]]:
-        query = (
-            select(PhotoRow.public_id, PhotoRow.epoch, OwnerRow.name)
+        unfinished, stored, count = session.execute(
+            select(
+                func.count().filter(PhotoRow.state.in_(WORKED_ON)),
+                func.coalesce(func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None)), 0),
+                func.count(),
+            )
             .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
-            .where(PhotoRow.state.in_(states), PhotoRow.deleted_at.is_(None))
-            .order_by(PhotoRow.id)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return [(row[0], row[1], row[2]) for row in session.execute(query)]
+            .where(OwnerRow.name == owner, PhotoRow.deleted_at.is_(None))
+        ).one()
+        return int(unfinished), int(stored) + int(session.scalar(results) or 0), int(count)
 
-    def unneeded(self, policy: str, limit: int = 100) -> list[str]:
+    @reads
+    def unneeded(self, session: Session, policy: str, limit: int = 100) -> list[str]:
         """Return photos whose file is to be given up, as the setting `keep_photos` says.
 
         Never one that is being worked on, waits for its lens, or failed in an outage and may be retried.
@@ -197,89 +163,57 @@ class PhotoStore:
             disposable = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
         else:
             disposable = learned & ~jobs.exists() & (ended < now() - GRACE)
-        query = (
-            select(PhotoRow.public_id)
-            .where(PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None), disposable, ~busy)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return list(session.scalars(query))
+        query = select(PhotoRow.public_id).where(*_FILED, disposable, ~busy)
+        return list(session.scalars(query.limit(limit)))
 
-    def read_profiles(self, limit: int = 100) -> list[str]:
+    @reads
+    def read_profiles(self, session: Session, limit: int = 100) -> list[str]:
         """Return the files of samples that were read, or refused, a day ago."""
+        ended = PhotoRow.finished_at < now() - FILE_KEPT
         query = select(PhotoRow.public_id).where(
-            PhotoRow.kind == PROFILE_FILE,
-            PhotoRow.deleted_at.is_(None),
-            PhotoRow.finished_at < now() - FILE_KEPT,
+            PhotoRow.kind == PROFILE_FILE, PhotoRow.deleted_at.is_(None), ended
         )
-        with self._db.reading() as session:
-            return list(session.scalars(query.limit(limit)))
+        return list(session.scalars(query.limit(limit)))
 
-    def unsearched(self, limit: int = 100) -> list[PhotoRow]:
+    @reads
+    def unsearched(self, session: Session, limit: int = 100) -> list[PhotoRow]:
         """Return photos nobody works on whose file may still say where they were taken.
 
         Such are those that failed before they were searched, and files that came again.
         """
-        query = (
-            select(PhotoRow)
-            .where(
-                *(
-                    PhotoRow.deleted_at.is_(None),
-                    PhotoRow.file_gone_at.is_(None),
-                    PhotoRow.location.is_(None),
-                    PhotoRow.kind != PROFILE_FILE,
-                ),
-                PhotoRow.state.not_in(WORKED_ON),
-            )
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return list(session.scalars(query))
+        query = select(PhotoRow).where(*_FILED, PhotoRow.location.is_(None), PhotoRow.kind != PROFILE_FILE)
+        return list(session.scalars(query.where(PhotoRow.state.not_in(WORKED_ON)).limit(limit)))
 
-    def is_live(self, photo_id: str, epoch: int) -> bool:
+    @reads
+    def is_live(self, session: Session, photo_id: str, epoch: int) -> bool:
         """Say whether work for this epoch of the photo is still wanted: the cancel poll."""
-        with self._db.reading() as session:
-            return (
-                session.scalar(
-                    select(PhotoRow.id).where(
-                        PhotoRow.public_id == photo_id,
-                        PhotoRow.epoch == epoch,
-                        PhotoRow.state.not_in(PHOTO_FINAL),
-                        PhotoRow.deleted_at.is_(None),
-                    )
-                )
-                is not None
-            )
+        of_epoch = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch)
+        wanted = (PhotoRow.state.not_in(PHOTO_FINAL), PhotoRow.deleted_at.is_(None))
+        return session.scalar(select(PhotoRow.id).where(*of_epoch, *wanted)) is not None
 
-    def failed_by(self, owner: str, code: str, limit: int) -> list[str]:
+    @reads
+    def failed_by(self, session: Session, owner: str, code: str, limit: int) -> list[str]:
         """Return the photos that ended with a code, oldest first."""
-        query = (
-            owned(PhotoRow, owner)
-            .where(PhotoRow.state == "failed", PhotoRow.error_code == code)
-            .order_by(PhotoRow.id)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return [row.public_id for row in session.scalars(query)]
+        query = owned(PhotoRow, owner).where(PhotoRow.state == "failed", PhotoRow.error_code == code)
+        return [row.public_id for row in session.scalars(query.order_by(PhotoRow.id).limit(limit))]
 
-    def existing(self, photo_ids: Iterable[str]) -> set[str]:
+    @reads
+    def existing(self, session: Session, photo_ids: Iterable[str]) -> set[str]:
         """Return which of these photos are not deleted and still have their file."""
-        query = select(PhotoRow.public_id).where(
-            PhotoRow.public_id.in_(list(photo_ids)),
-            PhotoRow.deleted_at.is_(None),
-            PhotoRow.file_gone_at.is_(None),
-        )
-        with self._db.reading() as session:
-            return set(session.scalars(query))
+        query = select(PhotoRow.public_id).where(PhotoRow.public_id.in_(list(photo_ids)), *_FILED)
+        return set(session.scalars(query))
 
-    def expect(self, prefix: str, *, within: timedelta) -> None:
+    # --- receiving --------------------------------------------------------------------------------
+
+    @writes
+    def expect(self, session: Session, prefix: str, *, within: timedelta) -> None:
         """Announce blobs below `prefix`: garbage an hour after that time unless a photo claims them."""
-        with self._db.writing() as session:
-            due = now() + within + SPARE
-            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due}])
+        discard(session, prefix, after=within + SPARE)
 
+    @writes_durably
     def receive(
         self,
+        session: Session,
         owner: str,
         *,
         public_id: str,
@@ -297,72 +231,74 @@ class PhotoStore:
         A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
         calibrate its lens and was not before, or it waited for settings that are now given.
         """
-        with self._db.writing(durable=True) as session:
-            owner_key = ensure_owner(session, owner, may_be_new=may_be_new)
-            fresh = {
-                "public_id": public_id,
-                "owner_id": owner_key,
-                "sha256": sha256,
-                "filename": filename,
-                "kind": kind,
-                "byte_size": byte_size,
-                "blob_key": blob_key,
-                "calibrate": calibrate,
-                "given": _of_upload(given),
-                "state": "received",
-                "received_at": now(),
-                "stage_at": now(),
-                **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
-            }
-            known, created = _insert_or_find(session, fresh)
-            if created:
-                _keep_announced(session, f"{blob_key.rpartition('/')[0]}/")
-                return Received(known, fresh=True)
-            merged = _of_upload(given, known.given)
-            again = (
-                known.state in {"failed", "cancelled"}
-                or (calibrate and not known.calibrate)
-                or (known.state == "needs_lens" and merged != known.given)
-                or (known.kind == PROFILE_FILE and known.state == "stored")
-            )
-            if again:
-                known.calibrate = calibrate
-                known.given = merged
-                if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
-                    restart(session, known)
-            return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
+        fresh = {
+            "public_id": public_id,
+            "owner_id": ensure_owner(session, owner, may_be_new=may_be_new),
+            "sha256": sha256,
+            "filename": filename,
+            "kind": kind,
+            "byte_size": byte_size,
+            "blob_key": blob_key,
+            "calibrate": calibrate,
+            "given": _of_upload(given),
+            "state": "received",
+            "received_at": now(),
+            "stage_at": now(),
+            **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
+        }
+        known, created = _insert_or_find(session, fresh)
+        if created:
+            _keep_announced(session, known.folder)
+            return Received(known, fresh=True)
+        merged = _of_upload(given, known.given)
+        again = (
+            known.state in {"failed", "cancelled"}
+            or (calibrate and not known.calibrate)
+            or (known.state == "needs_lens" and merged != known.given)
+            or (known.kind == PROFILE_FILE and known.state == "stored")
+        )
+        if again:
+            known.calibrate = calibrate
+            known.given = merged
+            if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
+                restart(session, known)
+        return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
 
-    def give_up_file(self, photo_id: str, names: Sequence[str]) -> bool:
+    @writes
+    def give_up_file(self, session: Session, photo_id: str, names: Sequence[str]) -> bool:
         """Give up the file of a photo and pictures of it; False if it is still needed, or gone already.
 
         The row says so before the blobs are deleted, and their keys become garbage: no blob is left behind.
         """
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-            busy = CorrectionRow.state.in_(("queued", "running"))
-            if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
-                return False
-            unfinished = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
-            if session.scalar(unfinished.limit(1)) is not None:
-                return False
-            photo.file_gone_at = now()
-            keys = [photo.blob_key, *(f"{photo_folder(photo)}{name}" for name in names)]
-            insert_new(session, GarbageRow, [{"prefix": key, "not_before": now()} for key in keys])
-            return True
+        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+        if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
+            return False
+        busy = CorrectionRow.state.in_(("queued", "running"))
+        unfinished = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
+        if session.scalar(unfinished.limit(1)) is not None:
+            return False
+        photo.file_gone_at = now()
+        discard(session, photo.blob_key, *(f"{photo.folder}{name}" for name in names), after=timedelta(0))
+        return True
 
-    def restore_file(self, photo_id: str, blob_key: str, *, again: bool = False) -> None:
+    @writes_durably
+    def restore_file(self, session: Session, photo_id: str, blob_key: str, *, again: bool = False) -> None:
         """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
-        with self._db.writing(durable=True) as session:
-            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-            if photo is None:
-                return
-            photo.blob_key, photo.file_gone_at = blob_key, None
-            photo.location = photo.file_sha256 = None
-            if again:
-                restart(session, photo)
+        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+        if photo is None:
+            return
+        photo.blob_key, photo.file_gone_at = blob_key, None
+        photo.location = photo.file_sha256 = None
+        if again:
+            restart(session, photo)
 
+    # --- work -------------------------------------------------------------------------------------
+
+    @writes
     def set_state(
         self,
+        session: Session,
+        /,
         photo_id: str,
         from_states: Sequence[str],
         to: str,
@@ -375,34 +311,41 @@ class PhotoStore:
         With `epoch` only if the photo was not started anew since: a worker that lost its lease changes
         nothing.
         """
-        with self._db.writing() as session:
-            return change_state(session, photo_id, from_states, to, epoch=epoch, **fields)
+        return change_state(session, photo_id, from_states, to, epoch=epoch, **fields)
 
-    def record_inspection(self, photo_id: str, identity: LensName, **header: object) -> None:
+    @writes
+    def record_inspection(
+        self, session: Session, /, photo_id: str, identity: LensName, **header: object
+    ) -> None:
         """Store what the header says; the owner's corrections go before it, settings of the upload after."""
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-            if photo is None:
-                return
-            settings = {column: header.pop(column, None) for column in GIVEN_SETTINGS.values()}
-            for field, column in GIVEN_SETTINGS.items():
-                setattr(photo, column, _setting(photo, field, settings[column]))
-            for column, value in header.items():
-                setattr(photo, column, value)
-            serial = photo.given.get("lens_serial")
-            photo.lens_maker = photo.given.get("lens_maker") or identity.maker
-            photo.lens_model = photo.given.get("lens_model") or identity.model
-            photo.lens_serial = serial or identity.serial
-            photo.lens_serial_source = "user" if serial else identity.serial_source
+        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+        if photo is None:
+            return
+        for field, column in GIVEN_SETTINGS.items():
+            setattr(photo, column, _setting(photo, field, header.pop(column, None)))
+        for column, value in header.items():
+            setattr(photo, column, value)
+        serial = photo.given.get("lens_serial")
+        photo.lens_maker = photo.given.get("lens_maker") or identity.maker
+        photo.lens_model = photo.given.get("lens_model") or identity.model
+        photo.lens_serial = serial or identity.serial
+        photo.lens_serial_source = "user" if serial else identity.serial_source
 
-    def record_lateral(self, photo_id: str, epoch: int, lateral: dict[str, Any]) -> None:
+    @writes
+    def record_lateral(self, session: Session, photo_id: str, epoch: int, lateral: dict[str, Any]) -> None:
         """Store the lateral colour that a photo shows, unless it was deleted or started anew meanwhile."""
         current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch, PhotoRow.deleted_at.is_(None))
-        with self._db.writing() as session:
-            session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
+        session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
 
+    @writes_durably
     def record_location(
-        self, photo: PhotoRow, location: str, *, key: str | None = None, digest: str | None = None
+        self,
+        session: Session,
+        photo: PhotoRow,
+        location: str,
+        *,
+        key: str | None = None,
+        digest: str | None = None,
     ) -> bool:
         """Record whether the file of a photo said where it was taken; False if it has another file by now.
 
@@ -410,38 +353,63 @@ class PhotoStore:
         file of the photo, and the one before garbage once nobody reads it any more.
         """
         current = (PhotoRow.public_id == photo.public_id, PhotoRow.blob_key == photo.blob_key)
-        changed = {} if key is None else {"blob_key": key, "file_sha256": digest}
-        with self._db.writing(durable=True) as session:
-            statement = update(PhotoRow).where(*current, PhotoRow.deleted_at.is_(None))
-            recorded = session.connection().execute(statement.values(location=location, **changed))
-            if recorded.rowcount != 1:
-                return False
-            if key is not None:
-                old = {"prefix": photo.blob_key, "not_before": now() + LATE}
-                insert_new(session, GarbageRow, [old])
-            return True
+        values = {"location": location, **({} if key is None else {"blob_key": key, "file_sha256": digest})}
+        statement = update(PhotoRow).where(*current, PhotoRow.deleted_at.is_(None)).values(**values)
+        if changed(session, statement) != 1:
+            return False
+        if key is not None:
+            discard(session, photo.blob_key)
+        return True
 
-    def assign_lens(self, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
+    @writes
+    def assign_lens(self, session: Session, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
         """Return the lens of an inspected photo, created if need be; None if its copy is unknown.
 
         Order: the lens that the owner named, then the serial (given by the owner, else of the file), then,
         only with `single_copy`, the model alone. Photos that are merely stored join a lens that exists
         but create none.
         """
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-            if photo is None:
-                return None
-            lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
-            if lens is not None:
-                photo.lens_id, photo.way = lens.id, lens.way
-                lens.complete(photo.lens_maker, photo.lens_model)
-                if photo.calibrate and photo.given.get("model") == lens.way:  # the request is fulfilled
-                    photo.given = {name: value for name, value in photo.given.items() if name != "model"}
-            return lens
+        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+        if photo is None:
+            return None
+        lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
+        if lens is not None:
+            photo.lens_id, photo.way = lens.id, lens.way
+            lens.complete(photo.lens_maker, photo.lens_model)
+            if photo.calibrate and photo.given.get("model") == lens.way:  # the request is fulfilled
+                photo.given = {name: value for name, value in photo.given.items() if name != "model"}
+        return lens
 
+    @writes
+    def fail(self, session: Session, photo_id: str, epoch: int, code: str, detail: str) -> bool:
+        """End a photo that is being worked on with a reason; its samples never count."""
+        fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
+        failed = change_state(session, photo_id, WORKED_ON, "failed", epoch=epoch, **fields)
+        if failed:
+            _let_go(session, photo_id)
+        return failed
+
+    @writes
+    def finish(self, session: Session, photo_id: str, epoch: int) -> int | None:
+        """Count a photo: its samples join the model and the lens's version grows by one.
+
+        Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
+        transaction: it happens entirely and once, however often it is tried.
+        """
+        done = {"finished_at": now(), "counted_at": now()}
+        if not change_state(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
+            return None
+        photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
+        if photo.lens_id is None:
+            raise ValueError(f"photo {photo_id} has no lens: assign one before it is counted")
+        return join(session, photo, "photo_added")
+
+    # --- what owners change -----------------------------------------------------------------------
+
+    @writes
     def change(
         self,
+        session: Session,
         photo_id: str,
         owner: str,
         given: Mapping[str, Any],
@@ -457,118 +425,130 @@ class PhotoStore:
         All of it or nothing; False where the photo cannot be excluded or included. A photo that has a
         result changes its lens's model at once, any other starts again.
         """
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None:
+        photo = find_to_change(session, PhotoRow, photo_id, owner)
+        if photo is None:
+            return False
+        if excluded is not None:
+            wanted: Literal["excluded", "counted"] = "excluded" if excluded else "counted"
+            if photo.state != wanted and not lenses.switch(session, photo, wanted):
                 return False
-            if excluded is not None:
-                wanted: Final[Literal["excluded", "counted"]] = "excluded" if excluded else "counted"
-                if photo.state != wanted and not lenses.switch(session, photo, wanted):
-                    return False
-            chosen = _chosen(session, photo, lens, owner)
-            begins = calibrate and not photo.calibrate
-            if begins and photo.file_gone_at is not None:
-                return False
-            return _changed(session, photo, given, chosen, begins=begins)
+        chosen = _chosen(session, photo, lens, owner)
+        begins = calibrate and not photo.calibrate
+        if begins and photo.file_gone_at is not None:
+            return False
+        return _changed(session, photo, given, chosen, begins=begins)
 
+    @writes
     def change_several(
-        self, photo_ids: Sequence[str], owner: str, given: Mapping[str, Any], lens: str | NewCopy | None
+        self,
+        session: Session,
+        photo_ids: Sequence[str],
+        owner: str,
+        given: Mapping[str, Any],
+        lens: str | NewCopy | None,
     ) -> None:
         """Apply the same settings and lens to several photos: to all or, where one refuses, to none.
 
         A new copy becomes the lens of them all.
         """
-        with self._db.writing() as session:
-            # always locked in the same order: two such changes must not wait for each other
-            rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
-            chosen: LensRow | None = None
-            for key in photo_ids:
-                photo = rows[key]
-                if photo is None:
-                    raise UnknownPhotoError(f"there is no photo {key[:60]}: nothing was changed")
-                if chosen is None and isinstance(lens, NewCopy):
-                    name = LensName(photo.lens_maker, photo.lens_model, None, label=lens.label)
-                    chosen = _chosen(session, photo, name, owner)
-                elif chosen is None and isinstance(lens, str):
-                    chosen = _chosen(session, photo, lens, owner)
-                if not _changed(session, photo, given, chosen):
-                    raise ConflictError(
-                        f"photo {key} was learned from for another model than that of the lens: leave it "
-                        "out; nothing was changed"
-                    )
+        # always locked in the same order: two such changes must not wait for each other
+        rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
+        chosen: LensRow | None = None
+        for key in photo_ids:
+            photo = rows[key]
+            if photo is None:
+                raise UnknownPhotoError(f"there is no photo {key[:60]}: nothing was changed")
+            if chosen is None and isinstance(lens, NewCopy):
+                name = LensName(photo.lens_maker, photo.lens_model, None, label=lens.label)
+                chosen = _chosen(session, photo, name, owner)
+            elif chosen is None and isinstance(lens, str):
+                chosen = _chosen(session, photo, lens, owner)
+            if not _changed(session, photo, given, chosen):
+                raise ConflictError(
+                    f"photo {key} was learned from for another model than that of the lens: leave it "
+                    "out; nothing was changed"
+                )
 
-    def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
-        """End a photo that is being worked on with a reason; its samples never count."""
-        with self._db.writing() as session:
-            fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-            failed = change_state(
-                session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields
-            )
-            if failed:
-                _let_go(session, photo_id)
-            return failed
-
-    def retry(self, photo_id: str, owner: Owner) -> bool:
+    @writes
+    def retry(self, session: Session, photo_id: str, owner: Owner) -> bool:
         """Start a failed or cancelled photo anew; False if it is in another state."""
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None or photo.state not in {"failed", "cancelled"}:
-                return False
-            restart(session, photo)
-            return True
+        photo = find_to_change(session, PhotoRow, photo_id, owner)
+        if photo is None or photo.state not in {"failed", "cancelled"}:
+            return False
+        restart(session, photo)
+        return True
 
-    def cancel(self, photo_id: str, owner: Owner) -> bool:
+    @writes
+    def cancel(self, session: Session, photo_id: str, owner: Owner) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
 
         Work that still runs sees the state and changes nothing.
         """
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None or not change_state(
-                session, photo_id, UNFINISHED, "cancelled", finished_at=now()
-            ):
-                return False
-            session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-            _let_go(session, photo_id)
-            return True
+        photo = find_to_change(session, PhotoRow, photo_id, owner)
+        if photo is None or not change_state(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
+            return False
+        session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+        _let_go(session, photo_id)
+        return True
 
-    def finish(self, photo_id: str, epoch: int) -> int | None:
-        """Count a photo: its samples join the model and the lens's version grows by one.
-
-        Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
-        transaction: it happens entirely and once, however often it is tried.
-        """
-        with self._db.writing() as session:
-            done = {"finished_at": now(), "counted_at": now()}
-            if not change_state(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
-                return None
-            photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
-            if photo.lens_id is None:
-                raise ValueError(f"photo {photo_id} has no lens: assign one before it is counted")
-            return join(session, photo, "photo_added")
-
-    def delete(self, photo_id: str, owner: Owner) -> str | None:
-        """Forget a photo, its patches and samples; return the prefix of its blobs.
+    @writes
+    def delete(self, session: Session, photo_id: str, owner: Owner) -> str | None:
+        """Forget a photo, its patches, samples and corrections; return the prefix of its blobs.
 
         The row stays, emptied, because the lens's history refers to it.
         """
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None:
-                return None
-            if photo.state == "counted":
-                give_back(session, photo, "photo_removed")
-            session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
-            session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-            delete_corrections(session, photo)
-            photo.deleted_at = now()
-            photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
-            _erase_description(photo)
-            photo.windows, photo.windows_rejected = None, 0
-            forget_if_empty(session, photo)
-            prefix = photo_folder(photo)
-            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
-            return prefix
+        photo = find_to_change(session, PhotoRow, photo_id, owner)
+        if photo is None:
+            return None
+        if photo.state == "counted":
+            give_back(session, photo, "photo_removed")
+        forget_patches(session, photo)
+        corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
+        discard(session, photo.folder, *(row.folder for row in corrections))
+        session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
+        photo.deleted_at = now()
+        photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
+        photo.given, photo.filename, photo.sha256 = {}, "", ""
+        for column in DESCRIPTION:
+            setattr(photo, column, None)
+        forget_if_empty(session, photo)
+        return photo.folder
+
+    # --- profiles ---------------------------------------------------------------------------------
+
+    @writes_durably
+    def take_in(
+        self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
+    ) -> int | None:
+        """Let the samples of a profile join its lens; return the number of their photos.
+
+        None where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of the
+        profile becomes a counted photo without a file, which can be excluded or deleted as any other. What
+        was imported before is not imported again.
+        """
+        groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
+        for sample in samples:
+            groups[sample.photo, sample.settings.with_channel("g")].append(sample)
+        lens = find_to_change(session, LensRow, file.given["lens_id"], ANY_OWNER)
+        ended = {"finished_at": now(), "file_gone_at": now()}
+        if lens is None or not change_state(
+            session, file.public_id, ("inspecting",), "stored", epoch=file.epoch, **ended
+        ):
+            return None
+        discard(session, file.blob_key)
+        imported = 0
+        for (photo, settings), of_photo in groups.items():
+            name = names.get(photo, photo or PROFILE)
+            row = _imported(session, lens, photo, settings, of_photo[0], name)
+            if row is not None:
+                _estimated(session, row, of_photo)
+                join(session, row, "photo_added")
+                imported += 1
+        return imported
+
+
+_FILED: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
+"""Conditions of photos whose file is kept."""
 
 
 def _keep_announced(session: Session, prefix: str) -> None:
@@ -592,11 +572,9 @@ def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, 
 
 
 def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
-    return session.scalar(
-        select(PhotoRow)
-        .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
-        .with_for_update()
-    )
+    same = (PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
+    query = select(PhotoRow).options(joinedload(PhotoRow.lens)).where(*same)
+    return session.scalar(query.with_for_update(of=PhotoRow))
 
 
 def _changed(
@@ -647,11 +625,6 @@ def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owne
     return None if lens is None else find_owned(session, LensRow, lens, owner)
 
 
-def photo_folder(photo: PhotoRow) -> str:
-    """Return the prefix of a photo's blobs."""
-    return f"{photo.blob_key.rpartition('/')[0]}/"
-
-
 def stored_settings(photo: PhotoRow) -> dict[str, Any]:
     """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
@@ -671,13 +644,6 @@ def _setting(photo: PhotoRow, field: str, header: object) -> object:
     return next((value for value in ranked if value is not None), None)
 
 
-def _erase_description(photo: PhotoRow) -> None:
-    """Erase all that the file and its owner said of a deleted photo."""
-    photo.given, photo.filename, photo.sha256 = {}, "", ""
-    for column in DESCRIPTION:
-        setattr(photo, column, None)
-
-
 def _let_go(session: Session, photo_id: str) -> None:
     """Forget a lens that only a photo without a result refers to, and with it its serial."""
     photo = session.scalars(
@@ -688,12 +654,11 @@ def _let_go(session: Session, photo_id: str) -> None:
 
 def restart(session: Session, photo: PhotoRow) -> None:
     """Begin a new epoch of a photo: its samples are deleted, work of the old one that still runs is void."""
-    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+    forget_patches(session, photo)
     photo.epoch += 1
+    photo.attempt = 0
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
-    photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
-    photo.windows, photo.windows_rejected = None, 0
 
 
 def change_state(
@@ -714,6 +679,57 @@ def change_state(
     if epoch is not None:
         conditions.append(PhotoRow.epoch == epoch)
     since = case((PhotoRow.state == to, PhotoRow.stage_at), else_=now())
-    changes = {"state": to, "stage_at": since, **fields}
-    statement = update(PhotoRow).where(*conditions).values(**changes)
-    return session.connection().execute(statement).rowcount == 1
+    statement = update(PhotoRow).where(*conditions).values(state=to, stage_at=since, **fields)
+    return changed(session, statement) == 1
+
+
+# --- profiles -------------------------------------------------------------------------------------
+
+
+def _imported(
+    session: Session, lens: LensRow, photo: str, settings: LensSettings, first: PsfSample, name: str
+) -> PhotoRow | None:
+    digest = hashlib.sha256(f"{PROFILE}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
+    public_id = new_id()
+    fresh: dict[str, Any] = {
+        "public_id": public_id,
+        "owner_id": lens.owner_id,
+        "lens_id": lens.id,
+        "sha256": digest,
+        "filename": name[:200],
+        "kind": PROFILE,
+        "byte_size": 0,
+        "blob_key": f"photos/{public_id}/original",
+        "calibrate": True,
+        "given": {"lens_id": lens.public_id},
+        "way": lens.way,
+        "aperture": settings.aperture,
+        "focal_mm": settings.focal_mm,
+        "focus_m": distances.written(settings.focus_m),
+        "pixel_pitch_um": first.pixel_pitch_um,
+        "state": "counted",
+        **dict.fromkeys(("received_at", "stage_at", "started_at", "finished_at", "counted_at"), now()),
+        "file_gone_at": now(),
+    }
+    if insert_new(session, PhotoRow, [fresh]) != 1:
+        return None
+    return session.scalars(select(PhotoRow).where(PhotoRow.public_id == public_id)).one()
+
+
+def _estimated(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) -> None:
+    places: dict[tuple[float, float], int] = {}
+    for sample in samples:
+        places.setdefault(_place(sample), len(places))
+    done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done", "attempts": 0}
+    done |= {"row": 0, "col": 0, "size": 0, "finished_at": now()}  # a profile does not say where in pixels
+    rows = [{**done, "idx": idx, "cell": idx, "r": r, "phi": phi} for (r, phi), idx in places.items()]
+    insert_new(session, PatchRow, rows)
+    patches = {row.idx: row for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
+    columns = [columns_of(sample, photo, patches[places[_place(sample)]], {}) for sample in samples]
+    insert_new(session, SampleRow, columns)
+    photo.patches_total = photo.patches_done = len(places)
+    session.flush()
+
+
+def _place(sample: PsfSample) -> tuple[float, float]:
+    return sample.position.r, sample.position.phi

@@ -28,7 +28,7 @@ from sqlalchemy import (
     false,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
 from app.schemas import CorrectionState, PhotoState
 
@@ -46,6 +46,12 @@ EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_
 
 def _one_of(column: str, values: tuple[str, ...]) -> str:
     return f"{column} IN ({', '.join(repr(value) for value in values)})"
+
+
+def _unique(name: str, *columns: str, where: str) -> Index:
+    """Let rows for which a condition holds differ in some of the columns."""
+    condition = text(where)
+    return Index(name, *columns, unique=True, sqlite_where=condition, postgresql_where=condition)
 
 
 class UtcTime(TypeDecorator[datetime]):
@@ -107,14 +113,7 @@ class LensRow(Base):
     __tablename__ = "lens"
     __table_args__ = (
         CheckConstraint("version >= 0", name="version"),
-        Index(
-            "uq_lens_identity",
-            "owner_id",
-            "identity_key",
-            unique=True,
-            sqlite_where=text("deleted_at IS NULL"),
-            postgresql_where=text("deleted_at IS NULL"),
-        ),
+        _unique("uq_lens_identity", "owner_id", "identity_key", where="deleted_at IS NULL"),
         Index("ix_lens_page", "owner_id", "public_id"),
     )
 
@@ -148,14 +147,7 @@ class PhotoRow(Base):
     __tablename__ = "photo"
     __table_args__ = (
         CheckConstraint(_one_of("state", PHOTO_STATES), name="state"),
-        Index(
-            "uq_photo_bytes",
-            "owner_id",
-            "sha256",
-            unique=True,
-            sqlite_where=text("deleted_at IS NULL"),
-            postgresql_where=text("deleted_at IS NULL"),
-        ),
+        _unique("uq_photo_bytes", "owner_id", "sha256", where="deleted_at IS NULL"),
         Index("ix_photo_state", "state"),
         Index("ix_photo_page", "owner_id", "public_id"),
         Index("ix_photo_lens_id_state", "lens_id", "state"),
@@ -215,7 +207,7 @@ class PhotoRow(Base):
     """How many windows were rejected before anything was estimated in them."""
 
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
-    """Those windows, as `app.store.samples` writes them: thousands, never queried one by one."""
+    """Those windows, as `app.store.patches` writes them: thousands, never queried one by one."""
 
     received_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
@@ -233,6 +225,15 @@ class PhotoRow(Base):
 
     file_gone_at: Mapped[datetime | None]
     """When the file was deleted, see the setting `keep_photos`."""
+
+    owner: Mapped[OwnerRow] = relationship()
+    lens: Mapped[LensRow | None] = relationship()
+    """The lens that it was taken with, where that is known."""
+
+    @property
+    def folder(self) -> str:
+        """Prefix of its blobs."""
+        return f"{self.blob_key.rpartition('/')[0]}/"
 
 
 class PatchRow(Base):
@@ -305,13 +306,8 @@ class EventRow(Base):
     __table_args__ = (
         CheckConstraint(_one_of("kind", EVENT_KINDS), name="kind"),
         UniqueConstraint("lens_id", "version"),
-        Index(
-            "uq_calibration_event_counted_once",
-            "photo_public_id",
-            "epoch",
-            unique=True,
-            sqlite_where=text("kind = 'photo_added'"),
-            postgresql_where=text("kind = 'photo_added'"),
+        _unique(
+            "uq_calibration_event_counted_once", "photo_public_id", "epoch", where="kind = 'photo_added'"
         ),
     )
 
@@ -334,15 +330,10 @@ class CorrectionRow(Base):
     __tablename__ = "correction"
     __table_args__ = (
         CheckConstraint(_one_of("state", CORRECTION_STATES), name="state"),
-        Index(
+        _unique(
             "uq_correction_params",
-            "photo_id",
-            "lens_id",
-            "lens_version",
-            "params_hash",
-            unique=True,
-            sqlite_where=text("state NOT IN ('failed', 'cancelled')"),
-            postgresql_where=text("state NOT IN ('failed', 'cancelled')"),
+            *("photo_id", "lens_id", "lens_version", "params_hash"),
+            where="state NOT IN ('failed', 'cancelled')",
         ),
         Index("ix_correction_state", "state"),
         Index("ix_correction_page", "owner_id", "public_id"),
@@ -376,6 +367,19 @@ class CorrectionRow(Base):
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    owner: Mapped[OwnerRow] = relationship()
+    photo: Mapped[PhotoRow] = relationship()
+    lens: Mapped[LensRow] = relationship()
+
+    @property
+    def folder(self) -> str:
+        """Prefix of its blobs."""
+        return f"corrections/{self.public_id}/"
+
+    @property
+    def run_folder(self) -> str:
+        """Prefix of the files of its last run: no other run writes there."""
+        return f"{self.folder}{self.epoch}-{self.attempt}/"
 
 
 class WorkerRow(Base):
@@ -420,12 +424,13 @@ class KeyRow(Base):
     key_hash: Mapped[str] = mapped_column(String(200), unique=True)
     label: Mapped[str | None]
     scopes: Mapped[str] = mapped_column(String(60))
-    """Words of `app.store.keys.SCOPES`, separated by spaces."""
+    """Words of `app.store.accounts.SCOPES`, separated by spaces."""
 
     created_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]
     expires_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
+    owner: Mapped[OwnerRow] = relationship()
 
 
 class SessionRow(Base):

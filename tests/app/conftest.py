@@ -20,8 +20,8 @@ from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
-from app.sandbox.budget import Budget
 from app.sandbox.outcome import Outcome
+from app.sandbox.runner import Budget
 from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.database import Database, new_id
 from app.store.migrate import downgrade, upgrade
@@ -90,7 +90,7 @@ class Steps:
             for k in range(count)
         ]
         rejected = NewPatch(count, 0, 0, 64, 0, 0, rejected="flat")
-        self.store.patches.add(photo.public_id, photo.epoch, [*patches, rejected])
+        self.store.photos.plan_patches(photo.public_id, photo.epoch, [*patches, rejected])
         self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
 
     def estimate(self, photo: PhotoRow, indices: tuple[int, ...] = (0, 1), *, width: float = 1.0) -> int:
@@ -109,7 +109,7 @@ class Steps:
             for k in indices
             for channel in CHANNELS
         ]
-        return self.store.patches.finish(photo.public_id, photo.epoch, samples)
+        return self.store.photos.add_samples(photo.public_id, photo.epoch, samples)
 
     def counted(self, *, patches: int = 2, width: float = 1.0, **options: Any) -> PhotoRow:
         photo = self.receive()
@@ -125,7 +125,7 @@ class Steps:
         return found
 
     def lens_id(self, photo: PhotoRow) -> str:
-        lens = self.store.photos.lens_of(self.fresh(photo))
+        lens = self.fresh(photo).lens
         assert lens is not None
         return lens.public_id
 
@@ -244,7 +244,8 @@ def reading(settings: Settings, store: Store) -> Iterator[None]:
 
     def read() -> None:
         while not ended.wait(0.02):
-            for photo_id, epoch, _ in store.photos.to_do():
+            for job in store.jobs.to_do():
+                photo_id, epoch = str(job.arguments[0]), int(job.arguments[1])
                 row = store.photos.get(photo_id, ANY_OWNER)
                 if row is not None and row.kind == PROFILE_FILE:  # photos are the test's own
                     work.photo(photo_id, epoch)

@@ -17,7 +17,7 @@ from app.main import create_app
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
-from app.store.corrections import Result
+from app.store.jobs import Result
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
 from lab.demo.service import own_service
@@ -151,9 +151,9 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
     assert not list(tmp_path.glob("*.p*"))
 
     Storage(settings.storage).put("corrections/x/result", b"the file")
-    run = store.corrections.start(correction.id)
+    run = store.jobs.start(correction.id)
     assert run is not None
-    store.corrections.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
+    store.jobs.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
 
     assert api.wait(correction).links.result is not None
     assert api.download(correction.id, target).read_bytes() == b"the file"
@@ -197,7 +197,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
     lens_id = steps.lens_id(steps.counted(patches=6))
     with pytest.raises(ServiceProblemError, match="not_ready"):
         api.save_report(lens_id, tmp_path / "report.pdf")
-    _, stored = store.samples.of_lens(lens_id)
+    _, stored = store.lenses.samples_of(lens_id)
     model = LensModel.fit([one.sample for one in stored])
     test = lens_report(model, "A lens", rows=5, size=15, channels=("g",))
     lens = store.lenses.get(lens_id, ANY_OWNER)

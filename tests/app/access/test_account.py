@@ -130,10 +130,10 @@ def test_an_erasure_that_was_killed_is_carried_through_by_a_worker(
     client: TestClient, store: Store, steps: Any
 ) -> None:
     photo = steps.counted()
-    store.keys.create("local", ["write"])
+    store.accounts.create_key("local", ["write"])
     key = store.accounts.begin_erasing("local")  # and then the API is killed
 
-    assert not store.keys.any_valid()
+    assert not store.accounts.has_valid_key()
     assert store.photos.get(photo.public_id, "local") is None
     assert store.accounts.to_erase() == [key]
     for owner_key in store.accounts.to_erase():
@@ -193,9 +193,9 @@ def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Any) -> Non
     counted, running, corrected, stored = steps.counted(), steps.receive(), steps.counted(), steps.receive()
     steps.inspect(running)
     store.photos.set_state(stored.public_id, ("received",), "stored")
-    lens = store.photos.lens_of(corrected)
+    lens = corrected.lens
     assert lens is not None
-    row, _ = store.corrections.create(corrected, lens, 1, {"method": "fast"})
+    row, _ = store.jobs.correct(corrected, lens, 1, {"method": "fast"})
     for photo in (counted, corrected, stored):
         ended(store, photo, timedelta(hours=2))
 
@@ -205,7 +205,7 @@ def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Any) -> Non
     assert unneeded("always") == set()
     assert unneeded("corrections") == {counted.public_id}
     assert unneeded("never") == {counted.public_id}  # the others are to be corrected
-    store.corrections.cancel(row.public_id, "local")
+    store.jobs.cancel(row.public_id, "local")
     ended(store, stored, timedelta(hours=25))
     assert unneeded("corrections") == {counted.public_id}
     assert unneeded("never") == {counted.public_id, corrected.public_id, stored.public_id}
@@ -224,7 +224,7 @@ def test_a_file_that_was_given_up_comes_back_with_the_same_bytes(client: TestCli
     assert store.photos.give_up_file(sent["id"], ("preview.jpg",))
     assert not store.photos.give_up_file(sent["id"], ("preview.jpg",))
     folder = f"photos/{sent['id']}/"
-    garbage = set(store.workers.garbage())
+    garbage = set(store.jobs.garbage())
     refused = client.post("/v1/corrections", json={"photo_id": sent["id"]})
     storage_of(client).remove(before.blob_key)
     storage_of(client).remove(before.blob_key)  # again, and nothing happens

@@ -20,8 +20,8 @@ from app.main import create_app
 from app.pages import lens_pages, photo_pages, pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
-from app.store import Store, keys
-from app.store.corrections import Result
+from app.store import Store, accounts
+from app.store.jobs import Result
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import KeyRow, SessionRow
@@ -42,8 +42,8 @@ def guarded(settings: Settings, store: Store) -> Iterator[TestClient]:
         yield opened
 
 
-def key_of(store: Store, owner: str, scope: keys.Scope = "admin", **options: Any) -> dict[str, str]:
-    return {"Authorization": f"Bearer {store.keys.create(owner, [scope], **options).text}"}
+def key_of(store: Store, owner: str, scope: accounts.Scope = "admin", **options: Any) -> dict[str, str]:
+    return {"Authorization": f"Bearer {store.accounts.create_key(owner, [scope], **options).text}"}
 
 
 def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str]:
@@ -51,15 +51,15 @@ def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str
     steps.owner = owner
     photo = steps.counted()
     storage.put(photo.blob_key, b"the original of " + owner.encode())
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
     params = {"method": "fast", "strength": 1.0, "output": {"format": "dng"}, "roi": None}
-    row, _ = store.corrections.create(photo, lens, 1, params)
-    run = store.corrections.start(row.public_id)
+    row, _ = store.jobs.correct(photo, lens, 1, params)
+    run = store.jobs.start(row.public_id)
     assert run is not None
     key = f"corrections/{row.public_id}/result.dng"
     storage.put(key, b"result")
-    assert store.corrections.finish(run, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {})
+    assert store.jobs.finish(run, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {})
     return {
         "photo_id": photo.public_id,
         "lens_id": lens.public_id,
@@ -263,32 +263,32 @@ def test_keys_end_by_revoking_expiry_and_rotation(
     guarded: TestClient, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.access.FRESH_S", 0.0)  # each request looks
-    made = store.keys.create("anna", ["read"], lasts=timedelta(days=1))
+    made = store.accounts.create_key("anna", ["read"], lasts=timedelta(days=1))
 
     def status(key: str) -> int:
         return guarded.get("/v1/photos", headers={"Authorization": f"Bearer {key}"}).status_code
 
     assert status(made.text) == 200
-    renewed = store.keys.rotate(made.prefix, keep=timedelta(hours=1))
+    renewed = store.accounts.rotate_key(made.prefix, keep=timedelta(hours=1))
     assert renewed is not None
     assert (status(made.text), status(renewed.text)) == (200, 200)
     with store.database.writing() as session:
         old = update(KeyRow).where(KeyRow.prefix == made.prefix)
         session.execute(old.values(expires_at=now() - timedelta(seconds=1)))
     assert (status(made.text), status(renewed.text)) == (401, 200)
-    assert store.keys.revoke(renewed.prefix)
+    assert store.accounts.revoke_key(renewed.prefix)
     assert status(renewed.text) == 401
-    assert store.keys.rotate(renewed.prefix, keep=timedelta(0)) is None
+    assert store.accounts.rotate_key(renewed.prefix, keep=timedelta(0)) is None
 
 
 def test_what_a_key_consists_of_is_kept_nowhere(store: Store) -> None:
-    made = store.keys.create("anna", ["read"])
+    made = store.accounts.create_key("anna", ["read"])
 
     with store.database.reading() as session:
         row = session.scalars(select(KeyRow)).one()
     assert made.text.split("_", 2)[2] not in str(vars(row))  # a secret may hold the sign that parts it off
     assert row.key_hash == hashlib.sha256(made.text.encode()).hexdigest()
-    assert store.keys.by_hash(keys.digest_of(made.text[:-1])) is None
+    assert store.accounts.by_hash(accounts.digest_of(made.text[:-1])) is None
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_what_a_key_consists_of_is_kept_nowhere(store: Store) -> None:
     [("read", 200, 403, 403), ("write", 200, 404, 403), ("admin", 200, 404, 204)],
 )
 def test_scopes_allow_what_they_say(
-    guarded: TestClient, store: Store, scope: keys.Scope, asks: int, changes: int, erases: int
+    guarded: TestClient, store: Store, scope: accounts.Scope, asks: int, changes: int, erases: int
 ) -> None:
     key = key_of(store, "anna", scope)
 
@@ -327,14 +327,14 @@ def test_a_stream_of_events_ends_with_the_key(
     monkeypatch.setattr("app.routes.jobs.LOOK_S", 0.1)
     steps.owner = "anna"
     photo = steps.receive()
-    made = store.keys.create("anna", ["read"])
+    made = store.accounts.create_key("anna", ["read"])
     gate = guarded.app.state.services.gate  # type: ignore[attr-defined]  # as above
     really = gate.is_still
     asked: list[bool] = []
 
     def revoked_meanwhile(who: Any) -> bool:
         if asked:
-            store.keys.revoke(made.prefix)
+            store.accounts.revoke_key(made.prefix)
         asked.append(really(who))
         return asked[-1]
 
@@ -403,15 +403,15 @@ def test_what_others_can_reach_does_not_start_without_a_key(
 
     with pytest.raises(UsageError, match="lensmodel keys create"):
         supervisor._prepare(open_settings)
-    made = store.keys.create("anna", ["write"])
+    made = store.accounts.create_key("anna", ["write"])
     supervisor._prepare(open_settings)
-    store.keys.revoke(made.prefix)
+    store.accounts.revoke_key(made.prefix)
     with pytest.raises(UsageError, match="no valid key"):
         supervisor._prepare(open_settings)
 
 
 def test_nobody_asks_for_the_rows_of_all_by_leaving_the_owner_out(store: Store) -> None:
-    parts = [part for name, part in vars(store).items() if name not in {"database", "keys"}]
+    parts = [part for name, part in vars(store).items() if name != "database"]
     methods = [method for part in parts for _, method in inspect.getmembers(part, inspect.ismethod)]
     owners = [inspect.signature(method).parameters.get("owner") for method in methods]
 

@@ -13,7 +13,6 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.http import middleware
 from app.http.middleware import MAX_JSON_BYTES
 from app.main import create_app
 from app.routes import photos
@@ -96,7 +95,6 @@ def answer_of(port: int, sent: bytes, then: Callable[[socket.socket], None] = la
 
 @pytest.fixture
 def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    monkeypatch.setattr(middleware, "JSON_SECONDS", 0.5)
     monkeypatch.setattr(photos, "UPLOAD_S", 0.5)
     with served(settings) as opened:
         yield opened
@@ -105,7 +103,6 @@ def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> I
 @pytest.mark.parametrize(
     "sent",
     [
-        head("POST", "/v1/corrections", 100) + b'{"photo_id":',
         head("POST", "/v1/photos", 9004, "application/octet-stream") + TIFF[:500],
         head("POST", "/v1/photos", 9004, "multipart/form-data; boundary=b") + b"--b\r\n",
         head("PUT", "/v1/lenses/LENS/profile", 9004, "application/octet-stream") + b"PK" + TIFF[:500],
@@ -193,7 +190,7 @@ def test_every_route_that_changes_something_asks_where_it_comes_from(client: Tes
 
 def test_a_public_service_answers_to_the_names_that_it_is_given(settings: Settings, store: Store) -> None:
     public = settings.model_copy(update={"allowed_hosts": "Lens.example.org, other.example"})
-    key = {"Authorization": f"Bearer {store.keys.create('anna', ['write']).text}"}
+    key = {"Authorization": f"Bearer {store.accounts.create_key('anna', ['write']).text}"}
     with TestClient(create_app(public)) as client:
         hosts = ("lens.example.org", "lens.example.org:443", "other.example", "evil.example", "127.0.0.1")
         answers = {host: client.get("/healthz", headers={"Host": host}).status_code for host in hosts}

@@ -33,8 +33,8 @@ from app.blobs.storage import Storage
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.accounts import Accounts
 from app.store.database import Database
-from app.store.keys import KeyStore
 from app.store.migrate import upgrade
 from app.store.tables import KeyRow
 from lab import targets
@@ -212,7 +212,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**lens, "serial": "L-43"}))
     database = Database(f"sqlite:///{folder / 'lensmodel-data' / 'app.db'}")
     upgrade(database)
-    KeyStore(database).create("anna", ["write"])
+    Accounts(database).create_key("anna", ["write"])
     with database.writing() as session:
         session.execute(update(KeyRow).values(prefix="abcd2345"))
     database.close()

@@ -136,7 +136,7 @@ def measured(load: Load, store: Store, minute: float) -> dict[str, Any]:
             handles += len(list(Path(f"/proc/{int(pid)}/fd").iterdir()))
     times = sorted(load.psf_ms) or [0.0]
     load.psf_ms.clear()
-    rows = store.workers.load().rows
+    rows = store.jobs.load().rows
     numbers = (
         *(round(minute, 1), sum(load.answers.values()), memory // 1024, handles),
         *(sum(1 for _ in load.service.data.rglob("*")), rows["photo"], rows["sample"]),
@@ -177,9 +177,9 @@ def main() -> int:
             for thread in threads:
                 thread.join()
             end = time.monotonic() + PATIENCE_S
-            while any(store.workers.load().jobs.values()) and time.monotonic() < end:
+            while any(store.jobs.load().jobs.values()) and time.monotonic() < end:
                 time.sleep(1.0)
-            unsettled = sum(store.workers.load().jobs.values())
+            unsettled = sum(store.jobs.load().jobs.values())
             findings = examine(settings, store, Storage(settings.storage)).findings
             store.close()
     print(json.dumps({"answers": dict(load.answers), "unfinished": unsettled, "faults": load.faults[:5]}))

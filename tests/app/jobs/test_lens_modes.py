@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -64,14 +65,14 @@ def taken(steps: Steps, store: Store) -> Callable[..., str]:
         store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
         places = [(0.1 + 0.15 * k, 1.1 * k - 3.0) for k in range(6)]
         patches = [NewPatch(k, 0, 0, 64, r, phi, cell=k, score=1.0) for k, (r, phi) in enumerate(places)]
-        store.patches.add(photo.public_id, photo.epoch, patches)
+        store.photos.plan_patches(photo.public_id, photo.epoch, patches)
         store.photos.set_state(photo.public_id, ("selecting",), "estimating")
         kernel = gaussian(25, sigma_px**2 * np.eye(2))
         samples = [
             NewSample(k, PsfSample(kernel, FieldPosition(*place), weight=0.5, estimator="default/1"))
             for k, place in enumerate(places)
         ]
-        store.patches.finish(photo.public_id, photo.epoch, samples)
+        store.photos.add_samples(photo.public_id, photo.epoch, samples)
         assert store.photos.finish(photo.public_id, photo.epoch) is not None
         return str(steps.lens_id(photo))
 
@@ -108,6 +109,7 @@ def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, taken: Cal
         statements.append(str(arguments[2]))
 
     event.listen(services.store.database.reader, "before_cursor_execute", note)
+    shutil.rmtree(services.storage.folder)  # it takes no blob, wherever these are
     psf(client, lens, r=0.7)
 
     assert len([text for text in statements if "SELECT" in text]) == 1
@@ -116,9 +118,9 @@ def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, taken: Cal
 def test_that_read_is_for_the_owner_alone(store: Store, taken: Callable[..., str]) -> None:
     lens = taken(6.0, (6000, 4000), 1.5)
 
-    assert store.samples.known_of(lens, "local") == store.samples.state_of(lens)
-    assert store.samples.known_of(lens, "somebody else") is None
-    assert store.samples.known_of("none", "local") is None
+    assert store.lenses.known_of(lens, "local") == store.lenses.state_of(lens)
+    assert store.lenses.known_of(lens, "somebody else") is None
+    assert store.lenses.known_of("none", "local") is None
 
 
 def test_an_aperture_far_from_all_photos_is_said_to_be_beyond(

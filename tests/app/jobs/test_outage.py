@@ -32,6 +32,7 @@ from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import LensName, Store
 from app.store.database import new_id
+from app.store.jobs import Job
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import EventRow, PhotoRow, SampleRow
@@ -129,7 +130,7 @@ def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> N
     photo = steps.receive()
     job = Away(exc.OperationalError("SELECT", {}, psycopg.OperationalError("away")), times=9)
 
-    worker._safe(job, worker._photo_broke)(photo.public_id, 1)
+    worker._safe(job, "photo")(photo.public_id, 1)
 
     assert job.runs == 10
     assert steps.fresh(photo).state == "received"
@@ -142,7 +143,7 @@ def test_a_job_that_waited_in_vain_ends_as_such(
     photo = steps.receive()
     steps.inspect(photo)
 
-    worker._safe(Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._cell_broke)(photo.public_id, 1, 0)
+    worker._safe(Away(OSError(errno.ENOSPC, "full"), times=10**6), "cell")(photo.public_id, 1, 0)
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", "outage")
@@ -151,7 +152,7 @@ def test_a_job_that_waited_in_vain_ends_as_such(
 def test_a_bug_ends_the_job_after_three_tries(worker: Worker, steps: Any) -> None:
     photo, job = steps.receive(), Away(KeyError("a bug"), times=10)
 
-    worker._safe(job, worker._photo_broke)(photo.public_id, 1)
+    worker._safe(job, "photo")(photo.public_id, 1)
 
     assert (steps.fresh(photo).error_code, job.runs) == ("internal_error", 3)
 
@@ -164,11 +165,11 @@ def test_a_worker_keeps_its_lease_while_its_engine_starts(
 
         def start(self, handlers: object) -> None:
             del handlers
-            first = store.workers.all()[0].heartbeat_at
+            first = store.jobs.workers()[0].heartbeat_at
             end = time.monotonic() + PATIENCE_S
-            while store.workers.all()[0].heartbeat_at == first and time.monotonic() < end:
+            while store.jobs.workers()[0].heartbeat_at == first and time.monotonic() < end:
                 time.sleep(0.02)
-            beats.append(store.workers.all()[0].heartbeat_at > first)
+            beats.append(store.jobs.workers()[0].heartbeat_at > first)
             worker.stop()
 
     beats: list[bool] = []
@@ -191,12 +192,12 @@ def failed_photo(store: Store, steps: Any, code: str = "outage") -> PhotoRow:
 
 def failed_correction(store: Store, steps: Any, strength: float = 1.0) -> str:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
     params = {"method": "fast", "strength": strength, "output": {"format": "png8"}, "roi": None}
-    correction, _ = store.corrections.create(photo, lens, lens.version, params)
-    assert store.corrections.start(correction.public_id)
-    assert store.corrections.fail(correction.public_id, "outage", "for a test")
+    correction, _ = store.jobs.correct(photo, lens, lens.version, params)
+    assert store.jobs.start(correction.public_id)
+    assert store.jobs.fail(correction.public_id, "outage", "for a test")
     return correction.public_id
 
 
@@ -206,7 +207,7 @@ def test_a_failed_photo_is_retried_by_one_call(client: TestClient, store: Store,
     answer = client.post(f"/v1/jobs/{photo.public_id}/retry")
 
     assert (answer.status_code, answer.json()["state"], answer.json()["error"]) == (202, "queued", None)
-    assert store.photos.to_do() == [(photo.public_id, 2, "local")]
+    assert Job("photo", (photo.public_id, 2), "local") in store.jobs.to_do()
     again = client.post(f"/v1/jobs/{photo.public_id}/retry")
     assert (again.status_code, again.json()["code"]) == (409, "conflict")
 
@@ -219,16 +220,16 @@ def test_a_failed_correction_is_retried_as_another_job_of_the_engine(
     answer = client.post(f"/v1/jobs/{correction}/retry")
 
     assert (answer.status_code, answer.json()["state"]) == (202, "queued")
-    assert store.corrections.to_do() == [(correction, 2, "local")]
-    assert not store.corrections.fail(correction, "outage", "said late by the first try", epoch=1)
-    assert store.corrections.start(correction, epoch=2)
+    assert Job("correction", (correction, 2), "local") in store.jobs.to_do()
+    assert not store.jobs.fail(correction, "outage", "said late by the first try", epoch=1)
+    assert store.jobs.start(correction, epoch=2)
 
 
 def test_a_retry_gives_way_to_the_same_wish_made_again(client: TestClient, store: Store, steps: Any) -> None:
     correction = failed_correction(store, steps)
-    plan = store.corrections.plan(correction, ANY_OWNER)
-    assert plan is not None
-    store.corrections.create(plan.photo, plan.lens, plan.correction.lens_version, plan.correction.params)
+    row = store.jobs.correction(correction, ANY_OWNER)
+    assert row is not None
+    store.jobs.correct(row.photo, row.lens, row.lens_version, row.params)
 
     assert client.post(f"/v1/jobs/{correction}/retry").status_code == 409
 
@@ -247,8 +248,8 @@ def test_all_that_an_outage_ended_is_retried_by_one_call(
     answers = [client.post("/v1/jobs/retry", params={"limit": 2}).json() for _ in range(3)]
 
     assert answers == [{"retried": 2}, {"retried": 2}, {"retried": 0}]
-    assert {row[0] for row in store.photos.to_do()} == {photo.public_id for photo in photos}
-    assert [row[0] for row in store.corrections.to_do()] == [correction]
+    subjects = {job.arguments[0] for job in store.jobs.to_do() if job.kind != "measure"}
+    assert subjects == {photo.public_id for photo in photos} | {correction}
     assert steps.fresh(other).state == "failed"
 
 
@@ -399,7 +400,7 @@ def test_a_lens_named_by_hand_keeps_its_name_after_a_retry(
 
 def test_a_job_that_breaks_while_its_worker_stops_does_not_look_done(worker: Worker, steps: Any) -> None:
     photo = steps.receive()
-    job = worker._safe(Away(KeyError("a bug"), times=10), worker._photo_broke)
+    job = worker._safe(Away(KeyError("a bug"), times=10), "photo")
     worker.stop()
 
     thread = threading.Thread(target=job, args=(photo.public_id, 1), daemon=True)
@@ -417,7 +418,7 @@ def test_a_worker_that_gets_no_connection_for_a_lease_stops(
         raise exc.TimeoutError("QueuePool limit reached")
 
     stopped: list[str] = []
-    monkeypatch.setattr(worker._store.workers, "beat", beat)
+    monkeypatch.setattr(worker._store.jobs, "beat", beat)
     monkeypatch.setattr(worker, "_die", stopped.append)
     monkeypatch.setattr(worker, "_last_beat", time.monotonic() - 1000.0)
 

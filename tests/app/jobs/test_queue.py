@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 from deadline import Deadline, stretched
 
-from app.jobs.queue import MAX_STARTS, DbosEngine, Handler, Job, Kind
+from app.jobs.queue import MAX_DEATHS, DbosEngine, Handler
+from app.store.jobs import Job, Kind
 
 DEAD = "a-worker-that-died"
 
@@ -154,7 +155,8 @@ def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
     script = textwrap.dedent(
         f"""
         import os, time
-        from app.jobs.queue import DbosEngine, Job
+        from app.jobs.queue import DbosEngine
+        from app.store.jobs import Job
         engine = DbosEngine({url!r}, {executor_id!r}, slots=1)
         engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
         engine.enqueue(Job("cell", ("p", 1)))
@@ -172,25 +174,24 @@ def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: 
     try:
         time.sleep(0.5)
         held_before = (engine.status(job), list(ran.jobs))
-        left = engine.take_over(DEAD)
+        engine.take_over(DEAD)
         until(lambda: ran.jobs == [("cell", "p", "1")])
         until(lambda: engine.status(job) == "done")
     finally:
         engine.stop()
 
     assert held_before == ("waiting", [])
-    assert left == 0
 
 
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
     previous = DEAD
     die_in_a_job(url)
-    for number in range(MAX_STARTS["cell"] + 1):
+    for number in range(MAX_DEATHS["cell"] + 1):
         script = textwrap.dedent(
             f"""
             import os, time
-            from app.jobs.queue import DbosEngine, Job
+            from app.jobs.queue import DbosEngine
             engine = DbosEngine({url!r}, "worker-{number}", slots=1)
             engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
             engine.take_over({previous!r})
@@ -208,6 +209,6 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
     finally:
         engine.stop()
 
-    assert number == MAX_STARTS["cell"]
+    assert number == MAX_DEATHS["cell"]
     assert status == "lost"
     assert ran.jobs == []

@@ -145,9 +145,9 @@ def test_a_worker_in_doubt_ends_what_broke_and_nothing_else(
     steps.inspect(waiting, serial=None)
     worker = Worker(settings)
     monkeypatch.setattr(worker, "_engine", engine)
-    listed = store.photos.running()
+    listed = store.jobs.to_do(begun=True)
     store.photos.set_state(waiting.public_id, ("inspecting",), "needs_lens")
-    monkeypatch.setattr(worker._store.photos, "running", lambda: listed)  # it came to wait after we looked
+    monkeypatch.setattr(worker._store.jobs, "to_do", lambda **_: listed)  # it came to wait after we looked
 
     worker._reconcile()
 
@@ -174,11 +174,11 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
 
     monkeypatch.setattr(worker._context.storage, "delete", delete)
     monkeypatch.setattr(worker, "_engine", SimpleNamespace(forget=lambda _: 0))
-    monkeypatch.setattr(worker._store.workers, "garbage", lambda: [stuck, other])
+    monkeypatch.setattr(worker._store.jobs, "garbage", lambda: [stuck, other])
 
     worker._tidy()
 
-    assert store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
+    assert store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
 
 
 @pytest.mark.slow
@@ -196,7 +196,7 @@ def test_another_worker_takes_over_from_one_that_died_for_ever(
 
     assert left < CELLS
     check_counts(store, 1)
-    until(lambda: len(store.workers.all()) == 1)
+    until(lambda: len(store.jobs.workers()) == 1)
 
 
 def test_the_loss_of_the_engines_database_loses_no_photo_and_that_of_the_tables_ends_a_worker(
@@ -269,7 +269,7 @@ def test_an_upload_that_ends_while_garbage_is_cleared_keeps_its_file(
     store.photos.expect(prefix, within=timedelta(hours=-3))  # as if it had begun hours ago
     storage.put(f"{prefix}original", b"a photo")
     worker = Worker(settings)
-    listed = store.workers.garbage()
+    listed = store.jobs.garbage()
 
     def receive_meanwhile() -> list[str]:
         store.photos.receive(
@@ -285,7 +285,7 @@ def test_an_upload_that_ends_while_garbage_is_cleared_keeps_its_file(
         )
         return listed
 
-    monkeypatch.setattr(worker._store.workers, "garbage", receive_meanwhile)
+    monkeypatch.setattr(worker._store.jobs, "garbage", receive_meanwhile)
     monkeypatch.setattr(worker, "_engine", SimpleNamespace(forget=lambda _: 0))
     worker._tidy()
 

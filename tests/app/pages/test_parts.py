@@ -29,8 +29,7 @@ from app.pages.shown import grouped
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
-from app.store.corrections import Result
-from app.store.photos import photo_folder
+from app.store.jobs import Result
 from app.store.tables import PhotoRow
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
@@ -56,7 +55,7 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright(
     tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
     photo = steps.counted()
     for name in (SHOWN, R_MAP):
-        Storage(settings.storage).put_file(f"{photo_folder(photo)}{name}", tmp_path / name)
+        Storage(settings.storage).put_file(f"{photo.folder}{name}", tmp_path / name)
 
     for name in ("preview.jpg", R_MAP):
         assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
@@ -87,7 +86,7 @@ def finished(
     for name in SIDES.values():
         write_tiles(settings.data_dir / name, a_picture())
         blobs.put_file(f"{folder}{name}", settings.data_dir / name)
-    run = store.corrections.start(made["id"])
+    run = store.jobs.start(made["id"])
     assert run is not None
     audit = {
         "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},
@@ -99,7 +98,7 @@ def finished(
     }
     result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
     report = {"zones": {}, "nothing_to_correct": nothing, "audit": audit}
-    assert store.corrections.finish(run, result, report)
+    assert store.jobs.finish(run, result, report)
     return made
 
 
@@ -321,7 +320,7 @@ def test_a_photo_has_a_thumbnail_before_it_is_developed(
     Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
     arguments = {"path": str(tmp_path / "p.jpg"), "kind": "jpeg", "orientation": 6}
     tasks.thumbnail(arguments, tmp_path, ignore_step)
-    Storage(settings.storage).put_file(f"{photo_folder(photo)}{THUMBNAIL}", tmp_path / THUMBNAIL)
+    Storage(settings.storage).put_file(f"{photo.folder}{THUMBNAIL}", tmp_path / THUMBNAIL)
 
     assert opened(client, address).size == (258, 480)
 
@@ -505,7 +504,7 @@ def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_se
 def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
     settings: Settings, store: Store, steps: Steps
 ) -> None:
-    photo, key = steps.receive(), store.keys.create("local", ["write"])
+    photo, key = steps.receive(), store.accounts.create_key("local", ["write"])
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         stranger = {"HX-Request": "true", "HX-Current-URL": "http://h/?a=b"}
         mine = {"Authorization": f"Bearer {key.text}", **stranger}
@@ -517,7 +516,7 @@ def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
         changed = client.get("/ui/parts", **asked)
         store.photos.delete(photo.public_id, "local")
         gone = client.get("/ui/parts", **asked)
-        store.keys.revoke(key.prefix)
+        store.accounts.revoke_key(key.prefix)
         ended = client.get("/ui/parts", params={"page": "home"}, headers=stranger)
 
     assert [a.status_code for a in (first, same, changed, gone, ended)] == [200, 304, 200, 404, 401]

@@ -14,7 +14,7 @@ from app.blobs.storage import Storage
 from app.routes.corrections import byte_range
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.corrections import Result
+from app.store.jobs import Result
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import OwnerRow
 
@@ -30,11 +30,11 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
     key = f"corrections/{correction_id}/result"
     Storage(settings.storage).put(key, FILE)
     etag = hashlib.sha256(FILE).hexdigest()
-    run = store.corrections.start(correction_id)
+    run = store.jobs.start(correction_id)
     assert run is not None
     result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
     report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
-    assert store.corrections.finish(run, result, report)
+    assert store.jobs.finish(run, result, report)
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_bounds_make_another_correction_and_none_the_same_as_before_there_were_a
     bound = post(client, photo_id=photo.public_id, halo=0.2, denoise=0.5).json()["id"]
 
     assert unbound == plain != bound
-    rows = [store.corrections.get(key, ANY_OWNER) for key in (plain, bound)]
+    rows = [store.jobs.correction(key, ANY_OWNER) for key in (plain, bound)]
     assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
         [None, None],
         [0.2, 0.5],
@@ -141,7 +141,7 @@ def test_a_photo_with_other_settings_is_corrected_anew(
     again = post(client, photo_id=photo.public_id, lens_id=lens_id)
 
     assert (again.status_code, again.json()["id"] != first) == (202, True)
-    row = store.corrections.get(again.json()["id"], ANY_OWNER)
+    row = store.jobs.correction(again.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.params["settings"]["aperture"] == 8.0
 
@@ -222,9 +222,9 @@ def test_an_unknown_method_lists_the_known_ones(client: TestClient, steps: Steps
 
 def test_the_result_waits_for_the_work(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
-    run = store.corrections.start(made["id"])
+    run = store.jobs.start(made["id"])
     assert run is not None
-    store.corrections.progress(run, 3, 8)
+    store.jobs.progress(run, 3, 8)
 
     early = client.get(f"/v1/corrections/{made['id']}/result")
     job = client.get(made["links"]["job"]).json()
@@ -240,7 +240,7 @@ def test_a_failed_correction_says_why_and_can_be_asked_for_again(
 ) -> None:
     photo = steps.counted()
     made = post(client, photo_id=photo.public_id).json()
-    store.corrections.fail(made["id"], "memory_limit", "needs 9 GiB, may have 4: correct a region")
+    store.jobs.fail(made["id"], "memory_limit", "needs 9 GiB, may have 4: correct a region")
 
     shown = client.get(made["links"]["self"]).json()
 
@@ -330,7 +330,7 @@ def test_corrections_are_listed_by_photo_and_deleted_with_their_file(
 
 def test_a_running_correction_is_cancelled_once(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
-    store.corrections.start(made["id"])
+    store.jobs.start(made["id"])
 
     assert client.post(f"/v1/jobs/{made['id']}/cancel").json()["state"] == "cancelled"
     assert client.post(f"/v1/jobs/{made['id']}/cancel").status_code == 409
@@ -347,9 +347,9 @@ def test_results_count_for_the_quota_and_expire(
     refused = post(client, photo_id=steps.counted().public_id)
     assert (refused.status_code, refused.json()["code"]) == (429, "quota_exceeded")
 
-    assert store.corrections.ended_before(now() - timedelta(days=1)) == []
-    assert store.corrections.ended_before(now() + timedelta(days=1)) == [finished]
-    assert store.corrections.delete(finished, ANY_OWNER) == f"corrections/{finished}/"
+    assert store.jobs.ended_before(now() - timedelta(days=1)) == []
+    assert store.jobs.ended_before(now() + timedelta(days=1)) == [finished]
+    assert store.jobs.delete(finished, ANY_OWNER) == f"corrections/{finished}/"
     assert client.get(f"/v1/corrections/{finished}").status_code == 404
 
 

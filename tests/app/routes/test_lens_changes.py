@@ -153,7 +153,7 @@ def test_a_profile_is_not_read_beside_the_keys_of_the_database(
 
     assert (answer.status_code, answer.json()["photos"], read) == (202, 0, [])
     job = client.get(answer.headers["location"]).json()
-    assert (job["state"], job["id"]) == ("queued", store.photos.to_do()[-1][0])
+    assert (job["state"], job["id"]) == ("queued", store.jobs.to_do()[-1].arguments[0])
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202
 
 
@@ -173,7 +173,7 @@ def test_a_profile_of_another_model_is_refused(client: TestClient, steps: Steps)
 def reported(client: TestClient, steps: Steps, store: Store, settings: Settings) -> str:
     """A lens whose newest version has its report."""
     lens_id: str = steps.lens_id(steps.counted(patches=6))
-    _, stored = store.samples.of_lens(lens_id)
+    _, stored = store.lenses.samples_of(lens_id)
     test = lens_report(
         LensModel.fit([one.sample for one in stored]), "A lens", rows=5, size=15, channels=("g",)
     )
@@ -246,7 +246,7 @@ def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", bytes(1 << 20))
-    monkeypatch.setattr("app.jobs.profile_work.MAX_UNPACKED", (1 << 20) - 1)
+    monkeypatch.setattr("app.jobs.photo_work.MAX_UNPACKED", (1 << 20) - 1)
     read: list[str] = []
     monkeypatch.setattr("app.jobs.tasks.read_profile", lambda *_: read.append("read"))
 

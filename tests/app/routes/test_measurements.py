@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 from app.jobs import tasks
 from app.jobs.context import JobFailedError
-from app.jobs.measurement_work import _checked
+from app.jobs.photo_work import _measured
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SAMPLES
 from app.store import Store
@@ -48,7 +48,7 @@ def answered(folder: Path, listed: list[dict[str, Any]]) -> list[dict[str, Any]]
 
 
 def test_what_a_child_measured_becomes_patches_with_samples(tmp_path: Path) -> None:
-    patches, samples = _checked(answered(tmp_path, [place(0), place(0, "r"), place(1)]), tmp_path)
+    patches, samples = _measured(answered(tmp_path, [place(0), place(0, "r"), place(1)]), tmp_path)
     assert [patch.idx for patch in patches] == [0, 1]
     assert [(new.idx, new.sample.settings.channel, new.sample.error) for new in samples] == [
         (0, "g", 0.04),
@@ -90,7 +90,7 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
     arguments = {"developed": [str(tmp_path / "developed")], "photo": "p1", "settings": settings}
 
     listed = tasks.measure_lens(arguments | {"kind": "quick", "size": 15}, tmp_path, ignore_step)
-    patches, samples = _checked(json.loads(json.dumps(listed)), tmp_path)
+    patches, samples = _measured(json.loads(json.dumps(listed)), tmp_path)
 
     assert [(p.idx, p.row, p.col, p.size, p.score) for p in patches] == [
         (0, 20, 30, 21, 0.96),
@@ -120,12 +120,12 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
 )
 def test_nonsense_of_a_child_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
     with pytest.raises(JobFailedError, match="gave no kernels"):
-        _checked(answered(tmp_path, [place(0, **changed)]), tmp_path)
+        _measured(answered(tmp_path, [place(0, **changed)]), tmp_path)
 
 
 def test_a_measurement_without_kernels_is_refused(tmp_path: Path) -> None:
     with pytest.raises(JobFailedError):
-        _checked([place(0)], tmp_path)
+        _measured([place(0)], tmp_path)
 
 
 def test_a_measurement_is_sent_to_its_lens(client: TestClient, steps: Steps, store: Store) -> None:

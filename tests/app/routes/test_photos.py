@@ -16,7 +16,7 @@ from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
 from app.store.owners import ANY_OWNER
-from app.store.photos import PhotoStore
+from app.store.photos import Photos
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(9000)
@@ -317,7 +317,7 @@ def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, setti
 def test_a_photo_that_is_deleted_while_it_is_sent_is_told_as_it_was_received(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(PhotoStore, "get", lambda *_: None)
+    monkeypatch.setattr(Photos, "get", lambda *_: None)
 
     answer = client.post("/v1/photos", content=TIFF)
 
@@ -427,10 +427,10 @@ def test_events_send_each_state_until_the_end(
 
 def test_jobs_of_photos_and_corrections_share_a_list(client: TestClient, steps: Steps, store: Store) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
     params = {"method": "standard", "strength": 1.0, "output": {}, "roi": None}
-    store.corrections.create(photo, lens, 1, params)
+    store.jobs.correct(photo, lens, 1, params)
 
     first = get(client, "/v1/jobs?limit=1")
     second = get(client, first["next"])

@@ -62,11 +62,11 @@ def ready_needs_all(client: TestClient, store: Store) -> None:
     assert before.json()["checks"]["schema"] == before.json()["checks"]["storage"] == "ok"
     assert "lensmodel worker" in before.json()["checks"]["worker"]
 
-    store.workers.register("w", host="h", pid=1, pid_started=0.0)
+    store.jobs.register("w", host="h", pid=1, pid_started=0.0)
 
     after = client.get("/readyz")
     assert (after.status_code, after.json()["status"]) == (200, "ready")
-    store.workers.bury("w")
+    store.jobs.bury("w")
     assert client.get("/readyz").status_code == 503
 
 

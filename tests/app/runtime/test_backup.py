@@ -19,6 +19,7 @@ from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.database import Database
+from app.store.jobs import Job
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.cli.main import app
@@ -46,7 +47,7 @@ def opened(folder: Path) -> Iterator[tuple[Settings, Store, Storage]]:
 
 
 def kernels(store: Store, lens_id: str) -> np.ndarray:
-    _, samples = store.samples.of_lens(lens_id)
+    _, samples = store.lenses.samples_of(lens_id)
     return np.stack([stored.sample.kernel for stored in samples])
 
 
@@ -58,13 +59,13 @@ def test_a_service_goes_on_from_a_backup(
     made = copies.backup(store.database, storage, tmp_path / "backup")
     with opened(tmp_path / "backup") as (settings, new, blobs):
         assert (made.photos, made.blobs) == (3, 3)
-        assert new.samples.of_lens(lens_id)[0] == store.samples.of_lens(lens_id)[0]
+        assert new.lenses.samples_of(lens_id)[0] == store.lenses.samples_of(lens_id)[0]
         np.testing.assert_array_equal(kernels(new, lens_id), kernels(store, lens_id))
         assert [blobs.get(photo.blob_key) for photo in photos] == [
             storage.get(photo.blob_key) for photo in photos
         ]
-        assert [row[0] for row in new.photos.to_do()] == [photos[2].public_id]  # work goes on there
-        assert new.lenses.unmeasured() == store.lenses.unmeasured() == [(lens_id, 2)]
+        photo = Job("photo", (photos[2].public_id, 1), "local")  # work goes on there
+        assert new.jobs.to_do() == store.jobs.to_do() == [Job("measure", (lens_id, 2)), photo]
         assert [f.check for f in examine(settings, new, blobs).open] == ["work"]
 
 

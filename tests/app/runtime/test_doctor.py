@@ -122,13 +122,13 @@ def test_a_sample_of_an_excluded_photo_is_taken_out_and_the_model_learns_anew(
     sound: list[PhotoRow], store: Store, steps: Any, examined: Callable[..., DoctorReport]
 ) -> None:
     lens_id = steps.lens_id(sound[0])
-    before = store.samples.of_lens(lens_id)
+    before = store.lenses.samples_of(lens_id)
     with store.database.writing() as session:  # as if the samples had stayed when it was excluded
         session.execute(update(PhotoRow).where(PhotoRow.id == sound[0].id).values(state="excluded"))
 
     assert "votes" in {finding.check for finding in examined(repair=True).findings}
 
-    state, samples = store.samples.of_lens(lens_id)
+    state, samples = store.lenses.samples_of(lens_id)
     assert state.rebuild_epoch > before[0].rebuild_epoch
     assert {stored.sample.photo for stored in samples} == {sound[1].public_id}
     assert examined().findings == ()
@@ -158,7 +158,7 @@ def test_blobs_that_nobody_names_are_given_up_for_deletion(
     examined(repair=True)
 
     assert examined().findings == ()
-    assert "photos/NOBODY/" in store.workers.garbage(at=now() + timedelta(hours=1))
+    assert "photos/NOBODY/" in store.jobs.garbage(at=now() + timedelta(hours=1))
 
 
 def test_changed_bytes_are_found_when_all_is_read(

@@ -125,7 +125,9 @@ class Installation:
     def __init__(self, store: Store, storage: Storage, settings: Settings, hosts: list[Host]) -> None:
         self.store, self.storage, self.settings, self.hosts = store, storage, settings, hosts
         self.workers: list[subprocess.Popen[bytes]] = []
-        key = store.keys.create("local", ["write"]).text  # others can reach these: they do not start without
+        key = store.accounts.create_key(
+            "local", ["write"]
+        ).text  # others can reach these: they do not start without
         self.clients = [
             httpx2.Client(
                 base_url=f"http://{h.address}:{API_PORT}",
@@ -204,7 +206,7 @@ def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
             site.workers.append(host.run([str(STAND_INS / "quick_worker.py")], environment))
         try:
             site.until(site.all_run)
-            site.until(lambda: len(store.workers.live(LEASE_S)) == len(hosts))
+            site.until(lambda: len(store.jobs.live(LEASE_S)) == len(hosts))
             yield site
         finally:
             for client in site.clients:
@@ -231,7 +233,7 @@ def test_two_hosts_share_the_patches_of_a_photo_and_one_may_be_cut_off_and_retur
     installed.until(lambda: installed.states().count("counted") >= 2)
     installed.hosts[1].cut_off()
     installed.until(lambda: set(installed.states()) == {"counted"})  # the other one finishes all
-    alone = len(installed.store.workers.live(LEASE_S))
+    alone = len(installed.store.jobs.live(LEASE_S))
     installed.hosts[1].reconnect()
     installed.until(lambda: installed.workers[1].poll() is not None)  # late: it must not go on
 

@@ -14,7 +14,7 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.jobs.job_log import accounted
+from app.jobs.worker import accounted
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
@@ -100,7 +100,7 @@ def test_a_line_from_within_a_request_has_its_id(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("app.store.lenses.LensStore.page", broken)
+    monkeypatch.setattr("app.store.lenses.Lenses.page", broken)
     answer = client.get("/v1/lenses", headers={"X-Request-ID": "asked-2"})
     assert answer.status_code == 500
 

@@ -10,7 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
-from app.jobs.job_log import accounted
+from app.jobs.worker import accounted
 from app.runtime import metrics
 from app.runtime.outage import OutageError
 

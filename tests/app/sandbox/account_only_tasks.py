@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from hostile_tasks import TASKS
@@ -14,11 +14,7 @@ __all__ = ["TASKS"]
 
 
 def _only_account(
-    writes: Sequence[Path],
-    reads: Iterable[Path] = (),
-    account: SystemAccount | None = None,
-    *,
-    removes: bool = False,
+    folder: Path, reads: Iterable[Path] = (), account: SystemAccount | None = None
 ) -> list[str]:
     assert account is not None
     account.become()

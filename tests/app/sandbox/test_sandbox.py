@@ -24,10 +24,9 @@ from deadline import Deadline, stretched
 from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine
-from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
-from app.sandbox.runner import MAX_SAID, Sandbox
+from app.sandbox.runner import MAX_SAID, Budget, Sandbox
 from lensmodel.cli.ending import UsageError
 
 OWN = Path(__file__).parent
@@ -198,67 +197,54 @@ def test_a_flood_of_text_is_cut(run: Run) -> None:
 
 
 def test_cancelling_kills_the_child(run: Run, tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "1" / "pid"
-    start = time.monotonic()
+    start, pids = time.monotonic(), list[int]()
 
-    arguments = {"pid_file": str(pid_file)}
+    def wanted() -> bool:
+        pids.extend(int(path.read_text()) for path in tmp_path.glob("scratch/*/pid") if path.read_text())
+        return not pids
 
-    outcome = run("sleep", arguments=arguments, compiles="1", wanted=lambda: not pid_file.exists())
-
-    assert outcome.ending == "cancelled"
+    assert run("sleep", wanted=wanted).ending == "cancelled"
     assert time.monotonic() - start < 20
-    assert gone(read_pid(pid_file))
+    assert gone(pids[0])
 
 
 def test_cancelling_kills_what_the_child_started_too(sandbox: Sandbox, tmp_path: Path) -> None:
     sandbox._confined = False  # as where the kernel cannot keep it from starting programs
-    pid_file = tmp_path / "shared" / "1" / "pid"
-    arguments = {"pid_file": str(pid_file)}
-
-    pid_file.parent.mkdir()
     with sandbox.folder() as folder:
-        outcome = sandbox.run(
-            "spawn", arguments, folder=folder, limits=LIMITS, wanted=lambda: not pid_file.exists()
-        )
+        pid = folder / "pid"
+        outcome = sandbox.run("spawn", {}, folder=folder, limits=LIMITS, wanted=lambda: not pid.exists())
+        started = read_pid(pid)
 
     assert outcome.ending == "cancelled"
-    assert gone(read_pid(pid_file))
+    assert gone(started)
 
 
 def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "1" / "pid"
-
     def stop_once_it_runs() -> None:
-        read_pid(pid_file)
+        while not list(tmp_path.glob("scratch/*/pid")):
+            time.sleep(0.02)
         sandbox.stop()
 
     threading.Thread(target=stop_once_it_runs).start()
 
-    assert run("sleep", arguments={"pid_file": str(pid_file)}, compiles="1").ending == "cancelled"
+    assert run("sleep").ending == "cancelled"
     assert run("add", arguments={"a": 1, "b": 1}).ending == "cancelled"
 
 
 def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "1" / "pid"
+    pid_file = tmp_path / "scratch" / "task" / "pid"
     script = textwrap.dedent(
         f"""
         import sys
         from pathlib import Path
         sys.path.insert(0, {str(OWN)!r})
-        from app.sandbox.budget import Budget
         from app.sandbox.outcome import TaskLimits
-        from app.sandbox.runner import Sandbox
+        from app.sandbox.runner import Budget, Sandbox
         if __name__ == "__main__":
-            scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parents[1])!r})
-            box = Sandbox(scratch, Budget(1, 1024), module="hostile_tasks", preload=[], cache=shared)
-            with box.folder() as folder:
-                box.run(
-                    "sleep",
-                    {{"pid_file": {str(pid_file)!r}}},
-                    folder=folder,
-                    limits=TaskLimits(512, 60),
-                    compiles="1",
-                )
+            folder = Path({str(pid_file.parent)!r})
+            box = Sandbox(folder.parent, Budget(1, 1024), module="hostile_tasks", preload=[])
+            folder.mkdir()
+            box.run("sleep", {{}}, folder=folder, limits=TaskLimits(512, 60))
         """
     )
     (tmp_path / "parent.py").write_text(script)
@@ -277,8 +263,7 @@ def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None
     script = f"""if True:
         from multiprocessing import forkserver
         from pathlib import Path
-        from app.sandbox.budget import Budget
-        from app.sandbox.runner import Sandbox
+        from app.sandbox.runner import Budget, Sandbox
         if __name__ == "__main__":
             Sandbox(Path({str(tmp_path)!r}), Budget(1, 64), preload=[])
             print(forkserver._forkserver._forkserver_address)
@@ -299,9 +284,8 @@ from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine
 from app.sandbox.account import find
-from app.sandbox.budget import Budget
 from app.sandbox.outcome import TaskLimits
-from app.sandbox.runner import MAX_SAID, Sandbox
+from app.sandbox.runner import MAX_SAID, Budget, Sandbox
 if __name__ == "__main__":
     data = Path({data!r})
     confine.keep_private()
@@ -530,23 +514,11 @@ def test_a_task_that_fills_its_folder_is_killed(run: Run, files: int, size: int)
     assert "2 MiB or 40 files" in outcome.detail
 
 
-def test_no_file_of_a_task_that_decodes_escapes_the_count_of_its_folder(run: Run) -> None:
+@pytest.mark.parametrize("compiles", [None, "1"], ids=["decodes", "computes"])
+def test_no_file_of_a_task_escapes_the_count_of_its_folder(run: Run, compiles: str | None) -> None:
     in_force("system_calls")
 
-    assert run("hoard", arguments={"bytes": 1 << 20}).value == []
-
-
-def test_a_task_that_compiles_may_replace_files_in_its_cache(run: Run) -> None:
-    assert "replaced" in run("hoard", arguments={"bytes": 1}, compiles="1").value
-
-
-def test_a_cache_counts_with_the_folder_of_the_task_that_fills_it(run: Run, tmp_path: Path) -> None:
-    limits = TaskLimits(memory_mb=512, wall_s=stretched(30), scratch_mb=2, files=40)
-    arguments = {"files": 3, "bytes": 1 << 20, "into": str(tmp_path / "shared" / "1")}
-
-    outcome = run("litter", arguments=arguments, limits=limits, compiles="1")
-
-    assert (outcome.ending, outcome.code) == ("error", "memory_limit")
+    assert run("hoard", arguments={"bytes": 1 << 20}, compiles=compiles).value == []
 
 
 def test_what_a_task_prints_is_logged_and_looks_like_no_record_of_ours(
@@ -575,12 +547,16 @@ def test_compiled_code_of_one_owner_is_out_of_reach_of_another(
     sandbox: Sandbox, run: Run, tmp_path: Path
 ) -> None:
     in_force("files")
-    theirs = tmp_path / "shared" / "1"
+    theirs, own = (tmp_path / "shared" / owner for owner in ("1", "2"))
     theirs.mkdir(parents=True)
+    caches = {"caches": [str(theirs), str(own)]}
+    limits = TaskLimits(memory_mb=2048, wall_s=stretched(60))
 
-    planted, own = run("compile_one", arguments={"theirs": str(theirs)}, compiles="2").value
+    first = run("compile_one", arguments=caches, limits=limits, compiles="2").value
+    again = run("compile_one", arguments=caches, limits=limits, compiles="2").value
 
-    assert (planted, own) == ("refused", str(tmp_path / "shared" / "2"))
+    assert first == ["compiled", str(own), f"reads {own}"]  # it reads its own and changes nothing there
+    assert again == ["loaded", str(own), f"reads {own}"]
 
 
 @pytest.mark.parametrize("missing", ["account", "files"])

@@ -49,7 +49,8 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
             "row": 0,
             "col": 8 * k,
             "size": 8,
-            "position": {"r": k / CELLS, "phi": turn},
+            "r": k / CELLS,
+            "phi": turn,
             "score": 1.0,
             "cell": k,
         }

@@ -44,7 +44,7 @@ def lens_of(store: Store, lens_id: str) -> LensRow:
 def widths(store: Store, lens_id: str) -> list[float]:
     """Return the variances of the kernels that count, one of each photo; all of a photo are alike."""
     found: dict[str, set[float]] = {}
-    for stored in store.samples.of_lens(lens_id)[1]:
+    for stored in store.lenses.samples_of(lens_id)[1]:
         variance = round(rms_width(stored.sample.kernel) ** 2, 0)
         found.setdefault(stored.sample.photo, set()).add(variance)
     assert all(len(one) == 1 for one in found.values()), found

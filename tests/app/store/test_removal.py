@@ -134,12 +134,12 @@ def test_corrections_of_a_deleted_lens_that_are_finished_stay(
     client: TestClient, store: Store, steps: Any
 ) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
     common = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
-    finished, _ = store.corrections.create(photo, lens, 1, common)
-    store.corrections.set_state(finished.public_id, ("queued",), "succeeded")
-    waiting, _ = store.corrections.create(photo, lens, 1, {**common, "strength": 0.5})
+    finished, _ = store.jobs.correct(photo, lens, 1, common)
+    store.jobs.set_state(finished.public_id, ("queued",), "succeeded")
+    waiting, _ = store.jobs.correct(photo, lens, 1, {**common, "strength": 0.5})
 
     client.delete(f"/v1/lenses/{lens.public_id}")
 

@@ -17,9 +17,9 @@ from sqlalchemy.exc import DBAPIError
 
 from app.errors import BusyError
 from app.runtime.settings import Settings, table
-from app.store import LensName, NewPatch, Store, corrections, lenses
-from app.store.corrections import Result
+from app.store import LensName, NewPatch, Store, jobs, lenses
 from app.store.database import Database
+from app.store.jobs import Result
 from app.store.migrate import current, downgrade, head, upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
@@ -35,7 +35,7 @@ def test_finishing_a_photo_counts_it_once_however_often_it_is_tried(store: Store
 
     assert store.photos.finish(photo.public_id, photo.epoch) is None
 
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
     assert (lens.version, lens.photo_count, lens.sample_count) == (1, 1, 6)
     assert len(store.lenses.history(lens)) == 1
@@ -57,13 +57,13 @@ def test_cells_empty_as_their_patches_finish_or_fail(store: Store, steps: Steps)
     photo = steps.receive()
     steps.inspect(photo)
     steps.plan(photo, count=4)
-    assert store.patches.cells(photo.public_id, 1) == [0, 1]
+    assert store.photos.cells(photo.public_id, 1) == [0, 1]
 
     steps.estimate(photo, (0, 2))
-    assert store.patches.cells(photo.public_id, 1) == [1]
-    store.patches.fail(photo.public_id, 1, [1, 3], "time_limit")
+    assert store.photos.cells(photo.public_id, 1) == [1]
+    store.photos.fail_patches(photo.public_id, 1, "time_limit", indices=[1, 3])
 
-    assert store.patches.cells(photo.public_id, 1) == []
+    assert store.photos.cells(photo.public_id, 1) == []
 
 
 def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
@@ -71,10 +71,10 @@ def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
     steps.inspect(photo)
     steps.plan(photo)
 
-    store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
+    store.photos.plan_patches(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
 
-    assert len(store.patches.listed(photo.public_id)) == 3
-    assert store.patches.all_of(photo.public_id)[0].row == 100
+    assert len(store.photos.windows(photo.public_id)) == 3
+    assert store.photos.patches(photo.public_id)[0].row == 100
 
 
 def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> None:
@@ -86,9 +86,11 @@ def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> N
         NewPatch(k + 1, 16 * k, 8 * k, 64, 0.12345678, -2.5, rejected=reasons[k % 3]) for k in range(2000)
     ]
 
-    count = store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected])
+    count = store.photos.plan_patches(
+        photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected]
+    )
 
-    listed = store.patches.listed(photo.public_id)
+    listed = store.photos.windows(photo.public_id)
     with store.database.reading() as session:
         stored = session.scalar(select(func.count()).select_from(PatchRow))
         size = session.scalar(select(func.length(cast(PhotoRow.windows, Text))))
@@ -102,7 +104,7 @@ def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> N
     assert size is not None
     assert size < 100_000
     store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
-    assert store.patches.listed(photo.public_id) == []
+    assert store.photos.windows(photo.public_id) == []
 
 
 def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> None:
@@ -115,7 +117,7 @@ def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> Non
     assert store.photos.cancel(photo.public_id, ANY_OWNER)
     assert store.photos.finish(photo.public_id, 1) is None
     assert not store.photos.cancel(photo.public_id, ANY_OWNER)
-    assert len(store.samples.of_lens(lens)[1]) == 6  # of the other photo alone
+    assert len(store.lenses.samples_of(lens)[1]) == 6  # of the other photo alone
 
 
 def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> None:
@@ -171,7 +173,7 @@ def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
     assert store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
     after = steps.fresh(photo)
-    state, samples = store.samples.of_lens(lens)
+    state, samples = store.lenses.samples_of(lens)
     assert (after.state, after.epoch) == ("counted", photo.epoch)
     assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory are told to forget the old ones
 
@@ -264,7 +266,7 @@ def test_a_stored_photo_makes_no_lens_but_joins_one(store: Store, steps: Steps) 
 def test_samples_come_back_as_they_were_written(store: Store, steps: Steps) -> None:
     photo = steps.counted()
 
-    state, samples = store.samples.of_lens(steps.lens_id(photo))
+    state, samples = store.lenses.samples_of(steps.lens_id(photo))
 
     assert (state.version, state.rebuild_epoch, len(samples)) == (1, 0, 6)
     sample = samples[0].sample
@@ -301,7 +303,7 @@ def test_a_sample_is_stored_as_earlier_programs_read_it(store: Store, steps: Ste
 def test_only_samples_of_later_versions_are_read_on(store: Store, steps: Steps) -> None:
     first, second = steps.counted(), steps.counted()
 
-    state, samples = store.samples.of_lens(steps.lens_id(first), after_version=1)
+    state, samples = store.lenses.samples_of(steps.lens_id(first), after_version=1)
 
     assert state.version == 2
     assert {stored.sample.photo for stored in samples} == {second.public_id}
@@ -312,11 +314,11 @@ def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: S
     lens = steps.lens_id(photo)
 
     assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)
-    assert store.samples.of_lens(lens)[1] == []
+    assert store.lenses.samples_of(lens)[1] == []
     assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)  # again: no version of its own
     assert store.photos.change(photo.public_id, OWNER, {}, excluded=False)
 
-    state, samples = store.samples.of_lens(lens)
+    state, samples = store.lenses.samples_of(lens)
     assert (state.version, state.rebuild_epoch, len(samples)) == (3, 2, 6)
 
 
@@ -327,11 +329,11 @@ def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, 
     assert store.photos.delete(photo.public_id, OWNER) == f"photos/{photo.public_id}/"
 
     assert store.photos.get(photo.public_id, ANY_OWNER) is None
-    assert {stored.sample.photo for stored in store.samples.of_lens(lens)[1]} == {other.public_id}
-    assert store.workers.garbage() == []  # a worker may still write: once more in a while
+    assert {stored.sample.photo for stored in store.lenses.samples_of(lens)[1]} == {other.public_id}
+    assert store.jobs.garbage() == []  # a worker may still write: once more in a while
     late = datetime.now(UTC) + timedelta(hours=1)
     models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
-    assert set(store.workers.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
+    assert set(store.jobs.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
     found = store.lenses.get(lens, ANY_OWNER)
     assert found is not None
     assert [event.kind for event in store.lenses.history(found)] == [
@@ -352,8 +354,8 @@ def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -
 
     assert store.photos.change(mine.public_id, OWNER, {}, lens=new)
 
-    assert store.samples.of_lens(old)[1] == []
-    assert len(store.samples.of_lens(new)[1]) == 12
+    assert store.lenses.samples_of(old)[1] == []
+    assert len(store.lenses.samples_of(new)[1]) == 12
 
 
 def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, steps: Steps) -> None:
@@ -361,40 +363,40 @@ def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, 
 
     store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
-    state, samples = store.samples.of_lens(steps.lens_id(photo))
+    state, samples = store.lenses.samples_of(steps.lens_id(photo))
     assert state.version == 2
     assert {stored.sample.settings.aperture for stored in samples} == {2.0}
 
 
 def test_the_same_correction_is_made_once_and_a_failed_one_again(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
 
-    first, made = store.corrections.create(photo, lens, 1, {"method": "fast"})
-    second, made_again = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    first, made = store.jobs.correct(photo, lens, 1, {"method": "fast"})
+    second, made_again = store.jobs.correct(photo, lens, 1, {"method": "fast"})
     assert (made, made_again, first.public_id) == (True, False, second.public_id)
 
-    assert store.corrections.fail(first.public_id, "time_limit", "too slow")
-    third, made = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    assert store.jobs.fail(first.public_id, "time_limit", "too slow")
+    third, made = store.jobs.correct(photo, lens, 1, {"method": "fast"})
     assert made
     assert third.public_id != first.public_id
 
 
 def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
-    row, _ = store.corrections.create(photo, lens, 1, {})
-    run = store.corrections.start(row.public_id)
+    row, _ = store.jobs.correct(photo, lens, 1, {})
+    run = store.jobs.start(row.public_id)
     assert run is not None
-    store.corrections.progress(run, 1, 2)
+    store.jobs.progress(run, 1, 2)
 
-    assert store.corrections.cancel(row.public_id, OWNER)
+    assert store.jobs.cancel(row.public_id, OWNER)
 
-    assert not store.corrections.finish(run, Result("k", "e", "image/tiff", 1, "n"), {})
-    assert not store.corrections.start(row.public_id)
-    assert not store.corrections.is_live(row.public_id)
+    assert not store.jobs.finish(run, Result("k", "e", "image/tiff", 1, "n"), {})
+    assert not store.jobs.start(row.public_id)
+    assert not store.jobs.is_live(row.public_id)
 
 
 def test_another_owner_sees_nothing(store: Store, steps: Steps) -> None:
@@ -409,16 +411,16 @@ def test_another_owner_sees_nothing(store: Store, steps: Steps) -> None:
 
 
 def test_a_worker_declared_dead_cannot_beat_again(store: Store, steps: Steps) -> None:
-    store.workers.register("w", host="h", pid=1, pid_started=0.0)
-    assert store.workers.beat("w")
-    assert [row.id for row in store.workers.live(10)] == ["w"]
+    store.jobs.register("w", host="h", pid=1, pid_started=0.0)
+    assert store.jobs.beat("w")
+    assert [row.id for row in store.jobs.live(10)] == ["w"]
 
-    assert store.workers.bury_stale(0.0) == ["w"]
+    assert store.jobs.bury_stale(0.0) == ["w"]
 
-    assert not store.workers.beat("w")
-    assert store.workers.live(10) == []
-    store.workers.forget("w")
-    assert store.workers.all() == []
+    assert not store.jobs.beat("w")
+    assert store.jobs.live(10) == []
+    store.jobs.forget("w")
+    assert store.jobs.workers() == []
 
 
 def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, steps: Steps) -> None:
@@ -435,7 +437,7 @@ def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, ste
     for thread in threads:
         thread.join()
 
-    state = store.samples.state_of(lens)
+    state = store.lenses.state_of(lens)
     assert state is not None
     assert state.version == 21
 
@@ -547,11 +549,11 @@ def samples_are_of_their_version(store: Store, steps: Steps) -> None:
 
     event.listen(store.database.reader, "after_cursor_execute", count_another)
     try:
-        state, samples = store.samples.of_lens(lens)
+        state, samples = store.lenses.samples_of(lens)
     finally:
         event.remove(store.database.reader, "after_cursor_execute", count_another)
 
-    again, later = store.samples.of_lens(lens, after_version=state.version)
+    again, later = store.lenses.samples_of(lens, after_version=state.version)
     assert (state.version, again.version) == (1, 2)
     assert {stored.version_added for stored in samples} == {1}
     assert not {stored.id for stored in samples} & {stored.id for stored in later}
@@ -572,11 +574,11 @@ def test_a_correction_whose_twin_ends_meanwhile_is_created(
     store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
-    blocked_once(monkeypatch, corrections)
+    blocked_once(monkeypatch, jobs)
 
-    row, created = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    row, created = store.jobs.correct(photo, lens, 1, {"method": "fast"})
 
     assert (row.state, created) == ("queued", True)
 
@@ -623,31 +625,31 @@ def test_an_upload_has_all_its_time_and_either_keeps_its_file_or_is_refused(
     hour, late = timedelta(hours=1), datetime.now(UTC) + timedelta(hours=3)
     for public_id in ("early", "late"):
         store.photos.expect(f"photos/{public_id}/", within=hour)
-    assert store.workers.garbage(at=datetime.now(UTC) + hour) == []
-    assert store.workers.garbage(at=late) == ["photos/early/", "photos/late/"]
+    assert store.jobs.garbage(at=datetime.now(UTC) + hour) == []
+    assert store.jobs.garbage(at=late) == ["photos/early/", "photos/late/"]
 
     receive("early")
-    assert not store.workers.claim_garbage("photos/early/", at=late)
-    assert store.workers.claim_garbage("photos/late/", at=late)
+    assert not store.jobs.claim_garbage("photos/early/", at=late)
+    assert store.jobs.claim_garbage("photos/late/", at=late)
     with pytest.raises(BusyError, match="too long"):
         receive("late")
 
-    assert store.workers.garbage(at=late) == ["photos/late/"]  # still, until its blobs are deleted
+    assert store.jobs.garbage(at=late) == ["photos/late/"]  # still, until its blobs are deleted
 
 
 def test_what_is_written_after_a_deletion_is_deleted_later(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    lens = store.photos.lens_of(photo)
+    lens = photo.lens
     assert lens is not None
-    one, _ = store.corrections.create(photo, lens, 1, {"method": "fast"})
-    two, _ = store.corrections.create(photo, lens, 1, {"method": "paper"})
+    one, _ = store.jobs.correct(photo, lens, 1, {"method": "fast"})
+    two, _ = store.jobs.correct(photo, lens, 1, {"method": "paper"})
     prefixes = [f"corrections/{row.public_id}/" for row in (one, two)]
 
-    assert store.corrections.delete(one.public_id, OWNER) == prefixes[0]
+    assert store.jobs.delete(one.public_id, OWNER) == prefixes[0]
     store.photos.delete(photo.public_id, OWNER)
 
-    assert not set(prefixes) & set(store.workers.garbage())
-    assert set(prefixes) <= set(store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)))
+    assert not set(prefixes) & set(store.jobs.garbage())
+    assert set(prefixes) <= set(store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)))
 
 
 def many(store: Store, count: int = 10_000) -> None:
@@ -709,8 +711,8 @@ def test_a_page_of_ten_thousand_lenses_is_found_by_an_index(store: Store) -> Non
         seen.append((statement, rest[0]))
 
     event.listen(store.database.reader, "before_cursor_execute", note)
-    for part in (store.lenses, store.photos, store.corrections):
-        assert len(part.page("owner 1", before=None, limit=50)) == 50
+    for page in (store.lenses.page, store.photos.page, store.jobs.corrections):
+        assert len(page("owner 1", before=None, limit=50)) == 50
     event.remove(store.database.reader, "before_cursor_execute", note)
 
     with store.database.reader.connect() as connection:

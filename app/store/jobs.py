@@ -1,0 +1,430 @@
+"""Corrections, the work that the tables ask for, the leases of workers, and blobs to be deleted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any, Final, Literal, TypeAlias
+
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
+
+from app.errors import BusyError, ConflictError, UnknownPhotoError
+from app.store.database import Repository, changed, insert_new, new_id, reads, writes, writes_durably
+from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, owned, present
+from app.store.tables import (
+    PHOTO_RUNNING,
+    CorrectionRow,
+    EventRow,
+    GarbageRow,
+    LensRow,
+    OwnerRow,
+    PhotoRow,
+    WorkerRow,
+)
+
+Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
+
+ACTIVE: Final = ("queued", "running")
+ENDED_BADLY: Final = ("failed", "cancelled")
+
+TRIES: Final = 10
+"""How often to look again for the same correction that ended between insert and select (chosen)."""
+
+_STATES: Final[Mapping[str, tuple[str, ...]]] = {
+    "photo": ("received", *PHOTO_RUNNING),
+    "correction": ACTIVE,
+}
+"""States of unfinished work by its kind, of work that nobody began first."""
+
+_TABLES: Final[Mapping[Kind, type[PhotoRow | CorrectionRow]]] = {
+    "photo": PhotoRow,
+    "correction": CorrectionRow,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One job: its kind, the ids and numbers of its subject, and the owner for whom it runs.
+
+    The id is made of kind and arguments: enqueuing a job twice runs it once.
+    """
+
+    kind: Kind
+    arguments: tuple[str | int, ...]
+    owner: str = "local"
+
+    @property
+    def id(self) -> str:
+        """The engine's id of this job."""
+        return "/".join([self.kind, *map(str, self.arguments)])
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run of a correction: a worker that lost its lease, or was begun before a retry, has another."""
+
+    correction_id: str
+    epoch: int
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A finished file and how to hand it out."""
+
+    key: str
+    etag: str
+    media_type: str
+    size: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """Waiting jobs and numbers of rows at one moment.
+
+    Parameters
+    ----------
+    jobs : mapping of (kind, state) to int
+        Unfinished jobs.
+    oldest_s : mapping of kind to float
+        Seconds for which the oldest job has waited; 0 where none waits.
+    garbage : int
+        Prefixes of blobs that wait to be deleted.
+    rows : mapping of table to int
+        Photos, lenses and samples.
+    """
+
+    jobs: Mapping[tuple[str, str], int]
+    oldest_s: Mapping[str, float]
+    garbage: int
+    rows: Mapping[str, int]
+
+
+def params_hash(params: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the canonical JSON of the parameters."""
+    return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+class Jobs(Repository):
+    """Work of all owners, and who does it. `ANY_OWNER` asks as the service itself."""
+
+    # --- corrections ------------------------------------------------------------------------------
+
+    @writes_durably
+    def correct(
+        self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
+    ) -> tuple[CorrectionRow, bool]:
+        """Create a correction, or return the one of the same request; True if it is new."""
+        request = {
+            "photo_id": photo.id,
+            "lens_id": lens.id,
+            "lens_version": version,
+            "params_hash": params_hash(params),
+        }
+        fresh = {
+            **request,
+            "public_id": new_id(),
+            "owner_id": photo.owner_id,
+            "params": dict(params),
+            "state": "queued",
+            "created_at": now(),
+            **dict.fromkeys(("attempt", "progress_done", "progress_total"), 0),
+        }
+        current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
+        # by its public id: SQLite may have given the key of a deleted photo to another one
+        if current is None or (current.id, current.owner_id) != (photo.id, photo.owner_id):
+            raise UnknownPhotoError(f"photo {photo.public_id} was deleted meanwhile: send it again")
+        if current.file_gone_at is not None:
+            raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
+        for _ in range(TRIES):
+            created = insert_new(session, CorrectionRow, [fresh]) == 1
+            row = session.scalar(_same(request))
+            if row is not None:
+                session.refresh(row, ["photo", "lens"])
+                return row, created
+        raise BusyError(f"{TRIES} times the same correction ended just then: ask for it again")
+
+    @reads
+    def correction(self, session: Session, correction_id: str, owner: Owner) -> CorrectionRow | None:
+        """Return one correction with its photo and its lens, or None."""
+        return find_owned(session, CorrectionRow, correction_id, owner)
+
+    @reads
+    def corrections(
+        self, session: Session, owner: str, *, before: str | None, limit: int, photo: PhotoRow | None = None
+    ) -> list[CorrectionRow]:
+        """Return corrections with their photos and lenses, newest first."""
+        query = owned(CorrectionRow, owner).order_by(CorrectionRow.public_id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(CorrectionRow.public_id < before)
+        if photo is not None:
+            query = query.where(CorrectionRow.photo_id == photo.id)
+        return list(session.scalars(query))
+
+    def is_live(self, correction_id: str, epoch: int | None = None) -> bool:
+        """Say whether the correction is still wanted: the cancel poll."""
+        row = self.correction(correction_id, ANY_OWNER)
+        return row is not None and row.state in ACTIVE and epoch in {None, row.epoch}
+
+    @writes
+    def set_state(
+        self,
+        session: Session,
+        /,
+        correction_id: str,
+        from_states: Sequence[str],
+        to: str,
+        *,
+        epoch: int | None = None,
+        run: Run | None = None,
+        **fields: object,
+    ) -> bool:
+        """Move a correction from one of `from_states` to `to`; False where it was in none of them.
+
+        With `epoch` only if it was not started anew since, with `run` only if that is its last one.
+        """
+        conditions = [CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states)]
+        if epoch is not None:
+            conditions.append(CorrectionRow.epoch == epoch)
+        if run is not None:
+            conditions += [CorrectionRow.epoch == run.epoch, CorrectionRow.attempt == run.attempt]
+        return changed(session, update(CorrectionRow).where(*conditions).values(state=to, **fields)) == 1
+
+    @writes
+    def start(self, session: Session, correction_id: str, epoch: int | None = None) -> Run | None:
+        """Begin, or begin again after the death of a worker; None if it is not to be done any more.
+
+        What an earlier run has stored becomes garbage.
+        """
+        row = find_to_change(session, CorrectionRow, correction_id, ANY_OWNER)
+        if row is None or row.state not in ACTIVE or epoch not in {None, row.epoch}:
+            return None
+        if row.attempt:
+            discard(session, row.run_folder)
+        row.state, row.started_at, row.attempt = "running", now(), row.attempt + 1
+        return Run(row.public_id, row.epoch, row.attempt)
+
+    @writes
+    def retry(self, session: Session, correction_id: str, owner: Owner) -> bool:
+        """Start a failed or cancelled correction anew; False if it is in another state.
+
+        False as well if the same correction was requested again meanwhile: that one will do.
+        """
+        row = find_to_change(session, CorrectionRow, correction_id, owner)
+        if row is None or row.state not in ENDED_BADLY:
+            return False
+        columns = ("photo_id", "lens_id", "lens_version", "params_hash")
+        if session.scalar(_same({name: getattr(row, name) for name in columns})) is not None:
+            return False
+        discard(session, row.run_folder)
+        row.epoch += 1
+        row.state, row.stage = "queued", None
+        row.error_code = row.error_detail = row.started_at = row.finished_at = None
+        row.attempt = row.progress_done = row.progress_total = 0
+        return True
+
+    @reads
+    def failed_by(self, session: Session, owner: str, code: str, limit: int) -> list[str]:
+        """Return the corrections that ended with a code, oldest first."""
+        failed = (CorrectionRow.state == "failed", CorrectionRow.error_code == code)
+        query = owned(CorrectionRow, owner).where(*failed).order_by(CorrectionRow.id).limit(limit)
+        return [row.public_id for row in session.scalars(query)]
+
+    def progress(self, run: Run, done: int, total: int, stage: str = "correcting") -> None:
+        """Record how far a running correction is."""
+        how_far: dict[str, Any] = {"progress_done": done, "progress_total": total, "stage": stage}
+        self.set_state(run.correction_id, ("running",), "running", run=run, **how_far)
+
+    def finish(self, run: Run, result: Result, report: Mapping[str, Any]) -> bool:
+        """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
+        return self.set_state(
+            run.correction_id,
+            ("running",),
+            "succeeded",
+            run=run,
+            report=dict(report),
+            result_key=result.key,
+            result_etag=result.etag,
+            result_media_type=result.media_type,
+            result_bytes=result.size,
+            result_name=result.name,
+            finished_at=now(),
+        )
+
+    def fail(self, correction_id: str, code: str, detail: str, *, epoch: int | None = None) -> bool:
+        """End with a reason."""
+        why: dict[str, Any] = {"error_code": code, "error_detail": detail, "finished_at": now()}
+        return self.set_state(correction_id, ACTIVE, "failed", epoch=epoch, **why)
+
+    def cancel(self, correction_id: str, owner: Owner) -> bool:
+        """Cancel an unfinished correction; False if it was finished already."""
+        if self.correction(correction_id, owner) is None:
+            return False
+        return self.set_state(correction_id, ACTIVE, "cancelled", finished_at=now())
+
+    @reads
+    def unfinished_of(self, session: Session, owner: str) -> int:
+        """Return how many corrections of an owner wait or run."""
+        of_owner = CorrectionRow.owner.has(OwnerRow.name == owner)
+        return session.scalar(select(func.count()).where(of_owner, CorrectionRow.state.in_(ACTIVE))) or 0
+
+    @reads
+    def ended_before(self, session: Session, moment: datetime, limit: int = 100) -> list[str]:
+        """Return corrections that ended before a moment, whatever came of them."""
+        ended = (CorrectionRow.state.not_in(ACTIVE), CorrectionRow.finished_at < moment)
+        return list(session.scalars(select(CorrectionRow.public_id).where(*ended).limit(limit)))
+
+    @writes
+    def delete(self, session: Session, correction_id: str, owner: Owner) -> str | None:
+        """Forget a correction; return the prefix of its blobs, None if there is no such correction."""
+        row = find_owned(session, CorrectionRow, correction_id, owner)
+        if row is None:
+            return None
+        discard(session, row.folder)
+        session.delete(row)
+        return row.folder
+
+    # --- what is to do ----------------------------------------------------------------------------
+
+    @reads
+    def to_do(self, session: Session, *, begun: bool = False, limit: int = 100) -> list[Job]:
+        """Return the jobs that the tables ask for, the oldest first; also those that workers began."""
+        query = (
+            select(LensRow.public_id, LensRow.version)
+            .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
+            .where(EventRow.metrics.is_(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
+        )
+        jobs = [Job("measure", (row[0], row[1])) for row in session.execute(query.limit(limit))]
+        for kind, table in _TABLES.items():
+            states = _STATES[kind] if begun else _STATES[kind][:1]
+            rows = session.execute(
+                select(table.public_id, table.epoch, OwnerRow.name)
+                .join(OwnerRow, OwnerRow.id == table.owner_id)
+                .where(table.state.in_(states), *present(table))
+                .order_by(table.id)
+                .limit(10 * limit if begun else limit)
+            )
+            jobs += [Job(kind, (row[0], row[1]), row[2]) for row in rows]
+        return jobs
+
+    @reads
+    def load(self, session: Session) -> Load:
+        """Return the numbers; reads of indexes, except for the counts of rows."""
+        jobs = {(kind, state): 0 for kind, states in _STATES.items() for state in states}
+        oldest = dict.fromkeys(_STATES, 0.0)
+        for kind, table, since in (
+            ("photo", PhotoRow, PhotoRow.stage_at),
+            ("correction", CorrectionRow, CorrectionRow.created_at),
+        ):
+            unfinished = (table.state.in_(_STATES[kind]), *present(table))
+            counted = select(table.state, func.count(), func.min(since)).where(*unfinished)
+            for state, count, first in session.execute(counted.group_by(table.state)):
+                jobs[kind, state] = count
+                if state == _STATES[kind][0]:
+                    oldest[kind] = max((now() - first).total_seconds(), 0.0)
+        numbers = {
+            "photo": select(func.count()).where(PhotoRow.deleted_at.is_(None)),
+            "lens": select(func.count()).where(LensRow.deleted_at.is_(None)),
+            # a count of samples would read all
+            "sample": select(func.coalesce(func.sum(LensRow.sample_count), 0)),
+        }
+        rows = {name: int(session.scalar(query) or 0) for name, query in numbers.items()}
+        return Load(jobs, oldest, session.scalar(select(func.count()).select_from(GarbageRow)) or 0, rows)
+
+    # --- workers ----------------------------------------------------------------------------------
+
+    def _now(self, session: Session) -> datetime:
+        """Return the time that all workers share: a database server's, whatever their own clocks say."""
+        return now() if self.database.is_sqlite else session.scalars(select(func.now())).one()
+
+    @writes
+    def register(
+        self,
+        session: Session,
+        worker_id: str,
+        *,
+        host: str,
+        pid: int,
+        pid_started: float,
+        confined: Iterable[str] = (),
+    ) -> None:
+        """Enter a new worker, with the measures that confine its children."""
+        at = self._now(session)
+        session.add(
+            WorkerRow(
+                id=worker_id,
+                host=host,
+                pid=pid,
+                pid_started=pid_started,
+                confined=" ".join(confined),
+                state="live",
+                started_at=at,
+                heartbeat_at=at,
+            )
+        )
+
+    @writes
+    def beat(self, session: Session, worker_id: str) -> bool:
+        """Renew the lease; False if the worker was declared dead: it must then stop at once."""
+        live = (WorkerRow.id == worker_id, WorkerRow.state == "live")
+        return changed(session, update(WorkerRow).where(*live).values(heartbeat_at=self._now(session))) == 1
+
+    @reads
+    def live(self, session: Session, lease_seconds: float) -> list[WorkerRow]:
+        """Return the workers whose last heartbeat is within the lease."""
+        since = self._now(session) - timedelta(seconds=lease_seconds)
+        live = (WorkerRow.state == "live", WorkerRow.heartbeat_at > since)
+        return list(session.scalars(select(WorkerRow).where(*live)))
+
+    @reads
+    def workers(self, session: Session) -> list[WorkerRow]:
+        """Return every worker that has a row, dead ones too."""
+        return list(session.scalars(select(WorkerRow)))
+
+    @writes
+    def bury_stale(self, session: Session, lease_seconds: float) -> list[str]:
+        """Declare workers dead that missed their lease; return the ids of all dead ones."""
+        before = self._now(session) - timedelta(seconds=lease_seconds)
+        silent = (WorkerRow.state == "live", WorkerRow.heartbeat_at < before)
+        session.execute(update(WorkerRow).where(*silent).values(state="dead"))
+        return list(session.scalars(select(WorkerRow.id).where(WorkerRow.state == "dead")))
+
+    @writes
+    def bury(self, session: Session, worker_id: str) -> None:
+        """Declare one worker dead: it has stopped, or its process is known to be gone."""
+        session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(state="dead"))
+
+    @writes
+    def forget(self, session: Session, worker_id: str) -> None:
+        """Remove a dead worker, once others have taken over all it had begun."""
+        session.execute(delete(WorkerRow).where(WorkerRow.id == worker_id, WorkerRow.state == "dead"))
+
+    # --- garbage ----------------------------------------------------------------------------------
+
+    @reads
+    def garbage(self, session: Session, limit: int = 100, *, at: datetime | None = None) -> list[str]:
+        """Return prefixes of blobs that are due for deletion, now or at another time."""
+        due = GarbageRow.not_before <= (at or now())
+        return list(session.scalars(select(GarbageRow.prefix).where(due).limit(limit)))
+
+    @writes
+    def claim_garbage(self, session: Session, prefix: str, *, at: datetime | None = None) -> bool:
+        """Say whether blobs are still garbage, and to be deleted now: no upload can keep them any more."""
+        due = (GarbageRow.prefix == prefix, GarbageRow.not_before <= (at or now()))
+        return changed(session, update(GarbageRow).where(*due).values(claimed=True)) == 1
+
+    @writes
+    def forget_garbage(self, session: Session, prefix: str) -> None:
+        """Record that the blobs of a prefix are deleted."""
+        session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
+
+
+def _same(request: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a selection of corrections
+    """Select the correction of the same request that has not failed and was not cancelled."""
+    columns = [getattr(CorrectionRow, name) == value for name, value in request.items()]
+    return select(CorrectionRow).where(*columns, CorrectionRow.state.not_in(ENDED_BADLY))

@@ -1,0 +1,250 @@
+"""Patches of photos: planned once, each cell finished once.
+
+Windows that were rejected before estimation are one compact value of their photo, not thousands of rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from sqlalchemy import Select, func, select, update
+from sqlalchemy.orm import Session
+
+from app.store.database import Repository, insert_new, reads, writes
+from app.store.owners import now
+from app.store.samples import columns_of
+from app.store.tables import PatchRow, PhotoRow, SampleRow
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import FieldPosition
+
+OPEN: Final = ("pending", "running")
+
+DIGITS: Final = 4
+"""Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
+diagonal is 3,600 pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewPatch:
+    """A window that was chosen, or rejected with a reason."""
+
+    idx: int
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    cell: int | None = None
+    score: float | None = None
+    rejected: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewSample:
+    """One sample that was estimated from the patch `idx`, and what the estimator says of itself."""
+
+    idx: int
+    sample: PsfSample
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Patches(Repository):
+    """Patches of photos, and the samples that are estimated from them."""
+
+    @writes
+    def plan_patches(self, session: Session, photo_id: str, epoch: int, patches: Sequence[NewPatch]) -> int:
+        """Write the plan of a photo once; return how many patches are to be estimated.
+
+        A second call, by a worker that repeats the step, adds nothing.
+        """
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return 0
+        of_plan = {"photo_id": photo.id, "epoch": epoch, "state": "pending", "attempts": 0}
+        columns = ("idx", "cell", "row", "col", "size", "r", "phi", "score")
+        rows = [
+            {**of_plan, **{name: getattr(patch, name) for name in columns}}
+            for patch in patches
+            if patch.rejected is None
+        ]
+        insert_new(session, PatchRow, rows)
+        rejected = [patch for patch in patches if patch.rejected is not None]
+        if photo.windows is None:
+            photo.windows, photo.windows_rejected = _packed(rejected), len(rejected)
+        return recount_patches(session, photo)
+
+    @reads
+    def patches(self, session: Session, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
+        """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
+        return list(session.scalars(_patches_of(photo_id, epoch).order_by(PatchRow.idx)))
+
+    @reads
+    def places_of(self, session: Session, photo_ids: Sequence[str]) -> list[FieldPosition]:
+        """Return where patches of photos gave a PSF."""
+        query = (
+            select(PatchRow.r, PatchRow.phi)
+            .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+            .where(PhotoRow.public_id.in_(photo_ids), PatchRow.epoch == PhotoRow.epoch)
+            .where(PatchRow.state == "done")
+        )
+        return [FieldPosition(r, phi) for r, phi in session.execute(query.order_by(PatchRow.id))]
+
+    @reads
+    def windows(self, session: Session, photo_id: str) -> list[PatchRow]:
+        """Return the patches of a photo, followed by the windows that were rejected before estimation."""
+        rows = list(session.scalars(_patches_of(photo_id).order_by(PatchRow.idx)))
+        return rows + _unpacked(
+            session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id))
+        )
+
+    @reads
+    def cells(self, session: Session, photo_id: str, epoch: int) -> list[int]:
+        """Return the numbers of the cells that still have patches to estimate."""
+        query = _patches_of(photo_id, epoch).where(PatchRow.state.in_(OPEN))
+        cells = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
+        return sorted(cell for cell in cells if cell is not None)
+
+    @writes
+    def begin_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
+        """Take up the open patches of one cell; empty if there are none or the photo needs them no more.
+
+        The attempt is counted before it is made.
+        """
+        query = _patches_of(photo_id, epoch).where(
+            PhotoRow.epoch == epoch,
+            PhotoRow.state == "estimating",
+            PatchRow.cell == cell,
+            PatchRow.state.in_(OPEN),
+        )
+        rows = list(session.scalars(query.order_by(PatchRow.idx)))
+        for row in rows:
+            row.state = "running"
+            row.attempts += 1
+        return rows
+
+    @writes
+    def add_samples(self, session: Session, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
+        """Store the samples of some patches and mark these done; return how many samples were new.
+
+        Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated
+        call stores nothing twice: patch and channel are a unique key.
+        """
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return 0
+        of_numbers = select(PatchRow).where(
+            PatchRow.photo_id == photo.id,
+            PatchRow.epoch == epoch,
+            PatchRow.idx.in_({sample.idx for sample in samples}),
+        )
+        patches = {patch.idx: patch for patch in session.scalars(of_numbers)}
+        rows = [
+            columns_of(new.sample, photo, patches[new.idx], new.diagnostics)
+            for new in samples
+            if new.idx in patches
+        ]
+        stored = insert_new(session, SampleRow, rows)
+        for patch in patches.values():
+            patch.state, patch.finished_at = "done", patch.finished_at or now()
+        session.flush()
+        recount_patches(session, photo)
+        return stored
+
+    @writes
+    def fail_patches(
+        self,
+        session: Session,
+        photo_id: str,
+        epoch: int,
+        reason: str,
+        *,
+        indices: Sequence[int] | None = None,
+        cell: int | None = None,
+        rejected: bool = False,
+    ) -> None:
+        """Mark patches, by their numbers or open ones of a cell, as useless: `rejected` for their quality."""
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return
+        which = [PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.state != "done"]
+        if indices is not None:
+            which.append(PatchRow.idx.in_(indices))
+        if cell is not None:
+            which += [PatchRow.cell == cell, PatchRow.state.in_(OPEN)]
+        state = "rejected" if rejected else "failed"
+        session.execute(
+            update(PatchRow).where(*which).values(state=state, reason=reason[:60], finished_at=now())
+        )
+        recount_patches(session, photo)
+
+
+def _patches_of(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
+    return (
+        select(PatchRow)
+        .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+        .where(PhotoRow.public_id == photo_id, PatchRow.epoch == (epoch or PhotoRow.epoch))
+    )
+
+
+def _selecting(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
+    """Return a photo whose patches may change, locked: on PostgreSQL a cancel waits, and the other way."""
+    return session.scalar(
+        select(PhotoRow)
+        .where(
+            PhotoRow.public_id == photo_id,
+            PhotoRow.epoch == epoch,
+            PhotoRow.state.in_(("selecting", "estimating")),
+            PhotoRow.deleted_at.is_(None),
+        )
+        .with_for_update()
+    )
+
+
+def recount_patches(session: Session, photo: PhotoRow) -> int:
+    """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
+    rows = session.execute(
+        select(PatchRow.state, func.count())
+        .where(PatchRow.photo_id == photo.id, PatchRow.epoch == photo.epoch)
+        .group_by(PatchRow.state)
+    )
+    counts = {row[0]: row[1] for row in rows}
+    rejected = counts.get("rejected", 0)
+    photo.patches_rejected = rejected + photo.windows_rejected
+    photo.patches_done = counts.get("done", 0) + counts.get("failed", 0)
+    photo.patches_total = sum(counts.values()) - rejected
+    return photo.patches_total
+
+
+def _packed(rejected: Sequence[NewPatch]) -> dict[str, Any]:
+    """Return windows as one value that JSON can hold; each reason is stored once."""
+    reasons = sorted({patch.rejected or "" for patch in rejected})
+    numbers = {reason: number for number, reason in enumerate(reasons)}
+    listed = [
+        [
+            *(patch.idx, patch.row, patch.col, patch.size),
+            *(round(patch.r, DIGITS), round(patch.phi, DIGITS), numbers[patch.rejected or ""]),
+        ]
+        for patch in rejected
+    ]
+    return {"reasons": reasons, "windows": listed}
+
+
+def _unpacked(stored: dict[str, Any] | None) -> list[PatchRow]:
+    """Return the windows of `_packed` as rows that belong to no table."""
+    if stored is None:
+        return []
+    return [
+        PatchRow(
+            idx=idx,
+            row=row,
+            col=col,
+            size=size,
+            r=r,
+            phi=phi,
+            state="rejected",
+            reason=stored["reasons"][reason],
+        )
+        for idx, row, col, size, r, phi, reason in stored["windows"]
+    ]

@@ -29,7 +29,7 @@ Examples:
 
     lensmodel keys list
 
-Exit status: 0 done, 1 it could not be, 2 called wrongly.""",
+Exit status: 0 done, 1 it could not be, 2 wrong usage.""",
     no_args_is_help=True,
 )
 
@@ -113,7 +113,7 @@ def create(
 
         lensmodel keys create --owner anna --scope read --expires 90d --label notebook
 
-    Exit status: 0 made, 1 it could not be, 2 called wrongly.
+    Exit status: 0 made, 1 it could not be, 2 wrong usage.
     """
     name = owner.strip()
     if not (0 < len(name) <= 100 and name.isprintable() and "|" not in name):
@@ -147,7 +147,7 @@ def listed(
 
         lensmodel keys list --owner anna --json
 
-    Exit status: 0 listed, 1 it could not be, 2 called wrongly.
+    Exit status: 0 listed, 1 it could not be, 2 wrong usage.
     """
     from app.store.owners import ANY_OWNER  # noqa: PLC0415 - as above
 
@@ -204,7 +204,7 @@ def rotate(
 
         lensmodel keys rotate abcd2345 --keep 1h
 
-    Exit status: 0 made, 1 there is no such valid key, 2 called wrongly.
+    Exit status: 0 made, 1 there is no such valid key, 2 wrong usage.
     """
     with _opened(data) as store:
         new_key = store.rotate_key(_prefix(prefix), keep=_span(keep))
@@ -221,7 +221,7 @@ def revoke(prefix: Prefix, data: Data = None) -> None:
 
         lensmodel keys revoke abcd2345
 
-    Exit status: 0 ended, 1 there is no such key, 2 called wrongly.
+    Exit status: 0 ended, 1 there is no such key, 2 wrong usage.
     """
     with _opened(data) as store:
         if not store.revoke_key(_prefix(prefix)):

@@ -59,7 +59,7 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
 
         lensmodel serve --port 9000 --data ~/lenses
 
-    Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 it could not run, 2 called wrongly.
+    Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 it could not run, 2 wrong usage.
     """
     settings = settings_from(data, host, port)
     typer.echo("lensmodel is starting ...", err=True)

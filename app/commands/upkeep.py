@@ -40,7 +40,7 @@ def doctor(
 
         lensmodel doctor --repair
 
-    Exit status: 0 all is well or mended, 1 something is not, 2 called wrongly.
+    Exit status: 0 all is well or mended, 1 something is not, 2 wrong usage.
     """
     from dataclasses import asdict  # noqa: PLC0415 - only these commands need the service
 
@@ -85,7 +85,7 @@ def backup(
 
         lensmodel backup my-backup --data lensmodel-data --json
 
-    Exit status: 0 there is a new backup, 1 there is none, 2 called wrongly.
+    Exit status: 0 there is a new backup, 1 there is none, 2 wrong usage.
     """
     from dataclasses import asdict  # noqa: PLC0415 - only these commands need the service
 

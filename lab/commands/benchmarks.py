@@ -60,7 +60,7 @@ bench = typer.Typer(
 
         lensmodel bench blind --help
 
-    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """,
     invoke_without_command=True,
 )
@@ -126,7 +126,7 @@ def blind(
 
         lensmodel bench blind --photos sharp --scenes 80 --half all --cases 200
 
-    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
     from lab.blind.benchmark import (  # noqa: PLC0415 - same
         BlindBenchmark,
@@ -193,7 +193,7 @@ def model(
 
         lensmodel bench model --psf-field stars.npz --json model.json
 
-    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
@@ -268,7 +268,7 @@ def correct(
 
         lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
 
-    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
     from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - see the top of the module
 

@@ -60,7 +60,7 @@ def gallery(
 
         lensmodel bench gallery --only simulated/snow --only simulated/sky -o two-pictures
 
-    Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
+    Exit status: 0 the page is written, 1 something failed, 2 wrong usage.
     """
     from lab.gallery import pictures, run  # noqa: PLC0415 - it needs half of SciPy
     from lab.gallery.page import text, write_page  # noqa: PLC0415 - same

@@ -78,7 +78,7 @@ def reproduce(
 
         lensmodel reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses
 
-    Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
+    Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(*(output / name for name in PAGE), force=force)

@@ -49,7 +49,7 @@ def demo(
 
         lensmodel demo --output demo-output
 
-    Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 called wrongly.
+    Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     with files.as_usage():

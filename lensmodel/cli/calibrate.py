@@ -73,7 +73,7 @@ def calibrate(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Learn the blur of one lens from photos, into a profile.
+    """Learn the blur of one lens from photos and write it to a profile.
 
     An existing profile is added to. Photos that it has seen are skipped, and it is saved after
     each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
@@ -88,7 +88,7 @@ def calibrate(
 
         lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
 
-    Exit status: 0 all photos counted, 1 some did not, 2 called wrongly.
+    Exit status: 0 all photos counted, 1 some did not, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     run(

@@ -66,7 +66,7 @@ def check(
 
         lensmodel check one.dng linear/one-corrected.dng --json
 
-    Exit status: 0 checked, whatever was found, 1 a file cannot be used, 2 called wrongly.
+    Exit status: 0 checked, whatever was found, 1 a file cannot be used, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     for path in (original, corrected):

@@ -199,7 +199,7 @@ def correct(
 
         lensmodel correct holiday --server http://127.0.0.1:8000 -o corrected
 
-    Exit status: 0 all photos are corrected, 1 some are not, 2 called wrongly.
+    Exit status: 0 all photos are corrected, 1 some are not, 2 wrong usage.
     """
     del help_all
     shown = Display.of(context, quiet=quiet, verbose=verbose)

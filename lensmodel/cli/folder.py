@@ -234,7 +234,7 @@ class _Folder:
             left: Counter[str] = Counter()
             gains: list[float] = []
             for shot in group.shots:
-                bars.update(task, description=f"correcting {shot.path.name}")
+                bars.update(task, description=f"2 of 2, correcting {shot.path.name}")
                 target = targets[shot.path]
                 share = partial(correction.show_share, bars, task, number)
                 result = self._correct_shot(shot, group, target, lens, share)
@@ -325,7 +325,7 @@ def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
 def _learning(bars: Progress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
     share = event.done / event.total if event.total else 0.0
     bars.update(
-        task, description=f"learning from {event.photo.name}: {event.stage}", completed=number + share
+        task, description=f"1 of 2, learning from {event.photo.name}: {event.stage}", completed=number + share
     )
 
 

@@ -34,7 +34,8 @@ class Commands(OnDemand):
     entries: ClassVar[Mapping[str, CommandEntry]] = {
         "correct": CommandEntry("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos."),
         "calibrate": CommandEntry(
-            "lensmodel.cli.calibrate:calibrate", "Learn the blur of one lens from photos, into a profile."
+            "lensmodel.cli.calibrate:calibrate",
+            "Learn the blur of one lens from photos and write it to a profile.",
         ),
         "report": CommandEntry(
             "lensmodel.cli.report:report",
@@ -42,7 +43,7 @@ class Commands(OnDemand):
         ),
         "measure": CommandEntry(
             "lensmodel.cli.measure:measure",
-            "Measure the blur of a lens from photos made for the purpose, into a profile.",
+            "Measure the blur of a lens from photos made for the purpose.",
         ),
         "check": CommandEntry(
             "lensmodel.cli.check:check",
@@ -114,7 +115,7 @@ app = typer.Typer(
     help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
     epilog="""Start with: lensmodel correct FOLDER --lens auto
 
-Exit status: 0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C, 143 by SIGTERM.""",
+Exit status: 0 done, 1 something failed, 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM.""",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,

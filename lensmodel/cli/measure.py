@@ -71,7 +71,7 @@ def measure(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Measure the blur of a lens from photos made for the purpose, into a profile.
+    """Measure the blur of a lens from photos made for the purpose.
 
     An existing profile is added to: measured samples stand beside the blind ones and count for more.
 
@@ -92,7 +92,7 @@ def measure(
 
         lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
 
-    Exit status: 0 all photos were used, 1 some were not, 2 called wrongly.
+    Exit status: 0 all photos were used, 1 some were not, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if kind not in KINDS:
@@ -229,7 +229,7 @@ def target(
 
         lensmodel target target.png --paper a4 --detail 2800
 
-    Exit status: 0 written, 1 failed, 2 called wrongly.
+    Exit status: 0 written, 1 failed, 2 wrong usage.
     """
     from lensmodel.measured import DETAILS, TargetPage, print_target  # noqa: PLC0415 - see `_run`
 

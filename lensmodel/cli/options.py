@@ -90,8 +90,8 @@ Profile = Annotated[
     ),
 ]
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
-Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
-ANY_LENS = typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
+Aperture = Annotated[float | None, aperture_option("f-number, for photos that do not record their own.")]
+ANY_LENS = typer.Option("--any-lens", help="Also accept photos that seem to be of a different lens.")
 AnyLens = Annotated[bool, ANY_LENS]
 Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
 RADIUS = typer.Option(
@@ -111,14 +111,19 @@ WORKERS = typer.Option(
     help="How many cores to use, as processes or threads. Default: all.",
 )
 Workers = Annotated[int | None, WORKERS]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
-JSON = typer.Option("--json", help="Print the result as JSON, and nothing else.")
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+JSON = typer.Option("--json", help="Print the result as JSON and nothing else.")
 Json = Annotated[bool, JSON]
-QUIET = typer.Option("--quiet", "-q", help="No progress and no notes, only errors.")
+QUIET = typer.Option("--quiet", "-q", help="Only errors: no progress and no notes.")
 Quiet = Annotated[bool, QUIET]
 Verbose = Annotated[
     int,
     typer.Option(
-        "--verbose", "-v", count=True, metavar="", help="More output; twice: everything.", show_default=False
+        "--verbose",
+        "-v",
+        count=True,
+        metavar="",
+        help="Say more; given twice, everything.",
+        show_default=False,
     ),
 ]

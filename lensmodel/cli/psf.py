@@ -70,7 +70,7 @@ def psf(
 
         lensmodel psf my-24mm.lensprofile --json
 
-    Exit status: 0 answered, 1 the profile cannot be used, 2 called wrongly.
+    Exit status: 0 answered, 1 the profile cannot be used, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     run(

@@ -99,7 +99,7 @@ def report(
 
         lensmodel report my-24mm.lensprofile --json
 
-    Exit status: 0 reported, 1 the profile cannot be used, 2 called wrongly.
+    Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
@@ -224,7 +224,7 @@ def export_psfs(
 
         lensmodel export my-24mm.lensprofile --aperture 2 -o mtf.csv
 
-    Exit status: 0 written, 1 the profile cannot be used, 2 called wrongly.
+    Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     written = _format(output, file_format)

@@ -4,7 +4,7 @@
 import { ask, byId, send } from "./common.js";
 
 const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
-const PAUSE_MS = 500;
+const PAUSE_MS = 250;
 const SOON = [800, 600]; // pixels of what is seen first: about a second of work
 const WORKING = "Working out what a correction does here …";
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {

@@ -26,7 +26,7 @@ from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.database import Database, new_id
 from app.store.migrate import downgrade, upgrade
 from app.store.owners import ANY_OWNER
-from app.store.tables import PROFILE_FILE, PhotoRow
+from app.store.tables import PROFILE_FILE, CorrectionRow, PhotoRow
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
@@ -118,6 +118,10 @@ class Steps:
         self.estimate(photo, tuple(range(patches)), width=width)
         assert self.store.photos.finish(photo.public_id, photo.epoch) is not None
         return self.fresh(photo)
+
+    def correct(self, photo: PhotoRow, **params: Any) -> CorrectionRow:
+        assert photo.lens is not None
+        return self.store.jobs.correct(photo, photo.lens, 1, params)[0]
 
     def fresh(self, photo: PhotoRow) -> PhotoRow:
         found = self.store.photos.get(photo.public_id, ANY_OWNER)

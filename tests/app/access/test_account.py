@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select, update
 from starlette.testclient import TestClient
+from uploads import receive
 
 from app.blobs.account_data import erase
 from app.store import Store
@@ -144,18 +145,7 @@ def test_an_erasure_that_was_killed_is_carried_through_by_a_worker(
 
 def test_an_upload_that_outlasts_its_owner_makes_no_new_one(store: Store) -> None:
     with pytest.raises(Exception, match="erased"):
-        store.photos.receive(
-            "anna",
-            public_id="a1",
-            sha256="0" * 64,
-            filename="a.jpg",
-            kind="jpeg",
-            byte_size=1,
-            blob_key="photos/a1/original",
-            calibrate=True,
-            given={},
-            may_be_new=False,
-        )
+        receive(store, "a1", owner="anna", may_be_new=False)
     assert count(store, OwnerRow) == 0
 
 
@@ -193,9 +183,7 @@ def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Any) -> Non
     counted, running, corrected, stored = steps.counted(), steps.receive(), steps.counted(), steps.receive()
     steps.inspect(running)
     store.photos.set_state(stored.public_id, ("received",), "stored")
-    lens = corrected.lens
-    assert lens is not None
-    row, _ = store.jobs.correct(corrected, lens, 1, {"method": "fast"})
+    row = steps.correct(corrected, method="fast")
     for photo in (counted, corrected, stored):
         ended(store, photo, timedelta(hours=2))
 

@@ -39,6 +39,7 @@ sys.path.insert(0, str(HERE))
 from deadline import stretched  # noqa: E402 - of the tests of the service
 from servers import Postgres, moto, postgres  # noqa: E402
 from small_disk import kept_full, small_disk  # noqa: E402
+from uploads import receive  # noqa: E402
 
 from app.blobs.storage import Storage  # noqa: E402
 from app.errors import BusyError  # noqa: E402
@@ -247,16 +248,8 @@ def send(
     store.photos.expect(f"photos/{public_id}/", within=within)
     storage.put(f"photos/{public_id}/original", PHOTO)
     time.sleep(pause_s)
-    store.photos.receive(
-        OWNERS[number % len(OWNERS)],
-        public_id=public_id,
-        sha256=f"{number:064x}",
-        filename="p.dng",
-        kind="dng",
-        byte_size=len(PHOTO),
-        blob_key=f"photos/{public_id}/original",
-        calibrate=True,
-        given={},
+    receive(
+        store, public_id, owner=OWNERS[number % len(OWNERS)], sha256=f"{number:064x}", byte_size=len(PHOTO)
     )
 
 

@@ -24,6 +24,7 @@ from obstore import exceptions as stored
 from servers import postgres
 from sqlalchemy import exc, func, select
 from starlette.testclient import TestClient
+from uploads import receive
 
 from app.blobs.storage import Storage
 from app.jobs.worker import Worker
@@ -192,10 +193,8 @@ def failed_photo(store: Store, steps: Any, code: str = "outage") -> PhotoRow:
 
 def failed_correction(store: Store, steps: Any, strength: float = 1.0) -> str:
     photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
     params = {"method": "fast", "strength": strength, "output": {"format": "png8"}, "roi": None}
-    correction, _ = store.jobs.correct(photo, lens, lens.version, params)
+    correction = steps.correct(photo, **params)
     assert store.jobs.start(correction.public_id)
     assert store.jobs.fail(correction.public_id, "outage", "for a test")
     return correction.public_id
@@ -285,17 +284,7 @@ def send(store: Store, storage: Storage, count: int, first: int = 0) -> list[str
         public_id = new_id()
         store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
         storage.put(f"photos/{public_id}/original", b"a photo")
-        store.photos.receive(
-            "local",
-            public_id=public_id,
-            sha256=f"{number:064x}",
-            filename="p.dng",
-            kind="dng",
-            byte_size=7,
-            blob_key=f"photos/{public_id}/original",
-            calibrate=True,
-            given={},
-        )
+        receive(store, public_id, sha256=f"{number:064x}")
         ids.append(public_id)
     return ids
 

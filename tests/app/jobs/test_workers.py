@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from deadline import Deadline, stretched
 from sqlalchemy import func, select, update
+from uploads import receive
 
 from app.blobs.storage import Storage
 from app.jobs.worker import Worker
@@ -272,17 +273,7 @@ def test_an_upload_that_ends_while_garbage_is_cleared_keeps_its_file(
     listed = store.jobs.garbage()
 
     def receive_meanwhile() -> list[str]:
-        store.photos.receive(
-            "local",
-            public_id="slow",
-            sha256="slow",
-            filename="p.dng",
-            kind="dng",
-            byte_size=7,
-            blob_key=f"{prefix}original",
-            calibrate=True,
-            given={},
-        )
+        receive(store, "slow")
         return listed
 
     monkeypatch.setattr(worker._store.jobs, "garbage", receive_meanwhile)

@@ -427,10 +427,7 @@ def test_events_send_each_state_until_the_end(
 
 def test_jobs_of_photos_and_corrections_share_a_list(client: TestClient, steps: Steps, store: Store) -> None:
     photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
-    params = {"method": "standard", "strength": 1.0, "output": {}, "roi": None}
-    store.jobs.correct(photo, lens, 1, params)
+    steps.correct(photo, method="standard", strength=1.0, output={}, roi=None)
 
     first = get(client, "/v1/jobs?limit=1")
     second = get(client, first["next"])

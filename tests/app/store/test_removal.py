@@ -134,14 +134,12 @@ def test_corrections_of_a_deleted_lens_that_are_finished_stay(
     client: TestClient, store: Store, steps: Any
 ) -> None:
     photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
     common = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
-    finished, _ = store.jobs.correct(photo, lens, 1, common)
+    finished = steps.correct(photo, **common)
     store.jobs.set_state(finished.public_id, ("queued",), "succeeded")
-    waiting, _ = store.jobs.correct(photo, lens, 1, {**common, "strength": 0.5})
+    waiting = steps.correct(photo, **{**common, "strength": 0.5})
 
-    client.delete(f"/v1/lenses/{lens.public_id}")
+    client.delete(f"/v1/lenses/{steps.lens_id(photo)}")
 
     states = [client.get(f"/v1/corrections/{row.public_id}").json()["state"] for row in (finished, waiting)]
     assert states == ["succeeded", "cancelled"]

@@ -14,6 +14,7 @@ import pytest
 from servers import postgres
 from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError
+from uploads import receive
 
 from app.errors import BusyError
 from app.runtime.settings import Settings, table
@@ -203,17 +204,7 @@ def test_a_failed_photo_starts_anew_when_it_is_sent_again(store: Store, steps: S
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "flat")
 
-    again = store.photos.receive(
-        OWNER,
-        public_id="other",
-        sha256=photo.sha256,
-        filename="x",
-        kind="dng",
-        byte_size=1,
-        blob_key="y",
-        calibrate=True,
-        given={},
-    )
+    again = receive(store, "other", sha256=photo.sha256)
 
     assert again.fresh
     assert (again.photo.public_id, again.photo.epoch, again.photo.state) == (photo.public_id, 2, "received")
@@ -385,9 +376,7 @@ def test_the_same_correction_is_made_once_and_a_failed_one_again(store: Store, s
 
 def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
-    row, _ = store.jobs.correct(photo, lens, 1, {})
+    row = steps.correct(photo)
     run = store.jobs.start(row.public_id)
     assert run is not None
     store.jobs.progress(run, 1, 2)
@@ -609,40 +598,24 @@ def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: St
 def test_an_upload_has_all_its_time_and_either_keeps_its_file_or_is_refused(
     store: Store, steps: Steps
 ) -> None:
-    def receive(public_id: str) -> Any:
-        return store.photos.receive(
-            OWNER,
-            public_id=public_id,
-            sha256=public_id,
-            filename="p.dng",
-            kind="dng",
-            byte_size=1,
-            blob_key=f"photos/{public_id}/original",
-            calibrate=True,
-            given={},
-        )
-
     hour, late = timedelta(hours=1), datetime.now(UTC) + timedelta(hours=3)
     for public_id in ("early", "late"):
         store.photos.expect(f"photos/{public_id}/", within=hour)
     assert store.jobs.garbage(at=datetime.now(UTC) + hour) == []
     assert store.jobs.garbage(at=late) == ["photos/early/", "photos/late/"]
 
-    receive("early")
+    receive(store, "early")
     assert not store.jobs.claim_garbage("photos/early/", at=late)
     assert store.jobs.claim_garbage("photos/late/", at=late)
     with pytest.raises(BusyError, match="too long"):
-        receive("late")
+        receive(store, "late")
 
     assert store.jobs.garbage(at=late) == ["photos/late/"]  # still, until its blobs are deleted
 
 
 def test_what_is_written_after_a_deletion_is_deleted_later(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
-    one, _ = store.jobs.correct(photo, lens, 1, {"method": "fast"})
-    two, _ = store.jobs.correct(photo, lens, 1, {"method": "paper"})
+    one, two = steps.correct(photo, method="fast"), steps.correct(photo, method="paper")
     prefixes = [f"corrections/{row.public_id}/" for row in (one, two)]
 
     assert store.jobs.delete(one.public_id, OWNER) == prefixes[0]

@@ -207,11 +207,14 @@ def _within(
     if job.unguarded:
         return RestoredCell(job.weakened(tile.cell_pixels, solution.planes[tile.inner]), expected, None)
     restored, audit = _checked(job, tile, bounds, blurs, solution)
-    if expected.changed(tile.cell_pixels, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:
+    if not expected.worth(tile.cell_pixels, restored) and bounds.denoise == 0.0:
         # so little passed limit and audit that the rest would smooth the photo, not sharpen it
         return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), audit, left=True)
-    restored = job.weakened(tile.cell_pixels, restored)
-    return RestoredCell(restored, expected.changed(tile.cell_pixels, restored), audit)
+    expected = expected.changed(
+        tile.cell_pixels, solution.planes[tile.inner], restored, mosaic=job.cfa is not None
+    )
+    expected = expected.weakened(job.strength * (2.0 - job.strength))
+    return RestoredCell(job.weakened(tile.cell_pixels, restored), expected, audit)
 
 
 def _checked(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Final
@@ -46,8 +46,8 @@ _GRID: Final = GRID
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 _MOST: Final = 0.7
-"""Largest share of the error that a change is credited with removing (chosen: no correction takes all of it
-away, and a change that is larger than the error did something else)."""
+"""Largest share of a mosaic's error that a change is credited with removing (chosen: no correction takes all
+of it away, and a change that is larger than the error did something else)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +64,30 @@ class CellForecast:
         """Expected gain in decibels."""
         return _decibels(self.before, self.after)
 
-    def changed(self, photo: Planes, result: Planes) -> CellForecast:
-        """The forecast of a cell that became `result` after bounds and audit.
+    def changed(self, photo: Planes, solution: Planes, result: Planes, *, mosaic: bool) -> CellForecast:
+        """The forecast of a cell whose `solution` became `result` after limit and audit.
 
         The error of a posterior mean is orthogonal to it, so the error falls by the mean square of the
-        change; by no more than forecast, since what a change adds beyond that is not the scene.
+        change: by as large a share of what is forecast as is left of the solution's. A mosaic determines less
+        than full planes do, for which the forecast is made: there the change itself counts.
         """
-        change = _squared_distance(photo, result) / photo[0].size * _GRID[0] * _GRID[1]
-        after = self.before - min(change, _MOST * self.before)
-        return CellForecast(self.zone, self.before, max(after, self.after), self.psf_error)
+        if mosaic:
+            fall = min(self._change(photo, result) / self.before, _MOST)
+            return replace(self, after=(1.0 - fall) * self.before)
+        made = _squared_distance(photo, solution)
+        return self.weakened(min(_squared_distance(photo, result) / made, 1.0) if made > 0.0 else 0.0)
+
+    def worth(self, photo: Planes, result: Planes) -> bool:
+        """Whether the change of a cell is so large that the error may have fallen by a gain that is seen."""
+        return self._change(photo, result) >= (1.0 - 10.0 ** (-0.1 * WORTH_DB)) * self.before
+
+    def _change(self, photo: Planes, result: Planes) -> float:
+        """Mean square of a change, in the unit of the errors."""
+        return _squared_distance(photo, result) / photo[0].size * _GRID[0] * _GRID[1]
+
+    def weakened(self, share: float) -> CellForecast:
+        """The forecast where only this share of the error that was to fall does."""
+        return replace(self, after=self.before - share * (self.before - self.after))
 
 
 @dataclass(frozen=True, slots=True)

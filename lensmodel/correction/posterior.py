@@ -56,23 +56,6 @@ class PsfPosterior:
         scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
         return cls(kernel, (scale * shape).astype(np.float32), error)
 
-    @classmethod
-    def of_rings(cls, kernel: Kernel, error: float, rings: NDArray[np.floating]) -> PsfPosterior:
-        """A kernel whose relative L2 error is known, and that of its transfer function by frequency.
-
-        Parameters
-        ----------
-        rings : ndarray, shape (n,)
-            Root mean square of |H - E[H]| in n rings from 0 to half a cycle per pixel. Between their middles
-            it is interpolated, and at the frequency 0, where all kernels are 1, it is 0.
-        """
-        if kernel.shape[0] > WIDEST:
-            return cls.of_error(kernel, error)
-        middles = (np.arange(len(rings)) + 0.5) * 0.5 / len(rings)
-        at = np.hypot(np.fft.fftfreq(GRID[0])[:, None], np.fft.rfftfreq(GRID[1])[None, :])
-        told = np.interp(at, np.concatenate([[0.0], middles]), np.concatenate([[0.0], np.square(rings)]))
-        return cls(kernel, told.astype(np.float32), error)
-
 
 @runtime_checkable
 class PosteriorField(Protocol):

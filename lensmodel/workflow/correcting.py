@@ -101,9 +101,7 @@ class _Posteriors:
     def posterior_at(self, position: FieldPosition, channel: Channel) -> correction.PsfPosterior:
         answer = self.field.answer_at(position, channel, correction.KERNEL_SIZE)
         kernel = correction.crop_to_support(answer.kernel)
-        if answer.ring_error is None or answer.answered_by != "network":
-            return correction.PsfPosterior.of_error(kernel, answer.predicted_error)
-        return correction.PsfPosterior.of_rings(kernel, answer.predicted_error, answer.ring_error)
+        return correction.PsfPosterior.of_error(kernel, answer.predicted_error)
 
 
 def _method_of(

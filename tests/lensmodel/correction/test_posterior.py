@@ -35,14 +35,3 @@ def test_variance_of_a_known_error_has_its_size_and_spares_what_has_no_blur(erro
 def test_impossible_errors_are_refused(bad: float) -> None:
     with pytest.raises(InvalidInputError, match="psf_error"):
         PsfPosterior.of_error(WIDE, bad)
-
-
-def test_variance_of_rings_is_theirs_at_their_middles_and_none_where_all_kernels_are_one() -> None:
-    rings = np.linspace(0.02, 0.3, 8)
-    posterior = PsfPosterior.of_rings(WIDE, 0.4, rings)
-
-    middles = np.arange(2, 32, 4)  # of 64: (k + 1/2) / 16 cycles/pixel
-    np.testing.assert_allclose(posterior.variance[0, middles], rings**2, rtol=1e-5)
-    np.testing.assert_allclose(posterior.variance[middles, 0], rings**2, rtol=1e-5)
-    assert posterior.variance[0, 0] == 0.0
-    assert posterior.error == 0.4

@@ -28,14 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.cases import list_photos, photo_half
-from lab.images import gains
+from lab.images import gains, to_srgb
 from lab.traced import GridLens
 from lensmodel import photo
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, distance
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
-from lensmodel.quality import to_srgb
 from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, load_scene, photograph, write_photo
 from lensmodel.workflow import correcting, sampling
 

@@ -18,6 +18,7 @@ from skimage import restoration
 
 from lab.compiled_transforms import bare_transforms
 from lab.correction.methods import compared
+from lab.images import to_srgb
 from lab.peers import Peer
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
@@ -26,7 +27,6 @@ from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel, Pla
 from lensmodel.correction import Deconvolver, Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
-from lensmodel.quality.images import to_srgb
 
 _TILE = 256  # pixels: a tile of the engine
 _KERNEL = 25  # pixels: of a blur of 2 px (chosen)

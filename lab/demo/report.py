@@ -15,13 +15,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from app.client import Client
 from lab.demo.camera import CAMERA, LENS, SETTINGS, DemoShot
+from lab.images import Picture, fidelity
 from lensmodel import quality
 from lensmodel.cli.console import mtf50_words
 from lensmodel.core.files import write_atomically
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import distance
 from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
-from lensmodel.quality.images import Picture
 from lensmodel.simulate import edge_chart
 
 _JUDGED: Final[tuple[Zone, ...]] = ("center", "corner")
@@ -138,7 +138,7 @@ def psf_error(client: Client, lens_id: str, version: int) -> dict[Zone, float]:
 def psnr(planes: Planes, shot: DemoShot) -> dict[Zone, float]:
     """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone, registered block by block."""
     gains = np.asarray(CAMERA.white_balance, dtype=np.float32)[:, None, None]
-    return quality.registered_zone_psnr(planes * gains, shot.sharp * gains, CAMERA.frame, srgb=True)
+    return fidelity(planes * gains, shot.sharp * gains, CAMERA.frame)["psnr"]
 
 
 def sharpness(planes: Planes) -> dict[Zone, Sharpness]:

@@ -11,8 +11,8 @@ from pathlib import Path
 from app.client import Client, JobEndedError
 from lab.demo import camera, report
 from lab.demo.service import Say, corrected, follow, own_service, planes_of
+from lab.images import as_shown
 from lensmodel.photo import develop
-from lensmodel.quality.images import as_shown
 from lensmodel.simulate import demo_data_path
 
 REAL_RAW = "canon_kissx4_colorchart.dng"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.gallery.rendering import Rendered
-from lensmodel.quality.images import Picture as Shown
-from lensmodel.quality.images import crop_boxes
+from lab.images import Picture as Shown
+from lab.images import crop_boxes
 
 SIDE: Final = 96
 ZOOM: Final = 3

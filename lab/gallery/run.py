@@ -23,13 +23,13 @@ from lab.code_version import version_of
 from lab.gallery import crops, measure
 from lab.gallery.pictures import FRAMES, Picture, take
 from lab.gallery.rendering import Rendered, read_rendered, rendered
+from lab.images import BLOCK
 from lab.store import Unit, stored
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import develop
-from lensmodel.quality.images import BLOCK
 from lensmodel.workflow import sampling
 from lensmodel.workflow.lens import Lens
 

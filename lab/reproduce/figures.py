@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from lab.images import Picture, as_shown, crop_boxes
 from lab.reproduce import fields
 from lab.reproduce.cases import Case, Reproduction
 from lab.reproduce.frames import take
@@ -21,7 +22,6 @@ from lensmodel.core.types import FieldPosition, Kernel, Plane
 from lensmodel.model import LensModel
 from lensmodel.patches import r_map
 from lensmodel.photo import develop
-from lensmodel.quality.images import Picture, as_shown, crop_boxes
 from lensmodel.workflow import sampling
 
 # Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.

@@ -31,6 +31,7 @@ from PIL import Image
 
 from lab.cases import photo_half
 from lab.code_version import version_of
+from lab.images import as_shown
 from lab.reproduce import figures, measure, programs
 from lab.reproduce.cases import Case, Reproduction, fingerprint, key_of, photos_of
 from lab.reproduce.fields import PointField, Remembered, general_field, general_words, measured_field
@@ -42,7 +43,6 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.quality.images import as_shown
 from lensmodel.workflow.sampling import PRESETS, Preset
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)

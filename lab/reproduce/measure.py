@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from lab.images import fidelity
+from lab.images import BLOCK, BORDER, fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
 from lab.reproduce.frames import Shots, guard_of
@@ -18,7 +18,6 @@ from lensmodel import quality
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, distance
 from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
-from lensmodel.quality.images import BLOCK, BORDER
 from lensmodel.simulate import edge_chart
 
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold

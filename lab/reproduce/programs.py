@@ -15,10 +15,9 @@ import numpy as np
 
 from lab import peers
 from lab.code_version import version_of
-from lab.images import psnr
+from lab.images import psnr, to_srgb
 from lensmodel.core.types import Planes
 from lensmodel.photo.colour import srgb_to_linear
-from lensmodel.quality.images import to_srgb
 
 _NAMES: Final = ("G'MIC Richardson-Lucy", "RawTherapee capture sharpening")
 _DARK: Final = 1e-3  # light added to both sides of a ratio, full scale is 1 (chosen): dark places have none

@@ -1,25 +1,20 @@
-"""Sharpness and fidelity: slanted edges, MTF, PSNR by zone."""
+"""Sharpness: slanted edges and MTF."""
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, slanted_edge
 from lensmodel.quality.edge_finder import find_edges
-from lensmodel.quality.images import best_shift, registered_zone_psnr, shifted, to_srgb
 from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
 
 __all__ = [
     "EdgeMeasurement",
     "EdgeResponse",
     "ZoneSharpness",
-    "best_shift",
     "by_zone",
     "crossing",
     "find_edges",
     "measure_edges",
     "mtf50_from_kernel",
     "mtf_from_kernel",
-    "registered_zone_psnr",
-    "shifted",
     "slanted_edge",
     "tangential_sagittal_mtf50",
-    "to_srgb",
 ]

@@ -1,9 +1,8 @@
-"""Slanted edges, kernels and pictures against closed forms."""
+"""Slanted edges and kernels against closed forms."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,24 +11,18 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage, optimize, special
 
-from lab.images import psnr
-from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import CORNER_ZONE_R, Frame
+from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta, gaussian
 from lensmodel.core.types import LensSettings
 from lensmodel.quality import (
-    best_shift,
     by_zone,
     crossing,
     measure_edges,
     mtf50_from_kernel,
     mtf_from_kernel,
-    registered_zone_psnr,
-    shifted,
     slanted_edge,
     tangential_sagittal_mtf50,
-    to_srgb,
 )
 from lensmodel.simulate import (
     Aberrations,
@@ -264,58 +257,8 @@ def test_measuring_skips_boxes_without_an_edge_and_says_when_none_is_left(
     assert math.isnan(between.tangential_mtf50)
 
 
-def test_srgb_curve_has_its_known_values_and_clips() -> None:
-    np.testing.assert_allclose(
-        to_srgb(np.array([-1.0, 0.0, 0.0031308, 0.214041, 1.0, 2.0])), [0, 0, 0.04045, 0.5, 1, 1], atol=1e-4
-    )
-
-
-@cache
-def smooth_scene() -> NDArray[np.float64]:
-    scene = dead_leaves(120, 160, np.random.default_rng(1))
-    return np.stack([ndimage.gaussian_filter(p.astype(np.float64), 1.5) for p in scene])
-
-
-@pytest.mark.parametrize("shift", [(0.3, -0.7), (1.6, 0.0), (-0.05, 2.2)])
-def test_best_shift_undoes_a_shift(shift: tuple[float, float]) -> None:
-    scene = smooth_scene()
-    moved = shifted(scene, *shift)
-    found = best_shift(moved, scene)
-
-    np.testing.assert_allclose(found, (-shift[0], -shift[1]), atol=0.01)
-
-
-def test_shift_moves_towards_growing_rows_and_columns() -> None:
-    picture = np.zeros((40, 50))
-    picture[20, 25] = 1.0
-
-    assert np.unravel_index(shifted(picture, 3.0, -2.0).argmax(), picture.shape) == (23, 23)
-    np.testing.assert_array_equal(shifted(picture, 0.0, 0.0), picture)
-
-
-def test_best_shift_of_a_flat_picture_is_none() -> None:
-    assert best_shift(np.full((40, 40), 0.3), np.full((40, 40), 0.3)) == (0.0, 0.0)
-
-
 def test_delta_kernel_passes_everything() -> None:
     kernel = delta(15)
 
     np.testing.assert_allclose(mtf_from_kernel(kernel, 0.3, [0.0, 0.2, 0.5]), 1.0)
     assert mtf50_from_kernel(kernel, 0.3) == 1.0
-
-
-def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
-    rng = np.random.default_rng(0)
-    sharp = ndimage.gaussian_filter(rng.random((256, 384)), 1.0)
-    rows, cols = np.mgrid[0:256, 0:384].astype(float)
-    bent = ndimage.map_coordinates(sharp, [rows + 0.004 * (cols - 192), cols], order=3, mode="mirror")
-    soft = ndimage.gaussian_filter(sharp, 1.0)
-    frame = Frame(256, 384)
-
-    shift = best_shift(bent, sharp)
-    plain = psnr(shifted(bent, *shift), sharp, mask=frame.radius_map() > CORNER_ZONE_R)
-    registered = registered_zone_psnr(bent, sharp, frame)["corner"]
-    blurred = registered_zone_psnr(soft, sharp, frame)["corner"]
-
-    assert registered > plain + 6.0
-    assert blurred < registered - 3.0

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lab.images import Gains, gains
+from lab.images import Gains, gains, to_srgb
 from lab.traced import GridLens, read_grid
 from lensmodel import correction, photo, simulate
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.model import LensModel
-from lensmodel.quality import to_srgb
 from lensmodel.workflow import correcting, sampling
 
 pytestmark = pytest.mark.slow

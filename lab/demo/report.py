@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from app.client import Client
+from lab.charts import by_zone, measure_edges
 from lab.demo.camera import CAMERA, LENS, SETTINGS, DemoShot
 from lab.images import Picture, fidelity
-from lensmodel import quality
 from lensmodel.cli.console import mtf50_words
 from lensmodel.core.files import write_atomically
 from lensmodel.core.geometry import zone_of
@@ -144,8 +144,8 @@ def psnr(planes: Planes, shot: DemoShot) -> dict[Zone, float]:
 def sharpness(planes: Planes) -> dict[Zone, Sharpness]:
     """MTF50, maximum of the MTF and overshoot on the green edges of the chart, by zone."""
     boxes = [edge.box for edge in edge_chart(CAMERA.frame).edges]
-    by_zone = quality.by_zone(quality.measure_edges(planes[1], boxes))
-    return {zone: Sharpness(row.mtf50, row.mtf_max, row.overshoot) for zone, row in by_zone.items()}
+    found = by_zone(measure_edges(planes[1], boxes))
+    return {zone: Sharpness(row.mtf50, row.mtf_max, row.overshoot) for zone, row in found.items()}
 
 
 def draw_crops(rows: Mapping[str, Picture], path: Path, *, side: int = 180) -> None:

@@ -9,12 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from lab.charts import by_zone, measure_edges
 from lab.images import BLOCK, BORDER, fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
 from lab.reproduce.frames import Shots, guard_of
 from lab.reproduce.learners import Answer, Place, Roi
-from lensmodel import quality
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, distance
 from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
@@ -97,7 +97,7 @@ def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
     The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
     pixel, not a constant 1, whose MTF50 would lie at infinity.
     """
-    found = quality.by_zone(quality.measure_edges(chart[channel], _edge_boxes(case)))
+    found = by_zone(measure_edges(chart[channel], _edge_boxes(case)))
     return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
 
 

@@ -1,18 +1,13 @@
 """Sharpness: slanted edges and MTF."""
 
-from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, slanted_edge
 from lensmodel.quality.edge_finder import find_edges
 from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
 
 __all__ = [
-    "EdgeMeasurement",
     "EdgeResponse",
-    "ZoneSharpness",
-    "by_zone",
     "crossing",
     "find_edges",
-    "measure_edges",
     "mtf50_from_kernel",
     "mtf_from_kernel",
     "slanted_edge",

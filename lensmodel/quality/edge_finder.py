@@ -28,8 +28,7 @@ from scipy import ndimage
 
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import NoiseModel
-from lensmodel.quality.charts import Box
-from lensmodel.quality.edge import EdgeResponse, slanted_edge
+from lensmodel.quality.edge import Box, EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ import numpy as np
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Direction
 from lensmodel.photo import LinearPhoto
-from lensmodel.quality.charts import direction_of
+from lensmodel.quality.edge import direction_of
 from lensmodel.quality.edge_finder import FoundEdge
 from lensmodel.report.places import place_in_words
 

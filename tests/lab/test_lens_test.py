@@ -19,7 +19,7 @@ from lensmodel.core.types import LensSettings
 from lensmodel.measured.edges import SlantedEdges, chart_edges, squares_of
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality import find_edges, tangential_sagittal_mtf50
-from lensmodel.quality.charts import direction_of
+from lensmodel.quality.edge import direction_of
 from lensmodel.report.chart_edges import edge_pages, edges_csv
 from lensmodel.simulate import Aberrations, SimulatedCamera, SimulatedLens, photograph, write_photo
 

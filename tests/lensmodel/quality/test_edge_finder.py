@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.charts import by_zone, measure_edges
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import LensSettings, NoiseModel
-from lensmodel.quality import by_zone, find_edges, measure_edges
+from lensmodel.quality import find_edges
 from lensmodel.simulate import BlurOptions, blurred, demo_scene, draw_lens, edge_chart
 
 FRAME = Frame(900, 1200)

@@ -11,14 +11,13 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage, optimize, special
 
+from lab.charts import by_zone, measure_edges
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta, gaussian
 from lensmodel.core.types import LensSettings
 from lensmodel.quality import (
-    by_zone,
     crossing,
-    measure_edges,
     mtf50_from_kernel,
     mtf_from_kernel,
     slanted_edge,

@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +13,9 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.types import ZONES, Direction, FieldPosition, Zone
-from lensmodel.quality.edge import EdgeResponse, slanted_edge
+from lensmodel.quality.edge import Box, EdgeResponse, direction_of, slanted_edge
 
 logger = logging.getLogger(__name__)
-
-_ALONG: Final = math.cos(math.radians(10.0))
-"""Edges whose normal lies further from u and v belong to neither (chosen: of points three times as long as
-wide ten degrees take a tenth of the MTF50)."""
-Box = tuple[int, int, int, int]
-"""(row, col, height, width) in pixels of the frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +71,6 @@ def measure_edges(plane: NDArray[np.floating], boxes: Sequence[Box]) -> tuple[Ed
     if not measured:
         raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
     return tuple(measured)
-
-
-def direction_of(normal: float, place: FieldPosition) -> Direction:
-    """Say which contrast an edge shows; only within 10 degrees of u or v it is tangential or sagittal."""
-    turned = normal - place.phi
-    if abs(math.cos(turned)) >= _ALONG:
-        return "tangential"
-    return "sagittal" if abs(math.sin(turned)) >= _ALONG else "oblique"
 
 
 def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:

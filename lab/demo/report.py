@@ -151,7 +151,7 @@ def sharpness(planes: Planes) -> dict[Zone, Sharpness]:
 def draw_crops(rows: Mapping[str, Picture], path: Path, *, side: int = 180) -> None:
     """Write a PNG with one row of crops for each picture, two screen pixels for one of its own.
 
-    They are where the last picture has most detail: in each third of the width.
+    They are where the last picture has most detail.
     """
     pictures, large = list(rows.items()), 2 * side
     places = _detailed(pictures[-1][1], side)
@@ -170,16 +170,18 @@ def draw_crops(rows: Mapping[str, Picture], path: Path, *, side: int = 180) -> N
     sheet.save(path, optimize=True)
 
 
-def _detailed(picture: Picture, side: int) -> list[tuple[int, int]]:
-    """Top left corners of the windows with the steepest steps, one in each third of the width."""
+def _detailed(picture: Picture, side: int, count: int = 3) -> list[tuple[int, int]]:
+    """Top left corners of the windows with the steepest steps that do not overlap, from left to right."""
     grey = picture.mean(axis=2)
     steep = np.abs(np.diff(grey, axis=0))[:, :-1] + np.abs(np.diff(grey, axis=1))[:-1]
     sums = np.pad(steep.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-    width = grey.shape[1]
-    thirds = [inside[:, k * width // 3 : (k + 1) * width // 3 - side] for k in range(3)]
-    found = [np.unravel_index(third.argmax(), third.shape) for third in thirds]
-    return [(int(row), int(col) + k * width // 3) for k, (row, col) in enumerate(found)]
+    found = []
+    for _ in range(count):
+        row, col = (int(place) for place in np.unravel_index(inside.argmax(), inside.shape))
+        inside[max(row - side, 0) : row + side, max(col - side, 0) : col + side] = -1.0
+        found.append((row, col))
+    return sorted(found, key=lambda place: place[1])
 
 
 def draw_history(errors: Sequence[Mapping[Zone, float]], path: Path) -> None:

@@ -88,7 +88,7 @@ def block_means(
     _same_shape(image, reference)
     if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
         raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
-    radius = frame.radius_map()
+    radius = _radii(frame)
     found, wanted = (picture.reshape(-1, *picture.shape[-2:]) for picture in (image, reference))
 
     def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
@@ -127,6 +127,11 @@ def block_error(picture: NDArray[np.floating], truth: NDArray[np.float64]) -> ND
 def psnr_of(error: float) -> float:
     """PSNR in dB of a mean squared error, for a peak of 1."""
     return -10.0 * math.log10(max(error, 1e-30))
+
+
+def _radii(frame: Frame) -> NDArray[np.float64]:
+    """R of every pixel."""
+    return frame.polar(np.arange(1.0 * frame.height)[:, None], np.arange(1.0 * frame.width)[None, :])[0]
 
 
 def zone_masks(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
@@ -253,7 +258,7 @@ def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
     frame = Frame(*truth.shape[:2])
     if min(frame.height, frame.width) < BLOCK:
         return None
-    radius = frame.radius_map()
+    radius = _radii(frame)
     errors: dict[Zone, NDArray[np.float64]] = {zone: np.zeros(2) for zone in ZONES}
     found: list[tuple[float, tuple[int, int]]] = []
     for row, col in blocks(frame):

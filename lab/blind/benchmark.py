@@ -12,9 +12,7 @@ already has an ER of 2 to 4, so each case also tells whether the method beats do
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import logging
 import math
@@ -401,17 +399,6 @@ def markdown_table(report: BlindReport) -> str:
     return table(_HEADS, rows) + "\n"
 
 
-def csv_table(results: Sequence[CaseResult]) -> str:
-    """Return every case as CSV with a header line."""
-    out = io.StringIO()
-    names = [*CaseResult.__dataclass_fields__, "improved"]
-    writer = csv.DictWriter(out, names, lineterminator="\n")
-    writer.writeheader()
-    for result in results:
-        writer.writerow({**asdict(result), "improved": result.improved})
-    return out.getvalue()
-
-
 def cumulative(ratios: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Percent of ratios below each threshold."""
     return np.asarray(100.0 * (ratios[None, :] < at[:, None]).mean(axis=1))
@@ -436,11 +423,10 @@ def curve_figure(report: BlindReport, noise: float) -> Figure:
 
 
 def write_report(report: BlindReport, folder: Path) -> tuple[Path, ...]:
-    """Write blind.json, blind.csv, blind.md and one curve a noise level as SVG and PNG."""
+    """Write blind.json, blind.md and one curve a noise level as SVG and PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "blind.json": json.dumps(report.to_json(), indent=1) + "\n",
-        "blind.csv": csv_table(report.results),
         "blind.md": markdown_table(report),
     }
     written = []

@@ -29,7 +29,7 @@ NOISE: Final = "0.01,0.003"
 ESTIMATORS: Final = "default,michaeli-irani"
 BLIND_OUTPUT: Final = Path("bench-output")
 STANDARD_OUTPUT: Final = Path("-")
-FINISHED: Final = ("blind.json", "blind.csv", "blind.md")
+FINISHED: Final = ("blind.json", "blind.md")
 """What a finished report of `bench blind` consists of, beside its curves."""
 
 JsonFile = Annotated[

@@ -80,13 +80,6 @@ class Frame:
         right = np.asarray(cols, dtype=np.float64) - col_c
         return np.hypot(up, right) / self.half_diagonal, np.arctan2(up, right)
 
-    def radius_map(self) -> NDArray[np.float32]:
-        """Array `(height, width)` of r at every pixel, float32."""
-        row_c, col_c = self.center
-        up = (row_c - np.arange(self.height, dtype=np.float32))[:, None]
-        right = (np.arange(self.width, dtype=np.float32) - col_c)[None, :]
-        return np.asarray(np.hypot(up, right) / np.float32(self.half_diagonal), dtype=np.float32)
-
 
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5

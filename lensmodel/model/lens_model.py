@@ -208,11 +208,6 @@ class LensModel:
             return self._regression.kernels(near, positions, settings, size, pitch_um)
         return np.stack([self.query(place, settings, size, pitch_um=pitch_um).kernel for place in positions])
 
-    def kernel_of(self, sample: PsfSample) -> Kernel:
-        """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
-        size, pitch_um = sample.kernel.shape[0], sample.pixel_pitch_um
-        return np.asarray(self.kernels([sample.position], sample.settings, size, pitch_um=pitch_um)[0])
-
     def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
         """Return the PSF of every place and channel at these settings, for pixels of some size."""
         return ModelField(self, settings, pitch_um)

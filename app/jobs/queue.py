@@ -168,7 +168,7 @@ class DbosEngine:
     def take_over(self, executor_id: str) -> None:
         """Resume the running jobs of a dead worker in their queues. See `JobEngine`.
 
-        Interrupted, it can be done again. Two workers that do it at once may both start a job: the tables
+        Interrupted, it can be done again. Should two workers do it at once, a job may run twice: the tables
         count what it did once.
         """
         for row in _listed(status="PENDING", executor_id=executor_id, app_version=str(JOB_PROTOCOL)):

@@ -325,9 +325,10 @@ class Worker:
             self._take_over(dead)
 
     def _take_over(self, dead: str) -> None:
-        if dead != self.id:
+        if dead != self.id and self._store.jobs.forget(
+            dead
+        ):  # should this end here, `_reconcile` does the rest
             self._engine.take_over(dead)
-            self._store.jobs.forget(dead)
             shutil.rmtree(self._scratch / dead, ignore_errors=True)
             metrics.TAKEN_OVER.inc()
             log.info("took over the work of worker %s", dead)

@@ -400,9 +400,10 @@ class Jobs(Repository):
         session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(state="dead"))
 
     @writes
-    def forget(self, session: Session, worker_id: str) -> None:
-        """Remove a dead worker, once others have taken over all it had begun."""
-        session.execute(delete(WorkerRow).where(WorkerRow.id == worker_id, WorkerRow.state == "dead"))
+    def forget(self, session: Session, worker_id: str) -> bool:
+        """Remove a dead worker; True for the one who did it, and takes over all it had begun."""
+        dead = (WorkerRow.id == worker_id, WorkerRow.state == "dead")
+        return changed(session, delete(WorkerRow).where(*dead)) == 1
 
     # --- garbage ----------------------------------------------------------------------------------
 

@@ -126,11 +126,12 @@ def _operations(described: Mapping[str, Any]) -> list[tuple[str, list[Operation]
 
 def _operation(method: str, path: str, entry: Mapping[str, Any]) -> Operation:
     listed = entry.get("parameters", [])
+    first, _, rest = entry.get("description", "").partition("\n\n")
     return Operation(
         method=method.upper(),
         path=path,
-        summary=entry["summary"],
-        description=entry.get("description", ""),
+        summary=first or entry["summary"],
+        description=rest,
         parameters=[(p["name"], p["in"], _meaning(p)) for p in listed],
         body=list(entry.get("requestBody", {}).get("content", {})),
         answers=[f"{status} {answer['description']}" for status, answer in entry["responses"].items()],

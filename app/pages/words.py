@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -83,6 +84,11 @@ def lens_name(lens: LensOut) -> str:
 def f_stop(number: float) -> str:
     """Write an aperture as photographers do."""
     return f"f/{number:.3g}"
+
+
+def plain(sentence: str) -> str:
+    """Leave out the figures in brackets: they stand on the page for testers."""
+    return re.sub(r" \([^)]*\)", "", sentence)
 
 
 def photo_state(photo: PhotoOut) -> str:
@@ -389,6 +395,7 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         centring_words,
         event_words,
         sharpness,
+        plain,
         model_words,
         unit_name,
         photo_state,

@@ -26,6 +26,7 @@ from app.main import create_app
 from app.pages.batch import unused_name
 from app.pages.pictures import in_sensor, upright_point
 from app.pages.shown import grouped
+from app.pages.words import plain
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
@@ -468,6 +469,12 @@ def test_two_measured_versions_make_a_curve(client: TestClient, steps: Steps, st
         curves.append('alt="Error after each version"' in client.get(f"/lenses/{lens}/tests").text)
 
     assert curves == [False, True]
+
+
+def test_a_photographer_reads_no_figures_in_a_verdict() -> None:
+    assert plain("It is sharp (MTF50 .41), and its corner softer (T .2, S .3).") == (
+        "It is sharp, and its corner softer."
+    )
 
 
 def test_the_page_of_a_lens_says_which_model_it_has(client: TestClient, steps: Steps) -> None:

@@ -21,13 +21,13 @@ from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedErro
 from app.jobs.queue import JobEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.other_lens import REMEDY, Described, difference
+from app.presets import configured_preset
 from app.sandbox.outcome import TaskLimits
 from app.store import NewPatch, NewSample, Store
 from app.store.jobs import Job
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, PhotoRow
-from app.ways import configured_way
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.types import CHANNELS, FieldPosition
@@ -115,7 +115,7 @@ class PhotoWork:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
         settings = self._context.settings
-        way = configured_way(settings, photo.way)
+        way = configured_preset(settings, photo.way)
         developed = self._context.developed(photo, wanted)
         arguments = {
             "developed": str(developed),
@@ -150,8 +150,8 @@ class _Steps:
         self._developed = Path()
 
     @property
-    def _way(self) -> Preset:
-        return configured_way(self._context.settings, self._photo.way)
+    def _preset(self) -> Preset:
+        return configured_preset(self._context.settings, self._photo.way)
 
     def _wanted(self) -> bool:
         return self._store.photos.is_live(self._photo.public_id, self._photo.epoch)
@@ -221,8 +221,8 @@ class _Steps:
         limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
         arguments = {
             "developed": str(developed),
-            "count": self._way.patches,
-            "estimator": self._way.estimator,
+            "count": self._preset.patches,
+            "estimator": self._preset.estimator,
             "selector": photo.given.get("selector") or SELECTOR,
         }
         with self._context.sandbox.folder() as folder:
@@ -282,7 +282,7 @@ class _Steps:
         done = [row for row in tried if row.state == "done"]
         if done:
             try:
-                sampling.require_spread([_patch_of(row) for row in done], count=self._way.patches)
+                sampling.require_spread([_patch_of(row) for row in done], count=self._preset.patches)
             except NoUsablePatchesError as error:
                 raise JobFailedError(error.code, str(error)) from error
         if not done:
@@ -310,7 +310,7 @@ class _Measured(_Steps):
             "developed": [str(folder) for folder in folders],
             "photo": photo.public_id,
             "settings": stored_settings(photo),
-            "size": self._way.kernel_size,
+            "size": self._preset.kernel_size,
         }
         limits = self._context.limits(photo, settings.task_seconds, _MEASURING)
         with self._context.sandbox.folder() as folder:
@@ -499,7 +499,7 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     lens = store.lenses.get(file.given["lens_id"], ANY_OWNER)
     if lens is None:
         raise JobFailedError("unknown_lens", "the lens was deleted meanwhile: send the profile to another")
-    if configured_way(settings, lens.way).mode != read["mode"]:
+    if configured_preset(settings, lens.way).mode != read["mode"]:
         text = f"the profile was learned with the model {read['mode']}, lens {lens.public_id} with {lens.way}"
         raise JobFailedError("conflict", f"{text}: send it to a lens of that model")
     if not file.given.get("any_lens"):

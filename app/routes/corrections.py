@@ -22,6 +22,7 @@ from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
+from app.presets import configured_preset
 from app.routes import photos as photo_routes
 from app.routes.common import (
     Cursor,
@@ -39,7 +40,6 @@ from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
-from app.ways import configured_way
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.core.names import camera_name
 from lensmodel.correction import deconvolvers
@@ -79,7 +79,7 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     version = _version_for(call, lens, options.lens_version)
     _admit(call)
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
-    params["method"] = options.method or configured_way(call.settings, lens.way).method
+    params["method"] = options.method or configured_preset(call.settings, lens.way).method
     # with other settings of the photo the same request is a new correction
     params["settings"] = stored_settings(photo)
     # only values other than the defaults: requests stored before there were bounds stay the same

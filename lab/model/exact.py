@@ -109,7 +109,7 @@ class PaperModel:
         d, n = 4 + len(varying), len(points)
         sigma = points.std(axis=0)
         sigma[3:5] = np.sqrt((sigma[3:5] ** 2).mean())  # one bandwidth for the circle
-        scale = np.array([va.rule_of_thumb(max(float(s), 1e-6), d, n) for s in sigma])
+        scale = np.array([va.reference_bandwidth(max(float(s), 1e-6), d, n) for s in sigma])
         return cls(cKDTree(points / scale), np.concatenate(values), scale, tuple(varying), neighbours)
 
     def kernel_at_settings(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import KINDS, PatchKind, PsfSample, centred, resized
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
-from lensmodel.model import bodies, support
+from lensmodel.model import camera_bodies, support
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
 
 NEAREST: Final = 256
@@ -55,8 +55,12 @@ class Attended:
     def kernel(self, channel: Channel, size: int, pitch_um: float | None) -> Kernel:
         """Return the kernel of a channel in pixels of some pitch."""
         kernel: Kernel = self.answer.kernels[CHANNELS.index(channel)]
-        if self.pitch_um is not None and pitch_um is not None and not bodies.alike(self.pitch_um, pitch_um):
-            return centred(bodies.rescaled(kernel, self.pitch_um, pitch_um, size))
+        if (
+            self.pitch_um is not None
+            and pitch_um is not None
+            and not camera_bodies.alike(self.pitch_um, pitch_um)
+        ):
+            return centred(camera_bodies.rescaled(kernel, self.pitch_um, pitch_um, size))
         return centred(resized(kernel, size))
 
     def error(self, channel: Channel) -> float:
@@ -144,7 +148,7 @@ class LearnedField:
         """The pitch of the samples that answer: the one asked for if there are such, else the commonest."""
         if not self._pitches.size:
             return None
-        if asked is not None and (np.abs(self._pitches / asked - 1.0) <= bodies.SAME).any():
+        if asked is not None and (np.abs(self._pitches / asked - 1.0) <= camera_bodies.SAME).any():
             return asked
         return float(self._pitches[self._counts.argmax()])
 
@@ -169,7 +173,7 @@ class LearnedField:
     def _group_of(self, pitch_um: float | None) -> _Group:
         same = np.isnan(self.patches.pitch) | (pitch_um is None)
         if pitch_um is not None:
-            same |= np.abs(self.patches.pitch / pitch_um - 1.0) <= bodies.SAME
+            same |= np.abs(self.patches.pitch / pitch_um - 1.0) <= camera_bodies.SAME
         rows = np.flatnonzero(same)
         return _Group.of(rows, self.patches.where[rows], pitch_um)
 

@@ -15,7 +15,7 @@ from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
-from lensmodel.model import bodies, support
+from lensmodel.model import camera_bodies, support
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
@@ -75,7 +75,7 @@ class LensModel:
         NoSamplesError
             If there are none, or all photos are excluded.
         """
-        settings, kept = settings or ModelSettings(), _distinct((), bodies.on_one_circle(samples))
+        settings, kept = settings or ModelSettings(), _distinct((), camera_bodies.on_one_circle(samples))
         if not kept:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         encoded, kernels = _parted(kept, settings)
@@ -90,7 +90,7 @@ class LensModel:
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples; a regression is fitted anew where these are of its kind."""
-        placed = bodies.on_one_circle((*self.samples, *samples))
+        placed = camera_bodies.on_one_circle((*self.samples, *samples))
         known = placed[: len(self.samples)]
         new = _distinct(known, placed[len(known) :])
         if not new:
@@ -243,7 +243,7 @@ class LensModel:
     @cached_property
     def pitch_um(self) -> float | None:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
-        return bodies.usual_pitch(self.samples)
+        return camera_bodies.usual_pitch(self.samples)
 
     @property
     def bandwidth(self) -> dict[str, float]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import bodies, support
+from lensmodel.model import camera_bodies, support
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.local_frame import LocalKernels
@@ -61,8 +61,8 @@ class Regression:
         base = np.array([s.weight for s in samples])
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples has a weight; include a photo again")
-        pitch_um = bodies.usual_pitch(samples)
-        common = bodies.at_pitch(samples, pitch_um)
+        pitch_um = camera_bodies.usual_pitch(samples)
+        common = camera_bodies.at_pitch(samples, pitch_um)
         points = va.points(common)
         widths = WidthField.fit(common, base) if normalised else WidthField()
         local = LocalKernels.of(common, points, widths)
@@ -101,11 +101,11 @@ class Regression:
         widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
         own = self.pitch_um
-        if own is None or pitch_um is None or bodies.alike(own, pitch_um):
+        if own is None or pitch_um is None or camera_bodies.alike(own, pitch_um):
             return self.local.kernels(near, angles, widths, size)
         inside = min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
         kernels = self.local.kernels(near, angles, widths, inside)
-        return np.stack([bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
+        return np.stack([camera_bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
     def error(self, near: Answers, found: support.Support) -> float:
         """Expected relative L2 error of one answer.

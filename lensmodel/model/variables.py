@@ -64,7 +64,7 @@ def vectors(where: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(where[:, 1:3] * (r / np.minimum(np.maximum(r, 1e-30) / _CENTER_R, 1.0)))
 
 
-def rule_of_thumb(sigma: float, dimensions: int, count: int) -> float:
+def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
     """Bandwidth by the normal reference rule, h = sigma (4 / ((d + 2) n))^(1 / (d + 4)), eq. (8)."""
     return sigma * (4.0 / ((dimensions + 2) * max(count, 1))) ** (1.0 / (dimensions + 4))
 
@@ -81,14 +81,14 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     d = 2 + sum(value > _SAME for value in spread.values())
     n = int(counts.max())
     bandwidths = {
-        "r": max(_PLACE_SHARE * rule_of_thumb(float(where[:, 0].std()), d, n), _FLOOR_R),
-        "phi": max(_PLACE_SHARE * rule_of_thumb(math.sqrt(0.5), d, n), _FLOOR_PHI),
+        "r": max(_PLACE_SHARE * reference_bandwidth(float(where[:, 0].std()), d, n), _FLOOR_R),
+        "phi": max(_PLACE_SHARE * reference_bandwidth(math.sqrt(0.5), d, n), _FLOOR_PHI),
         **FALLBACK,
     }
     for column, sigma in spread.items():
         name = COLUMNS[column]
         if sigma > _SAME:
-            bandwidths[name] = min(FALLBACK[name], rule_of_thumb(sigma, d, n))
+            bandwidths[name] = min(FALLBACK[name], reference_bandwidth(sigma, d, n))
     return bandwidths
 
 

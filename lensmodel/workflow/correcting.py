@@ -14,7 +14,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, ModelField
 from lensmodel.model.answer import PAPER
-from lensmodel.model.bodies import ALIKE, circle_mm
+from lensmodel.model.camera_bodies import ALIKE, circle_mm
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.photo.values import remarks_log

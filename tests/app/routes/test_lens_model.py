@@ -10,10 +10,10 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.client import Client
+from app.presets import configured_preset
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.owners import ANY_OWNER
-from app.ways import configured_way
 from lensmodel.workflow.sampling import PRESETS
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -70,9 +70,9 @@ def test_the_model_of_a_lens_is_never_changed(client: TestClient, steps: Steps) 
 def test_the_settings_of_the_service_decide_for_the_default_model_only(settings: Settings) -> None:
     chosen = settings.model_copy(update={"estimator": "michaeli-irani"})
 
-    default = configured_way(chosen, "default")
+    default = configured_preset(chosen, "default")
     assert default.estimator == "michaeli-irani"
-    assert configured_way(chosen, "paper") == replace(PRESETS["paper"], patches=chosen.patches)
+    assert configured_preset(chosen, "paper") == replace(PRESETS["paper"], patches=chosen.patches)
 
 
 def test_photos_of_the_paper_are_corrected_its_way_unless_asked_otherwise(

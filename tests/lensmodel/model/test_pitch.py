@@ -13,7 +13,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, distance, gaussian
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.model.bodies import rescaled
+from lensmodel.model.camera_bodies import rescaled
 
 FINE_UM, COARSE_UM = 4.0, 6.0
 SETTINGS = LensSettings(aperture=2.0)

@@ -123,13 +123,14 @@ def limited(
                       no more than (.24 / e)² (h - l)
         at an edge    .06 max( (.1 / e)², 1 ) (H - L)
 
-    It is an edge where a quarter of the window lies at the level that is exceeded. Within reach of lamps, of
-    white areas, and of all clipped light where e is .1 or more, each colour stays above the photo's least
-    within 2 pixels and below its most within 1. Beside areas of which one colour clipped, it stays within
-    the photo's range in the blur's reach, widened by .06 or what the blur hides of a line. Broad clipped
-    areas stay as they are, and so does, where e is .1, what may be glare of white ones, four times as bright
-    as saturation. Colour, the shares of red, green and blue in the light, is drawn towards the photo's own
-    at the same place until their differences lie in the photo's range within 3 pixels; the light stays.
+    It is an edge where a quarter of the window lies at the level that is exceeded. Around lamps, white areas,
+    and all clipped light where e is .1 or more, in the reach of the blur and some more, each colour stays
+    above the photo's least within 2 pixels and below its most within 1. Beside areas of which one colour
+    clipped, it stays within the photo's range in the blur's reach, widened by .06 or what the blur hides of a
+    line. Broad clipped areas stay as they are, and so does, where e is .1, what may be glare of white ones,
+    four times as bright as saturation. Colour, the shares of red, green and blue in the light, is drawn
+    towards the photo's own at the same place until their differences lie in the photo's range within 3
+    pixels; the light stays.
 
     Parameters
     ----------
@@ -164,7 +165,8 @@ def limited(
             held += np.minimum(doubt * glare_share(photo, white, clip, blurs), 1.0) * (photo - held)
         number, lamp, tinted = np.empty((3, *light.shape), dtype=np.float32)
         _marks(photo, clip, broad, error >= _UNSURE, number, lamp, tinted)
-        _beside_clipped(photo, held, broad, lamp, tinted, wide, np.float32(min(hidden, _EDGE)), free)
+        glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
+        _beside_clipped(photo, held, broad, lamp, tinted, glow, wide, np.float32(min(hidden, _EDGE)), free)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
     shares = (np.float32(hidden), np.float32(sure), np.float32(edge))
     _hold_light(photo, held, light, free, wide, shares, darkest)
@@ -349,14 +351,22 @@ def _marks(y: Real, clip: Real, broad: Mask, unsure: bool, number: Real, lamp: R
 
 @jit
 def _beside_clipped(
-    y: Real, x: Real, broad: Mask, lamp: Real, tinted: Real, wide: int, slack: Number, near: Mask
+    y: Real,
+    x: Real,
+    broad: Mask,
+    lamp: Real,
+    tinted: Real,
+    glow: int,
+    wide: int,
+    slack: Number,
+    near: Mask,
 ) -> None:
     """Hold each colour beside clipped light within that of the photo, in place; mark where lamps are near."""
     rows, cols = lamp.shape
     unused, beside, around = np.empty_like(lamp), np.empty_like(lamp), np.empty_like(lamp)
     dimmest, brightest = np.empty_like(lamp), np.empty_like(lamp)
     bottom, top = np.empty_like(lamp), np.empty_like(lamp)
-    extremes(lamp, lamp, wide, unused, beside)
+    extremes(lamp, lamp, glow, unused, beside)
     extremes(tinted, tinted, wide, unused, around)
     for c in range(3):
         extremes(y[c], y[c], _NEAREST, dimmest, unused)

@@ -453,6 +453,9 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
     with page.expect_request(lambda request: request.method == "DELETE" and request.url.endswith(first)):
         page.get_by_role("button", name="lower right").click()
 
+    expect(
+        page.locator("#preview-words")
+    ).to_be_in_viewport()  # a place that is chosen does not scroll it away
     expect(page.locator("#viewer")).to_have_attribute("data-previewed", "fast")  # the quick one first
     expect(page.locator("#viewer")).to_have_attribute("data-shown", "split")
     expect(page.locator("#viewer")).to_have_attribute("data-previewed", "standard")

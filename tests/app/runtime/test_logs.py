@@ -27,12 +27,15 @@ def lines() -> Iterator[io.StringIO]:
     handler = logging.StreamHandler(written)
     handler.setFormatter(logs.as_json("test"))
     root, log = logging.getLogger(), logging.getLogger("app")
-    before = log.level
+    of_requests = logging.getLogger("app.access")  # others may have begun the log of a service before
+    before = log.level, of_requests.level
     root.addHandler(handler)
     log.setLevel(logging.INFO)
+    of_requests.setLevel(logging.NOTSET)
     yield written
     root.removeHandler(handler)
-    log.setLevel(before)
+    log.setLevel(before[0])
+    of_requests.setLevel(before[1])
 
 
 def read(lines: io.StringIO) -> list[dict[str, Any]]:

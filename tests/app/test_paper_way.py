@@ -16,8 +16,8 @@ from lensmodel.model.profile import read_profile
 @pytest.mark.slow  # the paper's estimator on the smallest photo, and loops to compile: a minute and a half
 def test_a_lens_goes_the_papers_way(tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "first.dng", 0)
-    with running(tmp_path / "data", LENS_SELECTOR="good-regions") as service:
-        counted = service.calibrated(photo, model="paper")
+    with running(tmp_path / "data") as service:
+        counted = service.calibrated(photo, model="paper", selector="good-regions")
         lens = f"/v1/lenses/{counted['lens_id']}"
         exported = read_profile(io.BytesIO(service.http.get(f"{lens}/profile").content), "The answer")
         answer = service.get(f"{lens}/psf", params={"r": 0.4, "aperture": 2.8, "size": 55})

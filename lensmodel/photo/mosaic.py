@@ -33,7 +33,8 @@ _LOWEST_PILE: Final = 0.8
 
 def require_known_mosaic(rows: Sequence[str]) -> None:
     """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6."""
-    height, width = len(rows), len(rows[0]) if rows else 0
+    # the shorter of the rows counts: a damaged file may name fewer colours than it says
+    height, width = len(rows), min(map(len, rows), default=0)
     if (height, width) == (6, 6):
         return
     if (height, width) == (2, 2):

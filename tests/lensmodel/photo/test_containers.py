@@ -15,6 +15,7 @@ from PIL import Image
 from lensmodel import photo
 from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.mosaic import require_known_mosaic
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 RNG = np.random.default_rng(5)
@@ -280,3 +281,9 @@ def test_a_jpeg_of_stray_bytes_alone_is_no_photo(tmp_path: Path) -> None:
 
     with pytest.raises(NotAnImageError):
         photo.inspect(tmp_path / "x.jpg")
+
+
+@pytest.mark.parametrize("rows", [["RG", "G"], ["R", "GB"], ["RG", ""], []])
+def test_a_mosaic_that_names_too_few_colours_is_refused(rows: list[str]) -> None:
+    with pytest.raises(UnsupportedFormatError):
+        require_known_mosaic(rows)

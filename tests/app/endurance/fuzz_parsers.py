@@ -21,10 +21,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 from PIL import Image
 from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser
 
 from app.http.upload import _Form
 from lensmodel import photo
@@ -44,7 +46,8 @@ Reader = Callable[[Path], object]
 
 def _multipart(path: Path) -> object:
     form = _Form()
-    parser = form.parser(b"lens")
+    callbacks: Any = {name: getattr(form, name) for name in vars(_Form) if name.startswith("on_")}
+    parser = MultipartParser(b"lens", callbacks)
     try:
         parser.write(path.read_bytes())
         parser.finalize()

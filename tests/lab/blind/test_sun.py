@@ -8,12 +8,12 @@ from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.sun import edge_terms, image_step
+from lab.blind.methods.sun import Sun, edge_terms, image_step
 from lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
 from lab.blind.steps.pyramid import View
 from lab.training import make_edge_patches
-from lensmodel.core.psf import as_kernel, delta, gaussian
-from lensmodel.core.types import Kernel, Plane
+from lensmodel.core.psf import as_kernel, delta, distance, gaussian
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.simulate import edge_area
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
@@ -81,3 +81,15 @@ def test_a_sharp_step_stays_and_a_soft_one_becomes_steeper() -> None:
     assert np.sqrt(np.mean((kept - step)[inner] ** 2)) < 0.03
     assert np.abs(np.diff(steeper, axis=1)[inner]).max() > 1.3 * np.abs(np.diff(soft, axis=1)[inner]).max()
     assert np.array_equal(steeper[count == 0], soft[count == 0])
+
+
+def test_a_diagonal_stroke_is_recovered_from_one_patch() -> None:
+    kernel = np.zeros((13, 13))
+    kernel[np.arange(3, 10), np.arange(3, 10)] = np.linspace(1.0, 0.5, 7)
+    kernel[9, 4:9] = 0.4
+    diagonal = as_kernel(signal.convolve(kernel, gaussian(3, 0.3 * np.eye(2)), mode="same", method="direct"))
+
+    found = Sun().estimate([shot(diagonal)], [NoiseModel.white(SIGMA)], size=15).kernel
+
+    assert distance(found, diagonal).ncc > 0.85
+    assert distance(delta(15), diagonal).ncc < 0.5

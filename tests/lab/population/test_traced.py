@@ -74,7 +74,7 @@ def test_spherical_aberration_of_a_thin_lens_is_that_of_third_order(turned: bool
     )
     y, slope = axial_fan(one, h, distance=distance)
     crossing = f - y / slope - image
-    assert crossing == pytest.approx(-longitudinal, rel=0.03)
+    assert crossing == pytest.approx(-longitudinal, rel=0.02)
     assert Nominal(one).extension(distance) == pytest.approx(image - f, abs=1e-3)
 
 

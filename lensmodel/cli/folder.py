@@ -318,8 +318,7 @@ def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
         if lossy
         else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
     )
-    gain = gain_words(max(result["expected_gain_db"], 0.0))
-    return f"a correction would gain too little to be seen ({gain}): {why}"
+    return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
 
 
 def _learning(bars: Progress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:

@@ -58,11 +58,10 @@ def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]
     }
 
 
-def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: bool = False) -> float:
+def psnr(image: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
     _same_shape(image, reference)
-    a, b = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
-    error = float(np.square(np.subtract(a, b, dtype=np.float64)).mean())
+    error = float(np.square(np.subtract(image, reference, dtype=np.float64)).mean())
     return math.inf if error == 0.0 else psnr_of(error)
 
 

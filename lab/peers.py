@@ -1,4 +1,4 @@
-"""Programs that people use instead, run from outside: what they cost and what they gain.
+"""Programs that people use instead, run from outside: what they cost.
 
 Nothing here links a program; each is called by its own command line where it is installed.
 """
@@ -37,7 +37,6 @@ class Peer:
     program: str  # what must be on the path
     # the command line; a setting of 0 switches the sharpening off and leaves everything else
     command: Command
-    settings: tuple[float, ...]  # what to try when the best is chosen against the truth
     usual: float  # the setting that is timed
     raw: bool = False  # whether it takes a mosaic in a DNG; else a 16-bit TIFF, sRGB-encoded
 
@@ -94,12 +93,6 @@ class Peer:
         """CPU seconds of the sharpening alone: a run with it less one without."""
         with_it = self.run(source, folder, self.usual)[1]
         return with_it - self.run(source, folder, 0.0)[1]
-
-
-def read_picture(path: Path) -> NDArray[np.float32]:
-    """Read a TIFF of a peer, `(height, width, 3)`, 0 to 1."""
-    found = tifffile.imread(path)[..., :3]
-    return np.clip(found.astype(np.float32) / np.float32(_FULL), 0.0, 1.0)
 
 
 def _gmic(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
@@ -192,16 +185,9 @@ def _darktable(source: Path, target: Path, folder: Path, setting: float) -> list
 
 
 PEERS: Final[tuple[Peer, ...]] = (
-    Peer("G'MIC Richardson-Lucy", "gmic", _gmic, (2.0, 5.0, 10.0, 20.0), 20.0),
-    Peer("RawTherapee RL", "rawtherapee-cli", _rawtherapee(_LUCY), (0.5, 0.7, 1.0, 1.4), 1.0),
-    Peer("darktable lens deblur", "darktable-cli", _darktable, (1.0, 4.0, 8.0, 16.0), 16.0),
-    Peer(
-        "RawTherapee capture sharpening",
-        "rawtherapee-cli",
-        _rawtherapee(_CAPTURE),
-        (0.5, 0.8, 1.15, 1.6),
-        1.15,
-        raw=True,
-    ),
+    Peer("G'MIC Richardson-Lucy", "gmic", _gmic, 20.0),
+    Peer("RawTherapee RL", "rawtherapee-cli", _rawtherapee(_LUCY), 1.0),
+    Peer("darktable lens deblur", "darktable-cli", _darktable, 16.0),
+    Peer("RawTherapee capture sharpening", "rawtherapee-cli", _rawtherapee(_CAPTURE), 1.15, raw=True),
 )
-"""Each at the settings that are tried, and at the one that is timed."""
+"""Each at the setting that is timed."""

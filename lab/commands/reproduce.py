@@ -51,8 +51,7 @@ def reproduce(
         bool,
         typer.Option(
             "--compare",
-            help="Also the paper's own way, a general profile, a printed target, blind rivals and the "
-            "programs that are installed: hours.",
+            help="Also the paper's own way, a general profile, a printed target and blind rivals: hours.",
         ),
     ] = False,
     assert_bars: Annotated[

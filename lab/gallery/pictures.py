@@ -12,7 +12,8 @@ import numpy as np
 
 from lab.code_version import version_of
 from lab.gallery.rendering import rendered
-from lab.reproduce.frames import JPEG_QUALITY, MARGIN
+from lab.reproduce.frames import MARGIN
+from lab.reproduce.shots import JPEG_QUALITY
 from lab.scenes import hard_scene
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotAnImageError
 from lensmodel.core.files import atomic

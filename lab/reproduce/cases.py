@@ -12,7 +12,6 @@ from typing import Final, Literal, TypeAlias
 import lensmodel
 from lab import traced as stored
 from lab.code_version import version_of
-from lab.reproduce import programs
 from lab.reproduce.frames import Layout, content_of, layout_for, scene_files
 from lab.traced import GridLens
 from lensmodel.core.errors import InvalidInputError
@@ -158,10 +157,9 @@ class Reproduction:
     scenes: Path | None = None
     size: Size = "default"  # how it was planned, for the page
     # whether all that a lens is compared with is run too: Richardson-Lucy with our PSFs, the paper's own way
-    # from end to end, a general profile, a printed target, blind rivals, programs of others, Figs. 2 and 4
+    # from end to end, a general profile, a printed target, blind rivals, Figs. 2 and 4
     compare: bool = False
     rivals: tuple[str, ...] = RIVALS  # blind methods of others, names in `lab.rivals`; each sees one photo
-    programs: tuple[str, ...] = ()  # programs of others that correct the same photos, names in `lab.peers`
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -176,15 +174,14 @@ class Reproduction:
 def fingerprint() -> str:
     """Hash of the code and data that figures depend on: all that is behind the work on one case.
 
-    Rivals and programs have hashes of their own; plans and pages leave stored results as they are.
+    Rivals have a hash of their own; plans and pages leave stored results as they are.
     """
-    apart = ("lab.rivals", "lab.reproduce.programs", "lab.peers", "lensmodel.report")
-    return version_of("lab.reproduce.job", without=apart)
+    return version_of("lab.reproduce.job", without=("lab.rivals", "lensmodel.report"))
 
 
 def photos_of(case: Case, plan: Reproduction) -> str:
     """Name of the folder of a case's photos: of the lens, the frames, and what takes them."""
-    parts = (_lens_of(case), case.layout, content_of(plan.files()), version_of("lab.reproduce.frames"))
+    parts = (_lens_of(case), case.layout, content_of(plan.files()), version_of("lab.reproduce.shots"))
     return f"{case.name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"
 
 
@@ -235,7 +232,7 @@ def planned(
     cases = tuple(_case(one, _PHOTOS[size], frame or layout.frame, layout) for one in chosen)
     if len({case.name for case in cases}) < len(cases):
         raise InvalidInputError("two lenses are of one design and aperture; give one of each")
-    return Reproduction(cases, scenes, size, compare, programs=programs.installed() if compare else ())
+    return Reproduction(cases, scenes, size, compare)
 
 
 def _lens(text: str) -> int | Path:

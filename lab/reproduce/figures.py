@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from lab.images import Picture, as_shown, crop_boxes
 from lab.reproduce import fields
 from lab.reproduce.cases import Case, Reproduction
-from lab.reproduce.frames import take
+from lab.reproduce.shots import take
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width

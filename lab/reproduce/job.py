@@ -9,7 +9,6 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
     <key>/measured.json               with PSFs measured on a target
     <key>/general.json                with a general profile of the lens model
     <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
-    <key>/program-<name>-<version>.json  corrected by a program of others
 
 They hold figures only, some ten kilobytes a lens. Photos lie in `photos` of the output folder, models of an
 unfinished case in `work`, pictures in `pictures`.
@@ -32,11 +31,11 @@ from PIL import Image
 from lab.cases import photo_half
 from lab.code_version import version_of
 from lab.images import as_shown
-from lab.reproduce import figures, measure, programs
+from lab.reproduce import figures, measure
 from lab.reproduce.cases import Case, Reproduction, fingerprint, key_of, photos_of
 from lab.reproduce.fields import PointField, Remembered, general_field, general_words, measured_field
-from lab.reproduce.frames import Container, Shots, in_container, take
 from lab.reproduce.learners import Answer, Learner, LibraryLearner, Roi, corrected_with, paper_way
+from lab.reproduce.shots import Container, Shots, in_container, take
 from lab.rivals import rivals
 from lab.store import Unit, read, stored
 from lensmodel.core.errors import LensModelError
@@ -52,7 +51,7 @@ CONTROL: Final = "standard"
 PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")
 """Kinds of files that each lens is learned from and corrected in too, one photo of each."""
 
-_SEVERAL: Final = ("learned", "paths", "paper", "rivals", "programs")
+_SEVERAL: Final = ("learned", "paths", "paper", "rivals")
 _ALONE: Final = ("truth", "measured", "general")
 NewLearner: TypeAlias = Callable[[Path, Preset, int], Learner]
 """From a folder that keeps what was learned, the way of learning, and a number of processes."""
@@ -115,7 +114,6 @@ def run_reproduction(
             "size": plan.size,
             "methods": list(plan.methods),
             "rivals": {name: rivals.create(name).source for name in plan.rivals} if plan.compare else {},
-            "programs": list(plan.programs),
             "own_scenes": plan.scenes is None,
             "paper_kernel": paper_way(plan.cases[0]).kernel_size if plan.compare else None,
         },
@@ -161,9 +159,6 @@ class CaseJob:
             found |= {(part, ""): folder / f"{part}.json" for part in ("measured", "general")}
             code = rivals_version()
             found |= {("rivals", name): folder / f"rival-{name}-{code}.json" for name in plan.rivals}
-            code = programs.version()
-            for name in plan.programs:
-                found["programs", name] = folder / f"program-{programs.label_of(name)}-{code}.json"
         return found
 
     def run(self, told: Callable[..., None]) -> Unit:
@@ -182,19 +177,12 @@ class CaseJob:
                 "measured": lambda _: self._measured(shots),
                 "general": lambda _: self._by_field(general_field(case), 0.0, shots, "general"),
                 "rivals": lambda name: self._rival(name, shots),
-                "programs": lambda name: self._program(name, shots),
             }
         units: dict[str, dict[str, Unit]] = {part: {} for part in _SEVERAL}
         for (part, name), path in self.files.items():
-            words, fresh = f"{case.title}: {part} {name}".rstrip(), True
-            try:
-                unit, fresh = stored(path, partial(makers[part], name)) if makers else (read(path), False)
-                units.setdefault(part, {})[name] = unit
-            except LensModelError as error:
-                if part != "programs":
-                    raise
-                words += f" left out: {error}"  # of others: the page goes without, the next run tries again
-            told(words, fresh=fresh)
+            unit, fresh = stored(path, partial(makers[part], name)) if makers else (read(path), False)
+            units.setdefault(part, {})[name] = unit
+            told(f"{case.title}: {part} {name}".rstrip(), fresh=fresh)
         if not complete:
             shutil.rmtree(self.work)
         return {
@@ -298,24 +286,11 @@ class CaseJob:
             for seen, parts in ((chart, measure.chart_tiles(self.case)), (photo, self._tiles))
         )
         name = {} if label is None else {f"{label}-{method}": self._picture(f"{label}-{method}", after)}
-        return measure.state(edges, after, shots, self.case, before=chart.planes), name
+        return measure.state(edges, after, shots, self.case), name
 
     @property
     def _tiles(self) -> list[Roi]:
         return measure.tiles(self.case.camera.frame)
-
-    def _program(self, name: str, shots: Shots) -> Unit:
-        """What a program of others makes of chart and photo, at its best setting."""
-        peer, gains = programs.named(name), self.case.camera.white_balance
-        setting, after = programs.best_setting(peer, develop(shots.held_out).planes, shots.truth(), gains)
-        chart = develop(shots.chart).planes
-        edges = programs.corrected_by(peer, chart, setting, gains)
-        label = programs.label_of(name)
-        return {
-            "setting": setting,
-            "state": measure.state(edges, after, shots, self.case, before=chart),
-            "pictures": {label: self._picture(label, after)},
-        }
 
     def _learned(self, learning: _Learning, shots: Shots, number: str, *, own_way: bool) -> Unit:
         """What is known after so many photos, and what corrections with it come to."""
@@ -333,11 +308,10 @@ class CaseJob:
         if n == len(refused):  # no model: a user gets no correction, so the photos stay as they are
             return {**unit, "psf": None, "methods": dict.fromkeys(methods, self._before)}
         unit["methods"] = {}
-        chart = develop(shots.chart).planes
         for method in methods:
             after = learner.corrected(shots.held_out, method, self._tiles)
             edges = learner.corrected(shots.chart, method, measure.chart_tiles(case)).planes
-            state = measure.state(edges, after.planes, shots, case, before=chart)
+            state = measure.state(edges, after.planes, shots, case)
             state["nothing_to_correct"] = after.nothing_to_correct
             light = self._before["light"]
             state["forecast"] = measure.forecast(light, after.planes, after.expected_db, shots, case)

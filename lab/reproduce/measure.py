@@ -13,8 +13,8 @@ from lab.charts import by_zone, measure_edges
 from lab.images import BLOCK, BORDER, fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
-from lab.reproduce.frames import Shots, guard_of
 from lab.reproduce.learners import Answer, Place, Roi
+from lab.reproduce.shots import Shots, guard_of
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, distance
 from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
@@ -28,11 +28,6 @@ TILE: Final = 256
 """Pixels: side of the parts of a frame that are compared (chosen: four blocks and their borders)."""
 
 _EDGES: Final = 6  # of the chart, in its order
-
-FAIR_OVERSHOOT: Final = 5.0
-"""Percent of the step: corrections are compared at no more than that."""
-
-_MIXES = 10  # steps of a strength slider (chosen): tenths
 
 
 def places() -> list[Place]:
@@ -91,13 +86,13 @@ def _edge_boxes(case: Case) -> list[Roi]:
     return [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges[:_EDGES]]
 
 
-def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
+def edges(chart: Planes, case: Case) -> dict[str, Any]:
     """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
 
     The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
     pixel, not a constant 1, whose MTF50 would lie at infinity.
     """
-    found = by_zone(measure_edges(chart[channel], _edge_boxes(case)))
+    found = by_zone(measure_edges(chart[1], _edge_boxes(case)))
     return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
 
 
@@ -145,38 +140,7 @@ def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
 
 
 def state(
-    chart: Planes | None,
-    photo: Planes,
-    shots: Shots,
-    case: Case,
-    *,
-    before: Planes | None = None,
-    raw: bool = True,
+    chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, raw: bool = True
 ) -> dict[str, Any]:
-    """Everything about one version of the chart, if there is one, and of the held-out photo.
-
-    With the chart as it was (`before`) each zone also has `mtf50_fair`, see `fair_mtf50`.
-    """
-    found = {} if chart is None else edges(chart, case)
-    if chart is not None and before is not None:
-        for zone, value in fair_mtf50(chart, before, case).items():
-            found[zone]["mtf50_fair"] = value
-    return {"edges": found, **pictures(photo, shots, case, raw=raw)}
-
-
-def fair_mtf50(chart: Planes, before: Planes, case: Case) -> dict[str, float | None]:
-    """MTF50 in LP/PH at equal overshoot, by zone.
-
-    Overshoot buys MTF50. A correction that overshoots more than 5 percent is mixed with the photo as it
-    was, in steps of a tenth, until it no longer does: that is what its strength slider would do.
-    """
-    found: dict[str, float | None] = {}
-    for step in range(_MIXES, -1, -1):
-        share = np.float32(step / _MIXES)
-        mixed = edges(before[1:2] + share * (chart[1:2] - before[1:2]), case, channel=0)
-        for zone, row in mixed.items():
-            if zone not in found and (row["overshoot"] <= FAIR_OVERSHOOT or step == 0):
-                found[zone] = row["mtf50"]
-        if len(found) == len(mixed):
-            break
-    return found
+    """Everything about one version of the chart, if there is one, and of the held-out photo."""
+    return {"edges": {} if chart is None else edges(chart, case), **pictures(photo, shots, case, raw=raw)}

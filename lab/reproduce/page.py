@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lab.page import Page
-from lab.reproduce import programs
 from lab.reproduce.bars import Bar, bars, held
-from lab.reproduce.measure import FAIR_OVERSHOOT
 from lab.reproduce.tables import (
     DENOISED,
     GENERAL,
@@ -104,7 +102,7 @@ def _conditions(result: Mapping[str, Any]) -> str:
         "those of the photo that is corrected serve in no other, the rest again, mirrored and elsewhere. "
         f"Frames of {sizes}, of which the center, two squares half way out and the corners are compared. "
         "The photos are Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping "
-        f"and lateral colour. {paper}{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
+        f"and lateral colour. {paper}{_rivals(plan['rivals'])}"
         "The true PSF and the control go through the same correction. "
         f"Code {result['code']}."
     )
@@ -115,15 +113,6 @@ def _rivals(sources: Mapping[str, str]) -> str:
         return ""
     named = "; ".join(f"{name}: {source}" for name, source in sources.items())
     return f"Beside it, made anew by us, the blind rivals {named}. "
-
-
-def _programs(names: Sequence[str]) -> str:
-    if not names:
-        return ""
-    return (
-        f"Beside it the programs {', '.join(names)}, each at the best of its settings, chosen against the "
-        "truth. "
-    )
 
 
 def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
@@ -160,8 +149,7 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
         f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges. MTF50 "
         "alone proves nothing, because a PSF that is too wide scores above the truth: read it with the "
         "highest MTF (1.00 is right) and the overshoot of the edge in percent of the step, "
-        "both the largest of the zone. Fair is MTF50 at equal overshoot: a correction that overshoots more "
-        f"than {FAIR_OVERSHOOT:g} percent is mixed with the photo as it was until it does not. "
+        "both the largest of the zone. "
         f"{PAPER_WAY.capitalize()} is learned and corrected as the paper says from end to end; its rows are "
         "the same under each deconvolution. Other PSFs are corrected with the deconvolution of the title."
     )
@@ -169,18 +157,12 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
         page.title(f"Deconvolution: {deconvolution(method)}", 3)
         head = [
             "",
-            *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over", "fair")),
+            *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over")),
         ]
         page.table(head, [[shown(row["state"]), *_edge_cells(row)] for row in rows])
         page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
-        halo = found["halo"][method]
-        page.table(
-            ["", *ZONES, *(f"{z} overshoot beyond" for z in ZONES)],
-            [
-                [f"n = {n}", *(number(share[z], 2) for z in ZONES), *(number(halo[n][z], 1) for z in ZONES)]
-                for n, share in found["share"][method].items()
-            ],
-        )
+        kept = found["share"][method].items()
+        page.table(["", *ZONES], [[f"n = {n}", *(number(v[z], 2) for z in ZONES)] for n, v in kept])
     page.text("The paper, Canon EF 24mm f/1.4 (center, corner), for comparison of shares, not of values:")
     page.table(["", "center", "corner"], _PAPER)
 
@@ -194,7 +176,6 @@ def _edge_cells(row: Mapping[str, Any]) -> list[str]:
             f"{number(edge['tangential_mtf50'])} / {number(edge['sagittal_mtf50'])}",
             number(edge["mtf_max"], 2),
             number(edge["overshoot"], 1),
-            number(edge["mtf50_fair"]),
         ]
     return cells
 
@@ -471,9 +452,7 @@ def _pictures(case: Mapping[str, Any]) -> dict[str, str]:
     """Files of all pictures of a lens by label."""
     units = [case["truth"], *(case[part] for part in ("general", "measured") if case.get(part))]
     units += [
-        unit
-        for part in ("learned", "paths", "paper", "rivals", "programs")
-        for unit in case.get(part, {}).values()
+        unit for part in ("learned", "paths", "paper", "rivals") for unit in case.get(part, {}).values()
     ]
     return {label: name for unit in units for label, name in unit["pictures"].items()}
 
@@ -490,10 +469,6 @@ def _labels(case: Mapping[str, Any], plan: Mapping[str, Any]) -> dict[str, str]:
     found[f"way-paper-n{n}-paper"] = f"corrected blindly, {PAPER_WAY}, n = {n}"
     for name, source in plan["rivals"].items():
         found |= each(name, f"corrected with the PSFs of {source}")
-    found |= {
-        programs.label_of(name): f"corrected by {name}, its best setting {unit['setting']:g}"
-        for name, unit in case.get("programs", {}).items()
-    }
     found |= each("general", f"corrected with a {GENERAL} (in place of a commercial one)")
     found |= each("measured", "corrected with PSFs measured with a target (non-blind)")
     return {**found, **each("true", "corrected with the true PSF"), "scene": "the scene itself"}

@@ -20,7 +20,6 @@ from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.tags.location import gps_directory
-from lensmodel.photo.tags.xmp_block import sidecar_for, write_sidecar
 from lensmodel.workflow.calibrating import Calibration, InMemory
 from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
@@ -172,7 +171,6 @@ def correct(
     color_space: photo.ColorSpace = "same",
     quality: int = 95,
     least_gain_db: float | None = None,
-    sidecar: bool = False,
     keep_location: bool = False,
     workers: int | None = None,
     siblings: Iterable[Path | str] = (),
@@ -214,8 +212,6 @@ def correct(
     least_gain_db : float, optional
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`), which a forecast decides
         before the work where it can; None always writes.
-    sidecar : bool
-        Write an XMP file beside the corrected photo too, `c.tif.xmp` of `c.tif`, which tells what was done.
     keep_location : bool
         Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
@@ -242,8 +238,7 @@ def correct(
     ImageTooLargeError
         If the photo has more pixels than are read.
     InvalidInputError
-        If a value is out of its range, the ending of `output` is unknown, it is the photo itself, or another
-        program wrote the sidecar that is there.
+        If a value is out of its range, the ending of `output` is unknown, or it is the photo itself.
     UnknownMethodError
         If there is no method of that name.
     CancelledError
@@ -256,7 +251,6 @@ def correct(
     source = Path(image) if isinstance(image, str | Path) else None
     if target is not None and source is not None and target.exists() and target.samefile(source):
         raise InvalidInputError(f"{target} is the photo itself; name another file for the corrected one")
-    beside = None if target is None or not sidecar else sidecar_for(target)  # refused before any work
     known = lens if isinstance(lens, Lens) else Lens.load(lens)
     method = preset_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
@@ -283,7 +277,7 @@ def correct(
     too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
     if target is None or too_little:
         return corrected
-    encoding, metadata = developed.encoding, developed.info.metadata
+    encoding = developed.encoding
     if file_format is None and source is not None and written == "tiff16" and encoding.bit_depth == 32:
         written = "tiff32"  # what came as floating-point numbers may hold light beyond white
     del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
@@ -302,20 +296,6 @@ def correct(
         description=description,
         gps=gps_directory(source) if keep_location and source is not None else None,
     )
-    if beside is not None:
-        write_sidecar(
-            beside,
-            metadata,
-            source="" if source is None else source.name,
-            description=description,
-            done={
-                "Method": name,
-                "Strength": f"{strength:g}",
-                "Profile": known.description,
-                "ExpectedGainDb": f"{corrected.expected_gain_db:.2f}",
-                "NothingToCorrect": str(corrected.nothing_to_correct).lower(),
-            },
-        )
     return corrected
 
 

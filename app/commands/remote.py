@@ -53,8 +53,6 @@ def run(
     from app.client import Client  # noqa: PLC0415 - same
 
     targets, twice = correction.targets_of(files.photos(names), output, options.file_format)
-    if options.sidecar:
-        raise UsageError("--sidecar is for corrections made here; leave it out with --server")
     results = correction.clashes(twice, display)
     try:
         with Client(url) as client, display.progress() as bars:

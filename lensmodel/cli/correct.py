@@ -142,17 +142,6 @@ def correct(
             CORRECTING,
         ),
     ] = 0.0,
-    sidecar: Annotated[
-        bool,
-        rare(
-            typer.Option(
-                "--sidecar",
-                help="Write an XMP file beside each corrected photo, NAME.tif.xmp, that says what was "
-                "done and with which lens.",
-            ),
-            WRITING,
-        ),
-    ] = False,
     keep_location: Annotated[
         bool,
         rare(
@@ -214,7 +203,6 @@ def correct(
         workers,
         any_lens=any_lens,
         force=force,
-        sidecar=sidecar,
         keep_location=keep_location,
     )
     if server is not None:

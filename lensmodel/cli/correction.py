@@ -52,7 +52,6 @@ class CorrectionOptions:
     workers: int | None
     any_lens: bool
     force: bool
-    sidecar: bool = False
     least_gain_db: float | None = None
     keep_location: bool = False
 
@@ -191,7 +190,6 @@ def correct_one(
         bounds=options.bounds,
         file_format=options.file_format,
         least_gain_db=options.least_gain_db,
-        sidecar=options.sidecar,
         keep_location=options.keep_location,
         workers=options.workers,
         siblings=siblings,

@@ -45,10 +45,6 @@ class Commands(OnDemand):
             "lensmodel.cli.measure:measure",
             "Measure the blur of a lens from photos made for the purpose.",
         ),
-        "check": CommandEntry(
-            "lensmodel.cli.check:check",
-            "Find where a photo corrected by any program shows what the original cannot have contained.",
-        ),
         "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
         "target": CommandEntry(
             "lensmodel.cli.measure:target",

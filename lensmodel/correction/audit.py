@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
@@ -11,19 +11,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.jit import jit
-from lensmodel.core.types import (
-    CHANNELS,
-    ZONES,
-    FieldPosition,
-    NoiseModel,
-    Plane,
-    Planes,
-    StepHook,
-    Zone,
-    ignore_step,
-)
+from lensmodel.core.types import CHANNELS, ZONES, NoiseModel, Plane, Planes, Zone
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
 from lensmodel.correction.compiled.common import Complex, Real, through
@@ -70,9 +59,6 @@ HELD: Final = 0.1
 just seen, a half only what is spoilt)."""
 MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
 PLACES: Final = 12  # worst places to name (chosen: as many as a person looks at)
-TILE, HALO = 192, 48
-"""Side of a tile of `audit_photo` and the margin seen around it, pixels: multiples of `SIDE`, so that
-neighbouring tiles see the same blocks and no seam shows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -590,99 +576,3 @@ def _zone(audits: list[TileAudit]) -> ZoneAudit:
         float(np.mean(shares)),
         {name: share for name, share in checks.items() if share > 0.0},
     )
-
-
-EvidenceAt: TypeAlias = Callable[[FieldPosition, Window], Evidence]
-"""What is known at a place of the field, for a window of the photo."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotoAudit:
-    """Verdict on a photo.
-
-    Parameters
-    ----------
-    keep : Plane, shape (rows, cols)
-        Share of the correction that should be kept.
-    report : AuditReport
-        Why and where.
-    """
-
-    keep: Plane
-    report: AuditReport
-
-    def mixed(self, original: Planes, corrected: Planes) -> Planes:
-        """Mix a correction back towards its original as far as it fails.
-
-        Parameters
-        ----------
-        original, corrected : Planes, shape (3, rows, cols), float32
-            The photo and its correction.
-
-        Returns
-        -------
-        Planes, shape (3, rows, cols), float32
-        """
-        return np.asarray(original + self.keep * (corrected - original), dtype=np.float32)
-
-
-def audit_photo(
-    original: Planes, corrected: Planes, evidence: EvidenceAt, *, on_step: StepHook = ignore_step
-) -> PhotoAudit:
-    """Audit any program's correction of a photo.
-
-    Parameters
-    ----------
-    original, corrected : Planes, shape (3, rows, cols)
-        Linear light, saturation 1, pixel for pixel the same scene.
-    evidence : callable
-        What is known at a place: noise, clip levels, PSFs if any, where the sensor measured.
-    on_step : StepHook
-        Called after each tile; may raise to stop.
-
-    Returns
-    -------
-    PhotoAudit
-
-    Raises
-    ------
-    InvalidInputError
-        If the planes have different sizes.
-    """
-    if original.shape != corrected.shape:
-        raise InvalidInputError(
-            f"original and correction must have one size, got {original.shape} and {corrected.shape}"
-        )
-    frame = Frame(original.shape[1], original.shape[2])
-    keep = np.ones((frame.height, frame.width), dtype=np.float32)
-    tiles = list(_tiles(frame))
-    verdicts = []
-    for done, (part, around) in enumerate(tiles, start=1):
-        (top, bottom), (left, right) = ((s.start, s.stop) for s in part)
-        place = frame.position((top + bottom - 1) / 2.0, (left + right - 1) / 2.0)
-        inner = tuple(slice(p.start - a.start, p.stop - a.start) for p, a in zip(part, around, strict=True))
-        window = (slice(None), *around)
-        verdict = audit_tile(
-            np.asarray(original[window], dtype=np.float32),
-            np.asarray(corrected[window], dtype=np.float32),
-            evidence(place, around),
-            inner=(inner[0], inner[1]),
-        )
-        keep[part] = verdict.keep
-        verdicts.append((zone_of(place.r), (top, left), verdict.without_map()))
-        on_step(done, len(tiles))
-    return PhotoAudit(keep, pooled(verdicts))
-
-
-def _tiles(frame: Frame) -> Iterator[tuple[Window, Window]]:
-    """Parts of the frame, and each with its halo."""
-    for top in range(0, frame.height, TILE):
-        for left in range(0, frame.width, TILE):
-            bottom, right = min(top + TILE, frame.height), min(left + TILE, frame.width)
-            yield (
-                (slice(top, bottom), slice(left, right)),
-                (
-                    slice(max(top - HALO, 0), min(bottom + HALO, frame.height)),
-                    slice(max(left - HALO, 0), min(right + HALO, frame.width)),
-                ),
-            )

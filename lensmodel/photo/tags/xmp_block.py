@@ -1,4 +1,4 @@
-"""XMP: camera and lens, and what was done to a photo, within its file or in a sidecar beside it.
+"""XMP: camera and lens, and what was done to a photo, within its file.
 
 Sources: ISO 16684-1:2019, sections 7 and 8 (packet, `dc`, `xmp`, `xmpMM`); Adobe, "XMP Specification Part 2",
 2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`).
@@ -7,18 +7,12 @@ Sources: ISO 16684-1:2019, sections 7 and 8 (packet, `dc`, `xmp`, `xmpMM`); Adob
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.files import atomic
 from lensmodel.photo.tags.exif_block import SOFTWARE
 from lensmodel.photo.values import PhotoMetadata
-
-OWN: Final = "urn:x-lensmodel:correction/1/"
-"""Namespace of the properties that no standard has."""
 
 _SPACES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -28,64 +22,28 @@ _SPACES: Final[Mapping[str, str]] = MappingProxyType(
         "dc": "http://purl.org/dc/elements/1.1/",
         "xmp": "http://ns.adobe.com/xap/1.0/",
         "xmpMM": "http://ns.adobe.com/xap/1.0/mm/",
-        "stRef": "http://ns.adobe.com/xap/1.0/sType/ResourceRef#",
         "stEvt": "http://ns.adobe.com/xap/1.0/sType/ResourceEvent#",
         "tiff": "http://ns.adobe.com/tiff/1.0/",
         "exif": "http://ns.adobe.com/exif/1.0/",
         "exifEX": "http://cipa.jp/exif/1.0/",
         "aux": "http://ns.adobe.com/exif/1.0/aux/",
-        "lensmodel": OWN,
     }
 )
 for _prefix, _uri in _SPACES.items():
     ET.register_namespace(_prefix, _uri)  # else they are written as ns0, ns1: legal, and unreadable
 
-_PACKET: Final = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n{}\n<?xpacket end="{}"?>'
-_HEAD_BYTES: Final = 1024  # of a packet, in which its first element says who wrote it
+_PACKET: Final = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n{}\n<?xpacket end="r"?>'
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
 """What XML has no way to write; cameras put it into names."""
 
 
-def sidecar_for(photo: Path) -> Path:
-    """Name the sidecar of a photo: `c.tif.xmp` of `c.tif`, since `c.xmp` may be that of a `c.dng`."""
-    path = photo.with_name(f"{photo.name}.xmp")
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except FileNotFoundError:
-        return path
-    if f'xmptk="{SOFTWARE}"'.encode() not in head:
-        raise InvalidInputError(
-            f"{path.name} is there already and another program wrote it; move it away or ask for no sidecar"
-        )
-    return path
-
-
-def write_sidecar(
-    path: Path, metadata: PhotoMetadata, *, source: str, description: str, done: Mapping[str, str]
-) -> None:
-    """Write a packet as a file, complete or not at all; an existing one is replaced (`sidecar_for`)."""
-    with atomic(path) as file:
-        file.write(xmp_packet(metadata, description, source=source, done=done, writable=True))
-
-
-def xmp_packet(
-    metadata: PhotoMetadata,
-    description: str,
-    lens: str = "",
-    *,
-    source: str = "",
-    done: Mapping[str, str] = MappingProxyType({}),
-    writable: bool = False,
-) -> bytes:
+def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> bytes:
     """Return a packet, UTF-8; serial numbers, places (GPS) and maker notes stay out."""
     root = ET.Element(_name("x:xmpmeta"), {_name("x:xmptk"): SOFTWARE})
     whole = ET.SubElement(ET.SubElement(root, _name("rdf:RDF")), _name("rdf:Description"))
     whole.set(_name("rdf:about"), "")
     for key, value in _taken(metadata, lens).items():
         whole.set(_name(key), _plain(value))
-    for key, value in done.items():
-        whole.set(f"{{{OWN}}}{key}", _plain(value))
     _list(whole, "dc:rights", "rdf:Alt", [metadata.copyright] if metadata.copyright else [])
     _list(whole, "dc:creator", "rdf:Seq", [metadata.artist] if metadata.artist else [])
     _list(whole, "dc:subject", "rdf:Bag", metadata.keywords)
@@ -96,10 +54,8 @@ def xmp_packet(
         step.set(_name("stEvt:action"), "filtered")
         step.set(_name("stEvt:softwareAgent"), SOFTWARE)
         step.set(_name("stEvt:parameters"), _plain(description))
-    if source:
-        ET.SubElement(whole, _name("xmpMM:DerivedFrom")).set(_name("stRef:filePath"), _plain(source))
     ET.indent(root, " ")
-    return _PACKET.format(ET.tostring(root, encoding="unicode"), "w" if writable else "r").encode()
+    return _PACKET.format(ET.tostring(root, encoding="unicode")).encode()
 
 
 def _list(whole: ET.Element, name: str, kind: str, items: Sequence[str]) -> None:

@@ -299,24 +299,6 @@ def test_patterns_find_their_files_in_folders_whose_names_look_like_patterns(
     assert [path.name for path in files.photos([pattern])] == ["a.dng"]
 
 
-@pytest.mark.parametrize("foreign", [b"<x:xmpmeta x:xmptk='XMP Core 4.4.0-Exiv2'/>", b"", b"any words"])
-def test_a_sidecar_of_another_program_stays_as_it_is(foreign: bytes, folder: Path, here: Here) -> None:
-    words = ("correct", "one.dng", "-p", PROFILE, "-o", "one.tif", "--method", "fast", "--sidecar", "-q")
-    (folder / "one.xmp").write_bytes(foreign)  # a raw editor's, of one.dng
-    beside = folder / "one.tif.xmp"
-
-    first = here(*words)
-    ours = beside.read_bytes()
-    again = here(*words, "--force")
-    beside.write_bytes(foreign)
-    refused = here(*words, "--force")
-
-    assert (first.returncode, again.returncode, refused.returncode) == (0, 0, 1)
-    assert b"expectedgaindb" in ours.lower()
-    assert "one.tif.xmp is there already and another program wrote it" in one_sentence(refused.stderr)
-    assert beside.read_bytes() == (folder / "one.xmp").read_bytes() == foreign
-
-
 def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
     words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
     here(*words, "-o", "plain", "--strength", "0")

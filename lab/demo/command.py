@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from lensmodel import blind
-from lensmodel.cli import files
-from lensmodel.cli.calibrate import Estimator
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Quiet, Verbose
 
-FILES: Final = frozenset(
-    {
-        *("before-after.png", "calibration-history.json", "calibration-history.svg", "corrected.tif"),
-        *("psf-field.png", "report.json", "report.md", "service.log"),
-    }
-)
+FILES: Final = frozenset({"before-after.png", "corrected.tif", "report.md", "service.log"})
 """What a demo leaves in its folder."""
 
 
@@ -33,16 +24,14 @@ def demo(
             "--output", "-o", metavar="DIR", help="Where to write: a folder for the pictures and the report."
         ),
     ] = Path("demo-output"),
-    estimator: Estimator = "default",
-    json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Use a folder that holds other files too.")] = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Run the whole process on a real RAW file and on a simulated lens whose true blur is known.
+    """Run the whole process on a simulated lens whose true blur is known.
 
     Starts a service of its own, uploads photos, calibrates their lens, corrects a photo, measures,
-    and stops the service: about six minutes on two cores. What an earlier demo left in the folder
+    and stops the service: some minutes on two cores. What an earlier demo left in the folder
     is renewed; a folder with anything else in it is refused without --force.
 
     Example:
@@ -52,19 +41,12 @@ def demo(
     Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
-    with files.as_usage():
-        blind.estimators.create(estimator)
     _refuse_what_others_wrote(output, force=force)
     from lab.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 
     began = time.monotonic()
-    improved = run(
-        output, lambda text: shown.progress_line(text, time.monotonic() - began), estimator=estimator
-    )
-    if json_output:
-        shown.document(json.loads((output / "report.json").read_text(encoding="utf-8")))
-    else:
-        shown.result((output / "report.md").read_text(encoding="utf-8"))
+    improved = run(output, lambda text: shown.progress_line(text, time.monotonic() - began))
+    shown.result((output / "report.md").read_text(encoding="utf-8"))
     if not improved:
         shown.error("the corrected photo did not become better; see the report")
         raise typer.Exit(1)

@@ -1,12 +1,10 @@
-"""What the demo measured, all against a truth that the service never saw: as a page and as JSON."""
+"""What the demo measured, all against a truth that the service never saw: as a page."""
 
 from __future__ import annotations
 
-import io
-import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +16,6 @@ from lab.charts import by_zone, measure_edges
 from lab.demo.camera import CAMERA, LENS, SETTINGS, DemoShot
 from lab.images import Picture, fidelity
 from lensmodel.cli.console import mtf50_words
-from lensmodel.core.files import write_atomically
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import distance
 from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
@@ -48,8 +45,6 @@ class DemoReport:
     psnr_after: list[dict[Zone, float]] = field(default_factory=list)
     chart_before: dict[Zone, Sharpness] = field(default_factory=dict)
     chart_after: dict[Zone, Sharpness] = field(default_factory=dict)
-    refusal: str = ""
-    estimator: str = "default"
     seconds: float = 0.0
 
     @property
@@ -60,9 +55,7 @@ class DemoReport:
         )
 
     def write(self, folder: Path) -> None:
-        """Write report.md and report.json."""
-        stored = {**asdict(self), "improved": self.improved}
-        (folder / "report.json").write_text(json.dumps(stored, indent=2, default=str), encoding="utf-8")
+        """Write report.md."""
         (folder / "report.md").write_text(self._text(), encoding="utf-8")
 
     def _text(self) -> str:
@@ -78,16 +71,10 @@ class DemoReport:
             for zone, before in self.chart_before.items()
             if (after := self.chart_after.get(zone)) is not None
         )
-        refused = (
-            f"The service does not learn a lens from it: {self.refusal}"
-            if self.refusal
-            else "The service learned from it."
-        )
         return f"""# What the demo measured
 
 Lens: {self.lens}, at f/{self.aperture:g}, simulated, so that the truth is known. The photo that it was never
-calibrated with became **{"better" if self.improved else "NOT better"}** in centre and corner. Blind
-estimator: {self.estimator}.
+calibrated with became **{"better" if self.improved else "NOT better"}** in centre and corner.
 
 | photos learned from | PSF error centre / mid / corner | PSNR centre / mid / corner (dB) |
 | --- | --- | --- |
@@ -106,14 +93,9 @@ but does not blur it.
 MTF50 in cycles/pixel, green. A PSF that is too wide raises MTF50 as well, but then the highest MTF rises
 above 1 and edges overshoot: read them together.
 
-## A photo that shows too little
-
-One RAW file of a Canon EOS Kiss X4: a chart of even patches before a background out of focus. {refused}
-
 The whole demo took {self.seconds:.0f} s.
 
-Files: corrected.tif (16 bit), before-after.png, psf-field.png, calibration-history.svg and .json,
-report.json, service.log.
+Files: corrected.tif (16 bit), before-after.png, service.log.
 """
 
 
@@ -182,20 +164,3 @@ def _detailed(picture: Picture, side: int, count: int = 3) -> list[tuple[int, in
         inside[max(row - side, 0) : row + side, max(col - side, 0) : col + side] = -1.0
         found.append((row, col))
     return sorted(found, key=lambda place: place[1])
-
-
-def draw_history(errors: Sequence[Mapping[Zone, float]], path: Path) -> None:
-    """Write the error of the PSF after each photo as an SVG line chart."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra, and slow to import
-
-    figure = Figure(figsize=(6.5, 3.3), layout="constrained")
-    ax = figure.add_subplot()
-    photos = range(1, len(errors) + 1)
-    for zone in ZONES:
-        ax.plot(photos, [error[zone] for error in errors], "o-", label=f"{zone} (relative L2)")
-    ax.set(xlabel="photos of this lens", xticks=photos, ylim=(0.0, None))
-    ax.set_title("Error of the PSF after each photo", loc="left", fontsize=10)
-    ax.legend(frameon=False)
-    out = io.BytesIO()
-    figure.savefig(out, format="svg", metadata={"Date": None})
-    write_atomically(path, out.getvalue())

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import time
 from pathlib import Path
 
-from app.client import Client, JobEndedError
+from app.client import Client
 from lab.demo import camera, report
 from lab.demo.service import Say, corrected, follow, own_service, planes_of
 from lab.images import as_shown
 from lensmodel.photo import develop
-from lensmodel.simulate import demo_data_path
-
-REAL_RAW = "canon_kissx4_colorchart.dng"
 
 
-def run(output: Path, say: Say, *, estimator: str = "default") -> bool:
+def run(output: Path, say: Say) -> bool:
     """Run the demo; return whether the figures show an improvement.
 
     Parameters
@@ -27,8 +23,6 @@ def run(output: Path, say: Say, *, estimator: str = "default") -> bool:
         Folder for what it leaves behind; files of an earlier demo there are replaced.
     say : callable
         Takes one line of progress at a time.
-    estimator : str
-        Blind estimator by which the lens is learned.
     """
     output.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
@@ -37,12 +31,10 @@ def run(output: Path, say: Say, *, estimator: str = "default") -> bool:
         say(f"Photographing 5 scenes through the simulated lens {camera.LENS.model} ...")
         shots = camera.take_photos(work / "photos", on_photo=lambda name: say(f"  photo of {name}"))
         say("Starting the service ...")
-        settings = {"LENS_ESTIMATOR": estimator}
-        with own_service(work / "data", output / "service.log", settings) as client:
+        with own_service(work / "data", output / "service.log") as client:
             found = _simulated(client, shots, work, output, say)
-            found.refusal = _refusal(client, say)
             say("Stopping the service ...")
-    found.estimator, found.seconds = estimator, time.monotonic() - began
+    found.seconds = time.monotonic() - began
     found.write(output)
     say(f"Report: {output / 'report.md'}")
     return found.improved
@@ -82,26 +74,4 @@ def _simulated(
     gain = camera.CAMERA.white_balance
     rows = {"as photographed": as_shown(before, gain), "corrected": as_shown(after, gain)}
     report.draw_crops(rows, output / "before-after.png")
-    aperture = client.lens(lens_id).apertures[0]
-    (output / "psf-field.png").write_bytes(client.field_png(lens_id, aperture=aperture))
-    history = [event.model_dump(mode="json") for event in client.calibrations(lens_id)]
-    (output / "calibration-history.json").write_text(json.dumps(history, indent=2), encoding="utf-8")
-    report.draw_history(found.psf_error, output / "calibration-history.svg")
     return found
-
-
-def _refusal(client: Client, say: Say) -> str:
-    """Upload a real photo that shows too little of its lens, and return what the service says to it."""
-    say(f"Uploading {REAL_RAW}, a real RAW file; it does not say its lens, so the form does")
-    photo = client.upload(
-        demo_data_path(REAL_RAW),
-        lens_maker="Canon",
-        lens_model="unknown lens of the Kiss X4",
-        lens_serial="demo-1",
-        aperture=5.6,
-    )
-    try:
-        follow(client, photo, say)
-    except JobEndedError as ended:
-        return str(ended) if ended.job.error is None else ended.job.error.detail or str(ended)
-    return ""

@@ -63,7 +63,7 @@ class Commands(OnDemand):
         ),
         "demo": CommandEntry(
             "lab.demo.command:demo",
-            "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
+            "Run the whole process on a simulated lens whose true blur is known.",
             panel=RESEARCH,
         ),
         "reproduce": CommandEntry(

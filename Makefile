@@ -70,7 +70,9 @@ format: install ## let the formatter and the linter mend what they can
 	@$(BIN)/ruff check --fix .
 
 bench: install ## quality and speed benchmarks, tables on standard output
-	@$(BIN)/lensmodel bench
+	@$(BIN)/lensmodel bench blind --cases 12
+	@$(BIN)/lensmodel bench model --seeds 1000:1002
+	@$(BIN)/lensmodel bench correct --methods fast,standard
 
 docs: install ## the reference as a static site, site/index.html
 	@$(BIN)/mkdocs build --strict --quiet

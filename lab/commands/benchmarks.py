@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -19,11 +19,6 @@ from lensmodel.cli.files import as_usage, refuse_existing
 from lensmodel.cli.options import Force, Quiet, Verbose
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from lab.blind.benchmark import BlindBenchmark, BlindReport
 
 NOISE: Final = "0.01,0.003"
 ESTIMATORS: Final = "default,michaeli-irani"
@@ -44,44 +39,16 @@ JsonFile = Annotated[
 bench = typer.Typer(
     help="""Measure quality and speed.
 
-    Without a name, three quick runs, whose tables go to standard output:
-
-    - bench blind --cases 12
-
-    - bench model --seeds 1000:1002
-
-    - bench correct --methods fast,standard
-
-    They take a few minutes, and write nothing but finished cases, to bench-output/cache.
-
-    Examples:
-
-        lensmodel bench
+    Example:
 
         lensmodel bench blind --help
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """,
-    invoke_without_command=True,
+    no_args_is_help=True,
 )
 
 bench.command()(gallery)
-
-
-@bench.callback()
-def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) -> None:
-    """Run the three quick ones unless one is named."""
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
-    context.obj = shown
-    if context.invoked_subcommand is None:
-        from lab.blind.benchmark import BlindBenchmark, markdown_table  # noqa: PLC0415 - see the top
-        from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - same
-        from lab.model.model_benchmark import table  # noqa: PLC0415 - same
-
-        settings = BlindBenchmark(noise=_levels(NOISE), methods=_names(ESTIMATORS), cases=12)
-        shown.result("Blind estimators\n\n" + markdown_table(_blind(settings, 2, BLIND_OUTPUT, shown)))
-        shown.result("Lens model\n\n" + table(_model(shown, seeds=range(1000, 1002), photos=[1, 5])))
-        shown.result("Correction\n\n" + correct_table(_correct(None, "fast,standard", 1, shown)))
 
 
 @bench.command()
@@ -128,9 +95,10 @@ def blind(
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    from lab.blind.benchmark import (  # noqa: PLC0415 - same
+    from lab.blind.benchmark import (  # noqa: PLC0415 - see the top of the module
         BlindBenchmark,
         markdown_table,
+        run_blind_benchmark,
         write_report,
     )
 
@@ -150,23 +118,17 @@ def blind(
             selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
             scenes=scenes,
         )
-    report = _blind(settings, workers, output, shown)
-    written = write_report(report, output)
-    _tell(shown, json_output, report.to_json(), markdown_table(report))
-    shown.note("written: " + ", ".join(str(path) for path in written))
-
-
-def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
-    from lab.blind.benchmark import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
-
     with as_usage(), shown.progress() as bars:
         task = bars.add_task("cases", total=None)
-        return run_blind_benchmark(
+        report = run_blind_benchmark(
             settings,
             workers=workers,
             cache=output / "cache",
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
+    written = write_report(report, output)
+    _tell(shown, json_output, report.to_json(), markdown_table(report))
+    shown.note("written: " + ", ".join(str(path) for path in written))
 
 
 @bench.command()
@@ -204,37 +166,18 @@ def model(
         raise UsageError(
             f"give --seeds like 1000:1004 and --photos like 1,5, got {seeds} and {photos}"
         ) from error
-    from lab.model.model_benchmark import table  # noqa: PLC0415 - see the top of the module
-
-    result = _model(
-        shown,
-        seeds=range(first, last),
-        photos=counts,
-        methods=None if methods is None else _names(methods),
-        psf_field=psf_field,
-    )
-    _tell(shown, json_output, result, table(result))
-
-
-def _model(
-    shown: Display,
-    *,
-    seeds: Sequence[int],
-    photos: Sequence[int],
-    methods: Sequence[str] | None = None,
-    psf_field: Path | None = None,
-) -> dict[str, Any]:
-    from lab.model.model_benchmark import run_model_benchmark  # noqa: PLC0415 - see the top of the module
+    from lab.model.model_benchmark import run_model_benchmark, table  # noqa: PLC0415 - see the top of the module
 
     with as_usage(), shown.progress() as bars:
         task = bars.add_task("fits", total=None)
-        return run_model_benchmark(
-            seeds=seeds,
-            photos=photos,
-            methods=methods,
+        result = run_model_benchmark(
+            seeds=range(first, last),
+            photos=counts,
+            methods=None if methods is None else _names(methods),
             psf_field=psf_field,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
+    _tell(shown, json_output, result, table(result))
 
 
 @bench.command()
@@ -270,46 +213,33 @@ def correct(
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    from lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - see the top of the module
+    from lab.correction.correction_benchmark import (  # noqa: PLC0415 - see the top of the module
+        correct_table,
+        run_correct_benchmark,
+    )
+    from lab.peers import PEERS  # noqa: PLC0415 - same
+    from lensmodel.photo import develop  # noqa: PLC0415 - same
+    from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")
     window = _window(roi)
-    result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers, roi=window, beside=beside)
-    _tell(shown, json_output, result, correct_table(result))
-
-
-def _correct(
-    photo: Path | None,
-    methods: str,
-    workers: int,
-    shown: Display,
-    *,
-    repeats: int = 1,
-    peers: bool = False,
-    roi: tuple[int, int, int, int] | None = None,
-    beside: int | None = None,
-) -> dict[str, Any]:
-    from lab.correction.correction_benchmark import run_correct_benchmark  # noqa: PLC0415 - see the top of the module
-    from lab.peers import PEERS  # noqa: PLC0415 - same
-    from lensmodel.photo import develop  # noqa: PLC0415 - same
-    from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
-
     planes = develop(photo or demo_data_path("lake.jpg")).planes
     with as_usage(), shown.progress() as bars:
         task = bars.add_task("methods", total=None)
-        return run_correct_benchmark(
+        result = run_correct_benchmark(
             planes,
             methods=_names(methods),
             workers=workers,
             repeats=repeats,
             peers=PEERS if peers else (),
-            roi=roi,
+            roi=window,
             beside=beside,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
+    _tell(shown, json_output, result, correct_table(result))
 
 
 def _window(text: str | None) -> tuple[int, int, int, int] | None:

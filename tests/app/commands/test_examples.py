@@ -90,10 +90,10 @@ def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: s
     assert inspect.cleandoc(command.help or "").splitlines()[0] == listed.help
 
 
-def test_six_commands_are_for_everyone_and_twelve_in_panels_of_their_own() -> None:
+def test_five_commands_are_for_everyone_and_twelve_in_panels_of_their_own() -> None:
     panels = Counter(entry.panel for entry in ROOT.entries.values())
 
-    assert panels == {None: 6, "Research": 6, "Administration": 6}
+    assert panels == {None: 5, "Research": 6, "Administration": 6}
 
 
 def test_correct_shows_ten_options_and_all_of_them_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
@@ -134,7 +134,6 @@ SHORTER = {"calibrate": ["--estimator", "default"]}
 NOT_RUN = {
     "reproduce --size quick -o reproduction",  # tests/lab/reproduce runs one lens from end to end
     "reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses",
-    "bench",  # its three parts are run one by one
     "bench blind --cases 12",
     "bench blind --photos sharp --scenes 80 --half all --cases 200",
     "bench gallery --only simulated/text",  # tests/lab/gallery makes its page

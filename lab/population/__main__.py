@@ -39,6 +39,7 @@ def _arguments() -> argparse.Namespace:
     lenses.add_argument(
         "--plain", action="store_true", help="held out, with five RAW photos that nothing spoils"
     )
+    lenses.add_argument("--through", type=Path, help="take other photos through the lenses of this folder")
     lenses.add_argument("--processes", type=int, default=2)
     train = commands.add_parser("train", help="train the network; goes on where it was ended")
     train.add_argument("--minutes", type=float, default=60.0, help="of this sitting")
@@ -161,11 +162,12 @@ def main() -> None:
     began, count = time.monotonic(), 0
     name = "plain" if asked.plain else "held-out" if asked.held_out else "lenses"
     name = "lenses-of-errors" if asked.of_errors else name
+    order = library.Order(
+        asked.folder / name, asked.folder / "scenes", asked.family,
+        held_out=asked.held_out or asked.plain, plain=asked.plain, through=asked.through,
+    )  # fmt: skip
     shards = range(asked.first, asked.first + asked.shards)
-    for made in library.generate(
-        asked.folder / name, asked.folder / "scenes", asked.family, shards,
-        held_out=asked.held_out or asked.plain, plain=asked.plain, processes=asked.processes,
-    ):  # fmt: skip
+    for made in library.generate(order, shards, asked.processes):
         count += made
         if made:
             print(f"{asked.family}: {count} lenses in {time.monotonic() - began:.0f} s", flush=True)

@@ -5,7 +5,7 @@ A lens is drawn from its number alone, so that a library is the same however oft
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
 from lensmodel.neural.features import FAR_M
+from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import to_octant
 
 Family = Literal["wavefront", "third-order", "traced"]
@@ -131,6 +132,41 @@ def make_lens(
     if not plain:
         stacked = behind_sensor(stacked, *draw_sensor(rng))
     kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    set_so = np.array([(s.f_number, s.focal_mm, s.focus_m) for s in states], np.float32)
+    return _photographed(rng, scenes, kind, xy, stacked, set_so, states[0].lens.pitch_um, plain=plain)
+
+
+def retake(
+    stored: Mapping[str, NDArray[Any]], scenes: Scenes, rng: np.random.Generator, *, plain: bool = False
+) -> dict[str, Any] | None:
+    """Take other photos through a lens of the library; None where its kernels hold a file's processing."""
+    pitch, kind = stored["facts"]
+    if KINDS[int(kind)] != "raw":
+        return None
+    outer = stored["coarse"][..., outer_cells()]
+    kernels = assembled(np.concatenate([stored["fine"].reshape(*outer.shape[:3], -1), outer], -1))
+    states = stored["states"].astype(np.float32)
+    if states.shape[1] < 3:  # shards of lenses that were focused far away, all of them
+        states = np.column_stack([states, np.full(len(states), FAR_M, np.float32)])
+    other: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    xy = stored["xy"].astype(np.float64)
+    return _photographed(
+        rng, scenes, other, xy, kernels.astype(np.float32), states, float(pitch), plain=plain
+    )
+
+
+def _photographed(
+    rng: np.random.Generator,
+    scenes: Scenes,
+    kind: Kind,
+    xy: NDArray[np.float64],
+    stacked: NDArray[np.float32],
+    states: NDArray[np.float32],
+    pitch_um: float,
+    *,
+    plain: bool,
+) -> dict[str, Any] | None:
+    """Take photos through a lens: what a shard holds of it; None where they hardly show anything."""
     camera = Camera(rng, scenes, kind, xy, stacked, plain)
     photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
     count = int(rng.choice([32, 56, 110], p=[0.35, 0.4, 0.25]))
@@ -148,49 +184,68 @@ def make_lens(
         "xy": xy.astype(np.float32),
         "fine": fine_of(stacked).astype(np.float16),
         "coarse": coarse_of(stacked).astype(np.float16),
-        "states": np.array([(s.f_number, s.focal_mm, s.focus_m) for s in states], np.float32),
-        "facts": np.array([states[0].lens.pitch_um, KINDS.index(kind)], np.float32),
+        "states": states,
+        "facts": np.array([pitch_um, KINDS.index(kind)], np.float32),
     }
 
 
-def _make_shard(
-    folder: Path, scenes: Path, family: Family, shard: int, *, held_out: bool, plain: bool
-) -> int:
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{family}-{shard:05d}.npz"
-    if path.exists():
-        return 0
-    crops = Scenes(scenes, held_out=held_out)
-    made: dict[str, Any] = {}
-    count = 0
-    for number in range(shard * SHARD, (shard + 1) * SHARD):
-        lens = make_lens(family, number, crops, held_out=held_out, plain=plain)
-        if lens is not None:
-            made.update({f"{count}/{name}": value for name, value in lens.items()})
-            count += 1
-    with atomic(path) as file:
-        np.savez(file, **made)
-    return count
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What lenses to make, and where they go.
+
+    Parameters
+    ----------
+    folder, scenes : Path
+        Of shards, and of `scenes.build`.
+    family : {"wavefront", "third-order", "traced"}
+    held_out, plain : bool
+        See `make_lens`.
+    through : Path, optional
+        A folder of shards: other photos are taken through its lenses, and no lens is drawn.
+    """
+
+    folder: Path
+    scenes: Path
+    family: Family
+    held_out: bool = False
+    plain: bool = False
+    through: Path | None = None
+
+    def lenses(self, shard: int) -> Iterator[dict[str, Any] | None]:
+        """Make the lenses of a shard."""
+        if self.through is None:
+            crops = Scenes(self.scenes, held_out=self.held_out)
+            for number in range(shard * SHARD, (shard + 1) * SHARD):
+                yield make_lens(self.family, number, crops, held_out=self.held_out, plain=self.plain)
+        elif (path := _path(self.through, self.family, shard)).exists():
+            crops = Scenes(self.scenes, held_out=self.held_out)
+            for number, stored in enumerate(load_shard(path)):
+                rng = np.random.default_rng([number, shard, FAMILIES.index(self.family)])
+                yield retake(stored, crops, rng, plain=self.plain)
+
+    def make(self, shard: int) -> int:
+        """Write a shard that is not there yet; return how many lenses it has got."""
+        path = _path(self.folder, self.family, shard)
+        if path.exists():
+            return 0
+        lenses = [lens for lens in self.lenses(shard) if lens is not None]
+        if not lenses:
+            return 0
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(path) as file:
+            np.savez(file, **{f"{i}/{name}": v for i, lens in enumerate(lenses) for name, v in lens.items()})
+        return len(lenses)
 
 
-def generate(
-    folder: Path,
-    scenes: Path,
-    family: Family,
-    shards: Sequence[int],
-    *,
-    held_out: bool,
-    plain: bool,
-    processes: int,
-) -> Iterator[int]:
+def generate(order: Order, shards: Sequence[int], processes: int) -> Iterator[int]:
     """Make the shards that are not there yet; yield how many lenses each has got."""
     with ProcessPoolExecutor(processes) as pool:
-        jobs = [
-            pool.submit(_make_shard, folder, scenes, family, shard, held_out=held_out, plain=plain)
-            for shard in shards
-        ]
-        for job in jobs:
+        for job in [pool.submit(order.make, shard) for shard in shards]:
             yield job.result()
+
+
+def _path(folder: Path, family: Family, shard: int) -> Path:
+    return folder / f"{family}-{shard:05d}.npz"
 
 
 def load_shard(path: Path) -> list[dict[str, NDArray[Any]]]:

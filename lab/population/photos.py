@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lab.population.kernels import FINE, SIDE
+from lab.population.scenes import busiest
 from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
 
 Kind = Literal["raw", "tiff", "jpeg"]
@@ -31,6 +32,10 @@ KINDS: Final[tuple[Kind, ...]] = ("raw", "tiff", "jpeg")
 
 _MARGIN: Final = 8  # pixels around a window that demosaicking and sharpening look at
 _CLIPPED: Final = 0.02  # largest share of clipped samples of a patch that is used
+_SOFTEST: Final = (
+    2.8  # slope of the spectrum beyond which a scene is out of focus (chosen); drawn ones are not
+)
+_OWN_BLUR: Final = 0.35  # px^2 of a scene's own blur that are undone at most (chosen)
 _DEVELOPED_READ: Final = 1e-3  # noise that the statistics expect of developed files: their own is coloured
 
 
@@ -48,24 +53,23 @@ class Scenes:
         index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
         names = sorted({entry["name"] for entry in index})
         apart = set(names[4::10])
-        chosen = [entry for entry in index if (entry["name"] in apart) == held_out]
+        chosen = [
+            entry
+            for entry in index
+            if (entry["name"] in apart) == held_out
+            and (entry["slope"] < _SOFTEST or entry["name"].startswith(("leaves", "text")))
+        ]
         self._scenes = [np.load(folder / entry["file"], mmap_mode="r") for entry in chosen]
+        self.blur = tuple(min(float(entry["blur"]), _OWN_BLUR) for entry in chosen)
+        """Variance of each scene's own blur, px^2, which a photo of it undoes."""
 
     def __len__(self) -> int:
         return len(self._scenes)
 
     def crop(self, number: int, side: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Cut a square (3, side, side), mostly the busiest of three, and turn it at random."""
-        scene = self._scenes[number]
-        best, value = (0, 0), -np.inf
-        for _ in range(3 if rng.random() < 0.8 else 1):
-            row, col = rng.integers(0, scene.shape[0] - side + 1), rng.integers(0, scene.shape[1] - side + 1)
-            green = scene[row : row + side : 3, col : col + side : 3, 1].astype(np.float32)
-            contrast = min(float(green.std() / (green.mean() + 0.02)), 1.0)
-            contrast -= 3.0 * max(float((green > 0.97).mean()) - 0.01, 0.0)
-            if contrast > value:
-                best, value = (int(row), int(col)), contrast
-        crop = scene[best[0] : best[0] + side, best[1] : best[1] + side].astype(np.float32).transpose(2, 0, 1)
+        crop = busiest(self._scenes[number], side, rng, 3 if rng.random() < 0.8 else 1)
+        crop = crop.astype(np.float32).transpose(2, 0, 1)
         turn = int(rng.integers(8))
         crop = np.rot90(crop, turn % 4, (1, 2))
         return np.ascontiguousarray(crop[:, :, ::-1] if turn > 3 else crop)
@@ -209,7 +213,7 @@ class _Exposure:
     read: float
     shot: float
     sources: tuple[int, ...]  # a scene for each quarter of the frame
-    tilts: tuple[tuple[float, float], ...]  # change of each scene's spectrum: slope, softness
+    tilts: tuple[tuple[float, float], ...]  # change of each scene's spectrum: slope, variance of blur in px^2
     focus_error: float  # radius of a disc in pixels, 0: in focus
     focus_normal: tuple[float, float, float]  # half plane of the frame that is out of focus: nx, ny, offset
     shake: tuple[float, float]  # vector of a line, pixels
@@ -292,10 +296,8 @@ class Camera:
         drawn = rng.integers(0, len(self.scenes), 1 if one else 4)
         sources = tuple(int(s) for s in (np.repeat(drawn, 4) if one else drawn))
         tilts = tuple(
-            (float(rng.normal(0, 0.12)), max(0.0, float(rng.normal(0, 0.22))))
-            if rng.random() < 0.4
-            else (0.0, 0.0)
-            for _ in range(4)
+            (float(rng.normal(0, 0.15)), float(rng.normal(0, 0.3)) ** 2 - self.scenes.blur[s])
+            for s in sources
         )
         electrons = np.exp(
             np.log(45_000) - self._noise * np.log(56) + rng.normal(0, 0.3)
@@ -366,10 +368,9 @@ class Camera:
         gains = exposure.gain * self._balance
         crop = np.tensordot((self._mix * gains[:, None]).astype(np.float32), crop, 1)
         change = self._otf(state, place)
-        slope, softness = exposure.tilts[quarter]
-        if slope or softness:
-            tilt = ((0.05 + self._f) / 0.1) ** slope * np.exp(-2 * (np.pi * self._f * softness) ** 2)
-            change = change * (tilt / tilt[0, 0])
+        slope, blur = exposure.tilts[quarter]
+        tilt = (1.0 + self._f / 0.05) ** slope * np.exp(-2 * np.pi**2 * blur * np.minimum(self._f, 0.5) ** 2)
+        change = change * tilt
         nx, ny, offset = exposure.focus_normal
         if exposure.focus_error and nx * x + ny * y > offset:
             change = change * _disc(self._f * exposure.focus_error)

@@ -30,6 +30,14 @@ _LEAST_FACTOR: Final = (
 _SHARPEST: Final = 0.10  # least share of gradient energy in the finest band; below it a photograph is soft
 _SCALES: Final = (1.0, 1.5, 2.3)  # further factors that each photograph is scaled down by
 
+_SPECTRUM_SIDE: Final = (
+    128  # pixels of the windows that a scene's spectrum is taken from, as large as a patch
+)
+_NATURAL_SLOPE: Final = 2.0
+"""Of power against frequency: D. J. Field, "Relations between the statistics of natural images and the
+response properties of cortical cells", JOSA A 4, 1987."""
+_SLOPE_HELD: Final = 1.0  # how many rings' worth of weight that has in a fit (chosen)
+
 TEST_HALF: Final = (
     "beacon-street-sunset",
     "canyon-wren",
@@ -122,6 +130,45 @@ def sharpness(scene: NDArray[np.float32]) -> float:
     return float(np.median(energy[0][busy] / energy[1][busy]))
 
 
+def own_blur(scene: NDArray[np.floating], rng: np.random.Generator) -> tuple[float, float]:
+    """Slope of a scene's power spectrum, and variance (px^2, per axis) of its own Gaussian blur.
+
+    Of the busiest windows, log P = a - slope log f - 4 pi^2 variance f^2, by least squares over rings. A lens
+    is blamed for what the scenes of training hide: they must be as sharp as what real lenses look at.
+    """
+    side = _SPECTRUM_SIDE
+    window = np.outer(np.hanning(side), np.hanning(side))
+    f = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
+    edges = np.geomspace(0.035, 0.5, 13)
+    ring = np.digitize(f, edges) - 1
+    centre = np.array([f[ring == k].mean() for k in range(12)])
+    logs = []
+    for _ in range(40):
+        crop = busiest(scene, side, rng, 3)[..., 1].astype(np.float32)
+        power = np.square(np.abs(np.fft.rfft2((crop - crop.mean()) * window)))
+        logs.append([np.log(power[ring == k].mean() + 1e-9) for k in range(12)])
+    rows = np.stack([np.ones(12), -np.log(centre), -4 * np.pi**2 * centre**2], 1)
+    rows = np.vstack([rows, [[0.0, _SLOPE_HELD, 0.0]]])
+    fitted = np.linalg.lstsq(rows, np.append(np.mean(logs, 0), _SLOPE_HELD * _NATURAL_SLOPE), rcond=None)[0]
+    return float(fitted[1]), max(float(fitted[2]), 0.0)
+
+
+def busiest(
+    scene: NDArray[np.floating], side: int, rng: np.random.Generator, tries: int
+) -> NDArray[np.floating]:
+    """Of some squares (side, side, 3) of a scene the one of most contrast that is hardly clipped."""
+    best, value = scene[:side, :side], -np.inf
+    for _ in range(tries):
+        row, col = (int(rng.integers(0, n - side + 1)) for n in scene.shape[:2])
+        crop = scene[row : row + side, col : col + side]
+        green = crop[::3, ::3, 1].astype(np.float32)
+        contrast = min(float(green.std() / (green.mean() + 0.02)), 1.0)
+        contrast -= 3.0 * max(float((green > 0.97).mean()) - 0.01, 0.0)
+        if contrast > value:
+            best, value = crop, contrast
+    return best
+
+
 def leaves(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
     """Dead leaves: opaque shapes of a power law of sizes, each in front of those before, some shaded."""
     oversampled = 2 * side
@@ -185,13 +232,16 @@ def build(
     """
     folder.mkdir(parents=True, exist_ok=True)
     index: list[dict[str, object]] = []
+    rng = np.random.default_rng(seed)
 
     def keep(name: str, scene: NDArray[np.float32], scale: float) -> None:
         if min(scene.shape[:2]) < 260:
             return
         file = f"{len(index):04d}.npy"
         np.save(folder / file, scene.astype(np.float16))
-        index.append({"file": file, "name": name, "scale": scale, "shape": scene.shape[:2]})
+        slope, blur = own_blur(scene, rng)
+        facts = {"file": file, "name": name, "scale": scale, "shape": scene.shape[:2]}
+        index.append({**facts, "slope": slope, "blur": blur})
 
     for source in sources:
         if source.name in TEST_HALF:
@@ -206,7 +256,6 @@ def build(
             continue
         for scale in _SCALES:
             keep(source.name, scaled_down(scene, scale), scale)
-    rng = np.random.default_rng(seed)
     for number in range(drawn):
         keep(f"leaves {number}", leaves(rng, side), 1.0)
         keep(f"text {number}", text(rng, side), 1.0)

@@ -61,12 +61,40 @@ def test_sets_survive_a_file(lens: Lens, tmp_path: Path) -> None:
 
 def test_a_shard_that_is_there_is_not_made_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "SHARD", 1)
-    wanted = {"held_out": False, "plain": False}
-    library._make_shard(folder / "lenses", folder / "scenes", "third-order", 0, **wanted)
+    order = library.Order(folder / "lenses", folder / "scenes", "third-order")
+    order.make(0)
     (path,) = (folder / "lenses").glob("*.npz")
     before = path.stat().st_mtime_ns
-    assert not library._make_shard(folder / "lenses", folder / "scenes", "third-order", 0, **wanted)
+    assert not order.make(0)
     assert path.stat().st_mtime_ns == before
+
+
+def test_other_photos_are_taken_through_the_same_lens(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "SHARD", 1)
+    first = library.Order(folder / "first", folder / "scenes", "third-order", plain=True)
+    assert first.make(0) == 1
+    again = library.Order(
+        folder / "again", folder / "scenes", "third-order", plain=True, through=folder / "first"
+    )
+    assert again.make(0) == 1
+    (one,), (other,) = (
+        library.load_shard(folder / name / "third-order-00000.npz") for name in ("first", "again")
+    )
+    for same in ("fine", "coarse", "xy", "states", "facts"):
+        np.testing.assert_allclose(other[same].astype(float), one[same].astype(float), atol=2e-3)
+    assert not np.array_equal(other["statistics"][:8], one["statistics"][:8])
+
+
+def test_a_scene_tells_its_own_blur() -> None:
+    rng = np.random.default_rng(4)
+    f = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None])
+    noise = np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(f, 1 / 512)
+    for variance in (0.0, 0.1, 0.25):
+        plane = np.fft.irfft2(noise * np.exp(-2 * np.pi**2 * variance * f**2))
+        plane = 0.5 + 0.1 * plane / plane.std()
+        slope, blur = scenes.own_blur(np.repeat(plane[..., None], 3, 2), rng)
+        assert slope == pytest.approx(2.0, abs=0.15)
+        assert blur == pytest.approx(variance, abs=0.04)
 
 
 def test_demosaicking_keeps_samples_and_interpolates_a_slope() -> None:

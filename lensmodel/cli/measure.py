@@ -193,12 +193,12 @@ def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_
 def _show_edges(photo: LinearPhoto, folder: Path) -> None:
     """Write what was seen of a chart: the chart with its edges, each edge's profile and SFR, a table."""
     from lensmodel.report.chart_edges import edge_pages, edges_csv  # noqa: PLC0415 - matplotlib, an extra
-    from lensmodel.report.plots import save, to_pdf  # noqa: PLC0415 - as above
+    from lensmodel.report.plots import to_pdf, to_png  # noqa: PLC0415 - as above
 
     edges = chart_edges(photo)
     folder.mkdir(parents=True, exist_ok=True)
     pages = edge_pages(photo, edges)
-    save(pages[0], folder / EDGE_FILES[1])
+    write_atomically(folder / EDGE_FILES[1], to_png(pages[0]))
     write_atomically(folder / EDGE_FILES[0], to_pdf(pages))
     write_atomically(folder / EDGE_FILES[2], edges_csv(photo, edges).encode())
 

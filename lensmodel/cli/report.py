@@ -50,7 +50,7 @@ Aspect = Annotated[
     float, typer.Option(min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture.")
 ]
 
-FILES: Final = ("report.pdf", "report.png", "report.csv", "report.json")
+FORMS: Final = (".html", ".pdf", ".png", ".csv", ".json")
 COMPARED: Final = "comparison.pdf"
 _NAMED: Final = 8  # photos that the page names (chosen: two lines)
 
@@ -61,7 +61,10 @@ def report(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="DIR", help="Where to write: a folder for page, print and figures."
+            "--output",
+            "-o",
+            metavar="DIR|FILE",
+            help=f"Where to write: a folder for all of {', '.join(FORMS)}, or one such file.",
         ),
     ] = None,
     aperture: Aperture = None,
@@ -93,6 +96,8 @@ def report(
 
         lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
 
+        lensmodel report my-24mm.lensprofile -o my-24mm.html
+
         lensmodel report my-24mm.lensprofile --photo one.dng -o with-lateral-colour
 
         lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile -o both
@@ -102,23 +107,25 @@ def report(
     Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose)
-    if output is not None:
-        names = (*FILES, *([COMPARED] if against else ()))
-        files.refuse_existing(*(output / name for name in names), force=force)
-    elif against is not None or photo:
-        option = "--photo" if against is None else "--against"
-        raise UsageError(f"{option} needs --output: what it adds is written to files")
+    targets = _targets(output)
+    if against is not None:
+        if output is None or output in targets:
+            raise UsageError("--against needs a folder after --output: it adds a file of its own")
+        files.refuse_existing(output / COMPARED, force=force)
+    if photo and output is None:
+        raise UsageError("--photo needs --output: what it adds is written to files")
+    files.refuse_existing(*targets, force=force)
     with shown.busy("asking the lens at 200 places"):
         found = measured(profile, aperture, aspect, photo or [], whole=output is not None)
-    document = json.dumps(to_json(found), indent=1)
     if output is not None:
         with shown.busy("drawing"):
-            write(output, found, document)
+            for target in targets:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(target, _written(found, target.suffix.lower()))
             if against is not None:
-                other = measured(against, aperture, aspect, [], whole=True)
-                write_comparison(output, found, other)
+                write_comparison(output, found, measured(against, aperture, aspect, [], whole=True))
     if json_output:
-        typer.echo(document)
+        shown.document(found)
     else:
         at = found.tested[0].at or "unknown aperture"
         lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
@@ -166,19 +173,31 @@ def details_of(known: LensProfile) -> dict[str, str]:
     return {name: words for name, words in details.items() if words}
 
 
-def write(folder: Path, found: LensReport, document: str) -> None:
-    """Write a report in each form."""
-    from lensmodel.report.plots import pages, save, to_pdf  # noqa: PLC0415 - matplotlib, an extra
+def _targets(output: Path | None) -> tuple[Path, ...]:
+    """The files of a report: the one that is named, or one of each form in a folder."""
+    if output is None:
+        return ()
+    if output.suffix.lower() in FORMS and not output.is_dir():
+        return (output,)
+    return tuple(output / f"report{form}" for form in FORMS)
 
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = pages(found)
-    save(drawn[0], folder / "report.png")
-    for name, content in (
-        ("report.pdf", to_pdf(drawn)),
-        ("report.csv", to_csv(found).encode()),
-        ("report.json", document.encode()),
-    ):
-        write_atomically(folder / name, content)
+
+def _written(found: LensReport, form: str) -> bytes:
+    """A report in one of `FORMS`."""
+    from lensmodel.report.html import to_html  # noqa: PLC0415 - matplotlib, an extra
+    from lensmodel.report.plots import pages, to_pdf, to_png  # noqa: PLC0415 - as above
+
+    match form:
+        case ".html":
+            return to_html(found)
+        case ".pdf":
+            return to_pdf(pages(found))
+        case ".png":
+            return to_png(pages(found)[0])
+        case ".csv":
+            return to_csv(found).encode()
+        case _:
+            return json.dumps(to_json(found), indent=1).encode()
 
 
 def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:

@@ -150,8 +150,8 @@ class Spot:
 
     @property
     def mean(self) -> float:
-        """Mean of both MTF50."""
-        return (self.tangential + self.sagittal) / 2.0
+        """Mean of both MTF50, neither beyond what a sensor shows."""
+        return (min(self.tangential, NYQUIST) + min(self.sagittal, NYQUIST)) / 2.0
 
     @property
     def side(self) -> str:
@@ -254,6 +254,11 @@ class LensReport:
         if self.sensor.height_px is not None:
             parts.append(f"{self.sensor.height_px} pixels high")
         return ", ".join(parts)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What it rests on, a line each."""
+        return (self.facts, *(f"{name}: {words}" for name, words in self.details.items()))
 
     @property
     def advice(self) -> str:
@@ -462,7 +467,7 @@ def sharpness(found: ApertureReport) -> str:
     else:
         level = "sharp" if center >= _SHARP else "a little soft" if center >= _SOFT else "soft"
     words = f"this copy is {level} in the centre (MTF50 {_figure(center)})"
-    share = min(worst.mean, NYQUIST) / max(min(center, NYQUIST), 1e-6)
+    share = worst.mean / max(center, 1e-6)
     if share >= _EVEN:
         fall = "its corners are just as sharp"
     else:

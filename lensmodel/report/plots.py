@@ -8,13 +8,12 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.files import write_atomically
 from lensmodel.core.types import Channel, Zone
 from lensmodel.report.lens_report import (
     NYQUIST,
@@ -61,6 +60,8 @@ _PAGE: Final = (8.27, 11.69)  # inches: A4
 _A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
+_LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
+_PALE: Final = 0.45  # luma from which on dark figures are read best (chosen)
 _DOTS: Final = 160  # a inch of a PNG (chosen: a page is as wide as a screen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
@@ -100,6 +101,11 @@ Panel = tuple[str, Callable[[Place], None]]
 def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
     """All charts of one aperture, those over apertures and of lateral colour last."""
     return [_chart(panel) for panel in _panels(report, report.at(aperture), unit)]
+
+
+def overview(report: LensReport) -> list[Chart]:
+    """The charts of the first page: the map of sharpness, and what becomes of a point."""
+    return [_chart(panel) for panel in _simple(report)]
 
 
 def comparison_charts(comparison: Comparison) -> list[Chart]:
@@ -148,6 +154,7 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
     at = f", {found.at}" if found.at else ""
     panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
     panels += [
+        (f"Expected error of the blur, %{at}", _on(error_map, found)),
         (f"Contrast over the picture{at}: sagittal solid, tangential dashed", _on(contrast, found)),
         (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(side_softer, found)),
@@ -219,15 +226,12 @@ def to_pdf(figures: Iterable[Figure]) -> bytes:
     return out.getvalue()
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write one figure as PDF, SVG or PNG, by the ending of the name, whole or not at all."""
+def to_png(figure: Figure) -> bytes:
+    """Write a figure as PNG."""
     out = io.BytesIO()
-    ending = path.suffix.lower().removeprefix(".")
-    if ending not in {"pdf", "svg", "png"}:
-        raise InvalidInputError(f"figures are written as .pdf, .svg or .png, got {path.name}")
     with mpl.rc_context(_STYLE):
-        figure.savefig(out, format=ending, dpi=_DOTS, metadata={"Date": None} if ending == "svg" else None)
-    write_atomically(path, out.getvalue())
+        figure.savefig(out, format="png", dpi=_DOTS)
+    return out.getvalue()
 
 
 # --- single axes ------------------------------------------------------------------------------
@@ -235,25 +239,43 @@ def save(figure: Figure, path: Path) -> None:
 
 def sharpness_map(ax: Axes, found: ApertureReport, values: Sequence[float], *, factor: float = 1.0) -> Any:  # noqa: ANN401 - an image of matplotlib, which colour bars take
     """Draw a map of MTF50; places of which too little is known are hatched."""
-    grid = np.clip(np.array(values, dtype=np.float64).reshape(found.rows, found.cols), 0.0, NYQUIST)
+    shown = np.clip(values, 0.0, NYQUIST)
+    words = [(">" if v >= NYQUIST else "") + _number(min(v, NYQUIST), factor) for v in values]
+    return _map(ax, found, shown, words, _SHARPNESS, (0.0, NYQUIST), found.unknown)
+
+
+def error_map(ax: Axes, found: ApertureReport) -> None:
+    """Draw by how much the blur is expected to be wrong at each place."""
+    shown = np.nan_to_num(np.array(found.predicted_error), nan=1.0)
+    _map(ax, found, shown, [f"{100.0 * error:.0f}" for error in shown], "Greys", (0.0, 1.0))
+
+
+def _map(
+    ax: Axes,
+    found: ApertureReport,
+    values: NDArray[np.floating],
+    words: Sequence[str],
+    colours: LinearSegmentedColormap | str,
+    ends: tuple[float, float],
+    hatched: Sequence[bool] = (),
+) -> Any:  # noqa: ANN401 - as above
+    """Draw a value at each place of a report as a cell with its figure."""
     ax.grid(visible=False)
-    extent = (0.0, found.aspect, 0.0, 1.0)
-    image = ax.imshow(grid, cmap=_SHARPNESS, vmin=0.0, vmax=NYQUIST, extent=extent)
-    wide, high = found.aspect / found.cols, 1.0 / found.rows
-    for i, value in enumerate(values):
-        row, col = divmod(i, found.cols)
-        left, low = col * wide, 1.0 - (row + 1) * high
-        if found.unknown[i]:
-            ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
-        pale = found.unknown[i] or 0.15 < grid[row, col] / NYQUIST < 0.58
-        ink = "#131416" if pale else "#ffffff"
-        ax.text(left + wide / 2, low + high / 2, _cell(value, factor), color=ink, **_IN_CELL)
     ax.set(xticks=[], yticks=[])
+    image = ax.imshow(
+        np.asarray(values).reshape(found.rows, found.cols), cmap=colours, vmin=ends[0], vmax=ends[1],
+        extent=(0.0, found.aspect, 0.0, 1.0),
+    )  # fmt: skip
+    wide, high = found.aspect / found.cols, 1.0 / found.rows
+    for i, (word, value) in enumerate(zip(words, values, strict=True)):
+        row, col = divmod(i, found.cols)
+        left, low, pale = col * wide, 1.0 - (row + 1) * high, True
+        if any(hatched[i : i + 1]):
+            ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
+        else:
+            pale = np.dot(image.to_rgba(value)[:3], _LUMA) > _PALE
+        ax.text(left + wide / 2, low + high / 2, word, color="#131416" if pale else "#ffffff", **_IN_CELL)
     return image
-
-
-def _cell(value: float, factor: float) -> str:
-    return (">" if value >= NYQUIST else "") + _number(min(value, NYQUIST), factor)
 
 
 def _number(value: float, factor: float) -> str:
@@ -310,7 +332,7 @@ def over_apertures(ax: Axes, report: LensReport, unit: Unit = "c/px") -> None:
     stops = range(len(known))
     factor = report.sensor.factor(unit) or 1.0
     for k, spot in enumerate(known[0].spots):
-        values = [factor * min(one.spots[k].mean, NYQUIST) for one in known]
+        values = [factor * one.spots[k].mean for one in known]
         ax.plot(stops, values, "o-", label=spot.side.removeprefix("the "), lw=2.5 if k == 0 else 1.2)
     ax.set_xticks(list(stops), [one.at for one in known])
     ax.set_ylim(bottom=0.0)
@@ -341,14 +363,7 @@ def difference(ax: Axes, comparison: Comparison) -> None:
     one, two = comparison.first.found, comparison.second.found
     values = np.array(two.mean) - np.array(one.mean)
     top = max(0.02, float(np.abs(values).max()))
-    ax.grid(visible=False)
-    shown = values.reshape(one.rows, one.cols)
-    ax.imshow(shown, cmap=_CHANGES, vmin=-top, vmax=top, extent=(0.0, one.aspect, 0.0, 1.0))
-    for i, value in enumerate(values):
-        row, col = divmod(i, one.cols)
-        place = (col + 0.5) * one.aspect / one.cols, 1.0 - (row + 0.5) / one.rows
-        ax.text(*place, f"{value:+.2f}", **_IN_CELL)
-    ax.set(xticks=[], yticks=[])
+    _map(ax, one, values, [f"{value:+.2f}" for value in values], _CHANGES, (-top, top))
     ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 
@@ -383,29 +398,43 @@ def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Uni
     scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
 
 
+def _overview(ax: Axes, found: ApertureReport) -> None:
+    """Mean MTF50 over the picture, with a scale in words."""
+    image = sharpness_map(ax, found, found.mean)
+    scale = ax.figure.colorbar(image, ax=ax, location="bottom", fraction=0.05, aspect=50)
+    scale.set_ticks([0.02, 0.25, 0.45], labels=["soft", ".25", "no sensor shows more"])
+
+
+def _points(place: Place, found: ApertureReport) -> None:
+    """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
+    for ax, spot in zip(place.subplots(1, len(found.spots)), found.spots, strict=True):
+        ax.imshow(np.array(spot.kernel), cmap="gray", vmin=0.0)
+        weight = "bold" if spot is found.worst else "normal"
+        ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=weight, loc="center")
+        ax.set(xticks=[], yticks=[])
+        ax.set_xlabel(spot.words, fontsize=7.5)
+        ax.grid(visible=False)
+
+
+def _simple(report: LensReport) -> list[Panel]:
+    """What a photographer is shown."""
+    found = report.tested[0]
+    words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
+    return [
+        (f"{words} (MTF50, cycles/pixel; hatched: not known)", _on(_overview, found)),
+        ("What becomes of a point, each to its own brightest pixel", lambda on: _points(on, found)),
+    ]
+
+
 def _photographer(report: LensReport) -> Figure:
     """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
-    found = report.tested[0]
     with mpl.rc_context(_STYLE):
         figure = _page(report.name, report.verdict)
-        big = figure.add_axes((0.08, 0.44, 0.84, 0.38))
-        image = sharpness_map(big, found, found.mean)
-        words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
-        big.set_title(f"{words} (MTF50, cycles/pixel; hatched: not known)")
-        scale = figure.colorbar(
-            image, cax=figure.add_axes((0.08, 0.415, 0.84, 0.012)), orientation="horizontal"
-        )
-        scale.set_ticks([0.02, 0.25, 0.45], labels=["soft", ".25", "no sensor shows more"])
-        figure.text(0.08, 0.365, "What becomes of a point, each to its own brightest pixel", fontsize=10)
-        for k, spot in enumerate(found.spots):
-            ax = figure.add_axes((0.08 + 0.172 * k, 0.2, 0.155, 0.13))
-            ax.imshow(np.array(spot.kernel), cmap="gray", vmin=0.0)
-            weight = "bold" if spot is found.worst else "normal"
-            ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=weight, loc="center")
-            ax.set(xticks=[], yticks=[], xlabel=spot.words)
-            ax.grid(visible=False)
-        figure.text(0.08, 0.165, textwrap.fill(report.advice, 95), fontsize=10, va="top")
-        lines = [report.facts, *(f"{k}: {v}" for k, v in report.details.items())]
-        wrapped = "\n".join(textwrap.fill(line, 120) for line in lines)
-        figure.text(0.08, 0.115, wrapped, fontsize=8, color="#55585d", va="top")
+        figure.set_layout_engine("constrained", rect=(0.06, 0.22, 0.88, 0.66))
+        places: Any = figure.subfigures(2, 1, height_ratios=(3.2, 1.0))
+        for place, panel in zip(places, _simple(report), strict=True):
+            _titled(place, panel)
+        figure.text(0.08, 0.19, textwrap.fill(report.advice, 95), fontsize=10, va="top")
+        wrapped = "\n".join(textwrap.fill(line, 120) for line in report.notes)
+        figure.text(0.08, 0.14, wrapped, fontsize=8, color="#55585d", va="top")
     return figure

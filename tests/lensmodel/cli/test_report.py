@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +84,32 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, g
     run("report", NAME, "-o", "out", "--against", NAME)
 
     names = {p.name for p in (folder / "out").iterdir()}
-    assert names == {"comparison.pdf", *(f"report.{ending}" for ending in ("pdf", "png", "csv", "json"))}
+    assert names == {
+        "comparison.pdf",
+        *(f"report.{ending}" for ending in ("html", "pdf", "png", "csv", "json")),
+    }
     stored = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
     with (folder / "out" / "report.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
     found = [row for row in rows if row["aperture"] == "2" and row["direction"] == "sagittal"]
     assert [float(row["value"]) for row in found] == pytest.approx(stored["tested"][0]["sagittal"], rel=1e-4)
+
+
+def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone: None) -> None:
+    run("report", NAME, "-o", "out/mine.html", "--aperture", "2")
+
+    page = (folder / "out" / "mine.html").read_text(encoding="utf-8")
+    assert [p.name for p in (folder / "out").iterdir()] == ["mine.html"]
+    for words in (
+        "<h1>my-24mm</h1>",
+        "Next, a photo of something",
+        "Expected error of the blur",
+        "60 blur samples",
+    ):
+        assert words in page
+    assert set(re.findall(r"(?:src|href)=.(\w+:)", page)) == {"data:"}  # nothing is loaded from elsewhere
+    with pytest.raises(UsageError, match="--against needs a folder"):
+        run("report", NAME, "-o", "other.html", "--against", NAME)
 
 
 def test_the_page_says_what_it_rests_on_and_names_a_maker_once() -> None:
@@ -137,7 +158,7 @@ def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> Non
 
 
 def test_a_comparison_needs_a_folder(folder: Path) -> None:
-    with pytest.raises(UsageError, match="--against needs --output"):
+    with pytest.raises(UsageError, match="--against needs a folder"):
         run("report", NAME, "--against", NAME)
 
 

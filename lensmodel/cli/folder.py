@@ -168,10 +168,11 @@ class _Folder:
             if self._learns(calibrated, shot, group, on_event):
                 counted += 1
         bars.update(task, completed=before + most)
-        if not counted and all(
-            isinstance(self._refused[shot.path], NotEnoughEvidenceError) for shot in group.shots
-        ):
-            self._display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from")
+        refused = [self._refused.get(shot.path) for shot in group.shots]
+        if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
+            reasons = set(map(str, refused))
+            why = reasons.pop() if len(reasons) == 1 else "no photo shows enough to learn its blur from"
+            self._display.note(f"{group.lens}, {group.focal}: {why}")
         self._learned[group.name, group.focal] = counted
 
     def _calibration(self, target: Path) -> calibrating.Calibration:

@@ -14,6 +14,7 @@ LensModelError
 ├── MetadataMissingError       the photo does not say what is needed (HTTP 422)
 ├── NotEnoughEvidenceError     the photo or the model cannot answer yet (HTTP 409)
 │   ├── NoUsablePatchesError
+│   ├── TurnedPixelsError
 │   ├── NoSamplesError
 │   └── OutsideSupportError
 └── CancelledError             somebody asked to stop
@@ -103,6 +104,12 @@ class NoUsablePatchesError(NotEnoughEvidenceError):
     """No part of the photo tells about the blur."""
 
     code: ClassVar[str] = "no_usable_patches"
+
+
+class TurnedPixelsError(NotEnoughEvidenceError):
+    """Nobody can tell how the photo lay on the sensor."""
+
+    code: ClassVar[str] = "turned_pixels"
 
 
 class NoSamplesError(NotEnoughEvidenceError):

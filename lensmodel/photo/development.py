@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import rawpy
@@ -149,6 +150,7 @@ def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:
 
 def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
     pixels, transparent = read_pixels(path, header)
+    pixels = np.ascontiguousarray(np.rot90(pixels, info.turns or 0))
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
         raise UnreadablePhotoError(
@@ -177,20 +179,18 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
         pipeline=f"{info.kind}/{transfer}/1",
         grain=_grain(planes, (noise[0], noise[1], noise[2]), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
-        chroma_step=header.chroma_step,
-        remarks=(*(("its transparency is dropped",) if transparent else ()), *_of_turning(info)),
+        chroma_step=header.chroma_step[::-1] if info.turns else header.chroma_step,
+        remarks=(
+            *(("its transparency is dropped",) if transparent else ()),
+            *((_TURNED,) if info.turns is None else ()),
+        ),
     )
 
 
-def _of_turning(info: PhotoInfo) -> tuple[str, ...]:
-    """Say that a program has turned a picture: sensors are wider than high."""
-    said = info.metadata
-    if info.height <= info.width or said.orientation != 1 or said.camera_model is None:
-        return ()
-    return (
-        "a program has turned its pixels upright, and nothing tells which way: what its lens does at the top "
-        "and at the sides may be mixed up",
-    )
+_TURNED: Final = (
+    "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
+    "and the more these differ, the less is corrected"
+)
 
 
 def _grain(planes: Planes, noise: PlaneNoise, clip: tuple[float, float, float]) -> tuple[float, float, float]:

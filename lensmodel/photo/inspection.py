@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,7 @@ from lensmodel.photo.headers.header import Header, check_size
 from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.raw import exposure_of, opened_raw
 from lensmodel.photo.tags.metadata import is_centred, metadata_of
+from lensmodel.photo.turned import ORIENTATION, turns_to_sensor
 from lensmodel.photo.values import Limits, PhotoInfo
 
 MIN_SIDE = 16
@@ -67,4 +69,7 @@ def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None 
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
         )
-    return PhotoInfo(header.kind, width, height, metadata, centred=is_centred(header, metadata))
+    turns = turns_to_sensor(path, header, metadata) if raw is None else 0
+    if turns:
+        width, height, metadata = height, width, replace(metadata, orientation=ORIENTATION[turns])
+    return PhotoInfo(header.kind, width, height, metadata, is_centred(header, metadata), turns)

@@ -130,6 +130,9 @@ class PhotoInfo:
         What the file says.
     centred : bool
         Whether it shows the middle of its sensor, or all of it; false for what a program has cut.
+    turns : int or None
+        Quarter turns, counter-clockwise, from the stored pixels to those of the sensor: not 0 where a program
+        has turned them; None where nothing tells which way it did.
     """
 
     kind: FileKind
@@ -137,6 +140,7 @@ class PhotoInfo:
     height: int
     metadata: PhotoMetadata = PhotoMetadata()
     centred: bool = True
+    turns: int | None = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Sequence
 from typing import Final
+
+import numpy as np
 
 from lensmodel import correction
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError, OutsideSupportError
@@ -73,7 +76,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correction.correct_planes(
         planes,
-        field if unguarded else _Posteriors(field),
+        field if unguarded else _Posteriors(field, (1, 3) if developed.info.turns is None else (0,)),
         developed.frame,
         method=solver,
         strength=strength,
@@ -97,11 +100,19 @@ class _Posteriors:
     """What a model knows of the PSFs of a lens, as the correction needs it."""
 
     field: ModelField
+    turns: Sequence[int] = (0,)  # quarter turns that may lead from the photo to its sensor, equally likely
 
     def posterior_at(self, position: FieldPosition, channel: Channel) -> correction.PsfPosterior:
-        answer = self.field.answer_at(position, channel, correction.KERNEL_SIZE)
-        kernel = correction.crop_to_support(answer.kernel)
-        return correction.PsfPosterior.of_error(kernel, answer.predicted_error)
+        kernels, errors = [], []
+        for turn in self.turns:
+            place = FieldPosition(position.r, position.phi + turn * math.pi / 2.0)
+            answer = self.field.answer_at(place, channel, correction.KERNEL_SIZE)
+            kernels.append(np.rot90(answer.kernel, -turn))
+            errors.append(answer.predicted_error)
+        kernel = np.mean(kernels, axis=0)
+        apart = max(np.linalg.norm(each - kernel) for each in kernels) / np.linalg.norm(kernel)
+        error = math.hypot(max(errors), apart)
+        return correction.PsfPosterior.of_error(correction.crop_to_support(kernel), error)
 
 
 def _method_of(

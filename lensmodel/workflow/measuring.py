@@ -11,6 +11,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto, inspect
+from lensmodel.photo.turned import require_known_turn
 from lensmodel.workflow.sampling import require_aperture, settings_of
 
 DEFAULT_SIZE: Final = 31  # pixels: that of an estimate
@@ -29,6 +30,7 @@ def samples_of_developed(
     method = measure.methods.create(kind)
     if not photos:
         raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
+    require_known_turn(photos[0].info)
     require_aperture(photos[0].info.metadata, settings)
     chosen = settings_of(photos[0], settings)
     measured = method.measure(photos, size=size, on_step=on_step)

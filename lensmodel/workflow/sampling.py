@@ -41,6 +41,7 @@ from lensmodel.model import LensModel
 from lensmodel.model.answer import DEFAULT, PAPER
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto, PhotoMetadata
+from lensmodel.photo.turned import require_known_turn
 from lensmodel.workflow.lens import Lens
 
 log = logging.getLogger(__name__)
@@ -232,6 +233,7 @@ def find_patches(
 
     An estimator of whole photos chooses its own; for others `selector` scores windows of the green plane.
     """
+    require_known_turn(developed.info)
     method = blind.estimators.resolve(estimator)
     if isinstance(method, blind.PhotoEstimator):
         selection = method.select(developed, count=count)

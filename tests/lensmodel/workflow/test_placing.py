@@ -158,29 +158,6 @@ def test_a_photo_of_unknown_pitch_is_placed_by_its_size_alone(
         assert placed(developed_of(CROPPED, of_photo), model).frame.circle_px is not None
 
 
-@pytest.mark.parametrize(
-    ("rows", "cols", "orientation", "turned"),
-    [
-        (300, 200, 1, True),
-        (300, 200, 6, False),
-        (200, 300, 1, False),
-        (200, 200, 1, False),
-    ],
-)
-def test_a_picture_whose_pixels_were_turned_by_a_program_says_so(
-    rows: int, cols: int, orientation: int, turned: bool, tmp_path: Path
-) -> None:
-    block = Image.Exif()
-    block[0x0110], block[0x0112] = "T-1", orientation
-    pixels = np.random.default_rng(0).integers(0, 255, (rows, cols, 3), dtype=np.uint8)
-    for name in ("x.jpg", "x.tif", "x.png"):
-        Image.fromarray(pixels).save(tmp_path / name, exif=block)
-
-        remarks = photo.develop(tmp_path / name).remarks
-
-        assert any("turned its pixels" in remark for remark in remarks) == turned
-
-
 def test_lateral_colour_in_another_unit_displaces_the_same_pixels_alike() -> None:
     own = LateralColour((1e-3, -2e-3, 1e-3, 1.002), (0.0, 0.0, 0.0, 0.999), 300.0)
     other = own.counted_in(450.0)

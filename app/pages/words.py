@@ -68,7 +68,6 @@ REASONS: Final[Mapping[str, str]] = {
     "one-directional": "detail in one direction only",
     "periodic": "a repeating pattern, which misleads the estimate",
     "jpeg-blocks": "blocks of JPEG compression",
-    "defocus": "blurrier than its surroundings: probably out of focus",
     "border": "too near the edge of the picture",
     "duplicate": "overlaps a better one",
 }

@@ -74,7 +74,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
     noise = NoiseModel.white(sigma)
     blocks = measure_blocks(plane, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
     windows = windows_of(blocks, Frame(*plane.shape), noise)
-    usable = np.flatnonzero(first_reasons(windows, np.zeros(len(windows))) == "")
+    usable = np.flatnonzero(first_reasons(windows) == "")
     if usable.size < WINDOWS_A_GROUP:
         return
     drawn = np.sort(rng.choice(usable, WINDOWS_A_GROUP, replace=False))

@@ -1,4 +1,4 @@
-"""What speaks against a window: its own spectrum, periods, blocks and blobs, and defocus beside the others.
+"""What speaks against a window: its own spectrum, periods, blocks and blobs.
 
 And whether the chosen patches of a photo are enough, and spread out enough, to tell about its lens.
 """
@@ -18,7 +18,7 @@ from scipy import fft, ndimage
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.types import FieldPosition, Plane
-from lensmodel.patches.windows import BLOCKS_A_SIDE, CLIP_SHARE, SLOPE_ORDER, Patch, Windows
+from lensmodel.patches.windows import CLIP_SHARE, SLOPE_ORDER, Patch
 
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
 BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
@@ -260,107 +260,6 @@ def _kurtosis(values: NDArray[np.float64]) -> float:
     squares = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()]) ** 2
     square = float(np.mean(squares))
     return float(np.mean(squares**2)) / max(square * square, 1e-30)
-
-
-RINGS: Final = 8
-"""Of equal width in r: blur changes little within one, and each holds windows enough (chosen)."""
-ENVELOPE_PERCENTILE: Final = 15.0
-"""Of a ring's widths, see `width_envelope`: lower is a single window's error, higher needs more of the photo
-in focus (chosen)."""
-ENVELOPE_RATIO: Final = 1.25
-"""Of width to envelope, above which a window is defocused: widths scatter by some of it in focus, and a
-quarter wider harms a kernel (chosen)."""
-CORNER_ALLOWANCE: Final = 0.2
-"""The allowed ratio grows with r²: copies of a lens differ, and a decentred one is not out of focus."""
-GROWTH: Final = 4.0
-"""Of the envelope with r², see `width_envelope`: corners five times as wide as the centre are as bad as
-lenses get (chosen)."""
-SURFACE_LIMIT: Final = 0.19
-"""Of the log width, see `smooth_widths`: less and no real photo is smooth, more and depths pass for a lens
-(chosen)."""
-JUMP_SHARE: Final = 0.5
-"""Of the range of log widths, see `smooth_widths`: a slope takes a sixth of it, a step of depth all
-(chosen)."""
-SURFACE_STEPS: Final = 12  # of reweighting, each a small system: later ones change less (chosen)
-MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients: fewer let a surface follow the scene (chosen)
-QUARTER_ALLOWANCE: Final = 1.2
-"""A quarter of a window has fewer edges, its width a larger error: 1 would call windows defocused by chance
-(chosen)."""
-SHARP_PX: Final = 0.6
-"""Edges of a sharp photo measure about this wide; a smaller width carries no information."""
-MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
-
-
-def width_envelope(windows: Windows) -> NDArray[np.float64]:
-    """Smallest consistent edge width at each window's r.
-
-    Defocus can only widen, so that the lower envelope over a ring of the field is the width of
-    the lens in focus. The rings' 15th percentiles become an envelope by two facts about lenses:
-    it does not fall outwards, so that a ring holds at most what every ring further out holds;
-    and it grows by no more than the factor 1 + 4 r², so that a background far out of focus does
-    not pass for a soft corner.
-    """
-    known = np.isfinite(windows.width)
-    ring = np.minimum((windows.r * RINGS).astype(np.intp), RINGS - 1)
-    members = [windows.width[known & (ring == k)] for k in range(RINGS)]
-    used = [k for k in range(RINGS) if members[k].size >= MIN_IN_RING]
-    if not used:
-        return np.full(len(windows), np.inf)
-    low = np.array([np.percentile(members[k], ENVELOPE_PERCENTILE) for k in used])
-    level = np.maximum(np.minimum.accumulate(low[::-1])[::-1], SHARP_PX)
-    centres = (np.array(used) + 0.5) / RINGS
-    most = level[0] * (1.0 + GROWTH * windows.r**2)
-    return np.minimum(np.interp(windows.r, centres, level), most)
-
-
-def smooth_widths(windows: Windows) -> NDArray[np.float64]:
-    """Widths that a decentred or tilted lens would have, NaN where the photo does not look like one.
-
-    Such a lens is soft on one side, which the rings of `width_envelope` would take for defocus.
-    But its blur changes smoothly over the field, while a scene has depth steps. So the logarithm
-    of the width is fitted by a quadratic surface, robustly. The surface is accepted if four
-    windows in five follow it to within 19 percent, and if the width does not jump: over a sixth
-    of the frame, 95 of 100 changes stay below half of the range that it has in the photo.
-    """
-    known = np.isfinite(windows.width)
-    if int(known.sum()) < MIN_FOR_SURFACE:
-        return np.full(len(windows), np.nan)
-    x, y = windows.r * np.cos(windows.phi), windows.r * np.sin(windows.phi)
-    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    target, part = np.log(np.maximum(windows.width[known], SHARP_PX)), basis[known]
-    weight = np.ones_like(target)
-    residual = target
-    for _ in range(SURFACE_STEPS):
-        fit = np.linalg.lstsq(part * weight[:, None], target * weight, rcond=None)[0]
-        residual = np.abs(target - part @ fit)
-        # Least absolute deviations by reweighting; the floor is the measurement error.
-        weight = 1.0 / np.sqrt(np.maximum(residual, 0.03))
-    believed = float(np.quantile(residual, 0.8)) < SURFACE_LIMIT and not _jumps(windows)
-    return np.exp(basis @ fit) if believed else np.full(len(windows), np.nan)
-
-
-def _jumps(windows: Windows) -> bool:
-    rows, row_at = np.unique(windows.rows, return_inverse=True)
-    cols, col_at = np.unique(windows.cols, return_inverse=True)
-    grid = np.full((rows.size, cols.size), np.nan)
-    grid[row_at, col_at] = np.log(np.maximum(windows.width, SHARP_PX))
-    lag = max(BLOCKS_A_SIDE, cols.size // 6)
-    steps = np.abs(
-        np.concatenate([(grid[lag:] - grid[:-lag]).ravel(), (grid[:, lag:] - grid[:, :-lag]).ravel()])
-    )
-    steps = steps[np.isfinite(steps)]
-    if steps.size < MIN_FOR_SURFACE:
-        return True
-    low, high = np.nanquantile(grid, (0.1, 0.9))
-    return float(np.quantile(steps, 0.95)) > JUMP_SHARE * float(high - low)
-
-
-def defocus_excess(windows: Windows) -> NDArray[np.float64]:
-    """Width over the envelope's limit: above 1 the window counts as defocused; 0 where unknown."""
-    envelope = np.fmax(width_envelope(windows), smooth_widths(windows))
-    limit = envelope * ENVELOPE_RATIO * (1.0 + CORNER_ALLOWANCE * windows.r**2)
-    worst = np.fmax(windows.width, windows.widest / QUARTER_ALLOWANCE)
-    return np.nan_to_num(worst / limit)
 
 
 LEAST_PATCHES: Final = 6

@@ -58,8 +58,6 @@ EVIDENCE_FLOOR: Final = 0.25
 quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
 SHORTLIST_A_SECTOR: Final = 8
 """Windows that the costlier scores look at: several times as many as are taken (chosen)."""
-# Of the logarithm of the width over the envelope: where the weight is 1/e (chosen)
-FOCUS_SOFTNESS: Final = 0.33
 
 _ADVICE: Final[dict[str, str]] = {
     "flat": "take a scene with more fine detail, at a lower ISO",
@@ -69,7 +67,6 @@ _ADVICE: Final[dict[str, str]] = {
     "periodic": "avoid fences, grids and facades that repeat",
     "jpeg-blocks": "use the RAW file or a higher JPEG quality",
     "border": "crop the empty border away",
-    "defocus": "take a flat, distant scene in focus",
 }
 
 
@@ -185,8 +182,7 @@ def select(
     side = _block_side(frame, size)
     blocks = measure_blocks(plane, noise, side, clip, on_step)
     windows = windows_of(blocks, frame, noise)
-    excess = checks.defocus_excess(windows)
-    reasons = first_reasons(windows, excess)
+    reasons = first_reasons(windows)
     usable = np.flatnonzero(reasons == "")
     short = usable[spread.shortlist(windows.take(usable), edge_score(windows)[usable], SHORTLIST_A_SECTOR)]
     reasons[np.setdiff1d(usable, short)] = "duplicate"
@@ -197,7 +193,7 @@ def select(
         reasons[short] = second_reasons(looked)
         fine = reasons[short] == ""
         left = short[fine]
-        score[left] = chooser.score(windows.take(left), looked.take(fine)) * _focus_weight(excess[left])
+        score[left] = chooser.score(windows.take(left), looked.take(fine))
         if left.size:
             picks = spread.spread_windows(windows.take(left), score[left], count)
             chosen = [(int(left[i]), cell) for i, cell in picks]
@@ -226,7 +222,7 @@ def _block_side(frame: Frame, size: int) -> int:
     return min(size, fitting) // BLOCKS_A_SIDE
 
 
-def first_reasons(windows: Windows, excess: NDArray[np.float64]) -> NDArray[np.str_]:
+def first_reasons(windows: Windows) -> NDArray[np.str_]:
     """Reason of each window from block sums alone, the first that holds; empty where none does."""
     small, large = windows.eigenvalues.T
     tests: list[tuple[Reason, NDArray[np.bool_]]] = [
@@ -236,7 +232,6 @@ def first_reasons(windows: Windows, excess: NDArray[np.float64]) -> NDArray[np.s
         ("flat", (windows.contrast < FLAT_CONTRAST) | (large < FLAT_EIGENVALUE)),
         ("one-directional", small < ONE_DIRECTION_RATIO * large),
         ("flat", small < FLAT_EIGENVALUE),
-        ("defocus", excess > 1.0),
     ]
     return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
 
@@ -251,12 +246,6 @@ def second_reasons(looked: Details) -> NDArray[np.str_]:
         ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
     ]
     return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
-
-
-def _focus_weight(excess: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fall from 1 at the envelope to a third at the limit: of equal windows the sharper wins."""
-    over = np.maximum(excess * checks.ENVELOPE_RATIO - 1.0, 0.0)
-    return np.exp(-np.square(over / FOCUS_SOFTNESS))
 
 
 def _look(plane: Plane, windows: Windows, i: int, clip: float, coarse: NoiseModel | None) -> Details:

@@ -28,7 +28,7 @@ from lensmodel.patches.rmap import (
 )
 
 Reason: TypeAlias = Literal[
-    "border", "clipped", "dark", "flat", "one-directional", "periodic", "jpeg-blocks", "defocus", "duplicate"
+    "border", "clipped", "dark", "flat", "one-directional", "periodic", "jpeg-blocks", "duplicate"
 ]
 """Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
 

@@ -279,37 +279,6 @@ def test_windows_with_missing_pixels_are_rejected_as_border(part: Plane) -> None
     assert {r.reason for r in result.rejected if r.col < 40} == {"border"}
 
 
-def test_a_defocused_part_is_left_out_and_the_rest_kept(scene: Plane, selection: Selection) -> None:
-    t = np.hypot(*np.ogrid[-4:5, -4:5])
-    disc = (np.clip(3.0 + 0.5 - t, 0.0, 1.0)).astype(np.float32)
-    out_of_focus = np.zeros(scene.shape, dtype=bool)
-    out_of_focus[:, 900:] = True
-    blurred = ndimage.convolve(scene, disc / disc.sum())
-    result = chosen(photo_of(np.where(out_of_focus, blurred, scene)), count=36)
-
-    defocused = [p for p in result.patches if overlap(p, out_of_focus) > 0.5]
-    in_focus = [p for p in selection.patches if overlap(p, out_of_focus) == 0.0]
-    assert len(defocused) < 0.05 * len(result.patches)
-    assert len(result.patches) - len(defocused) > 0.5 * len(in_focus)
-
-
-def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane) -> None:
-    scene = scene[:720, :1080]
-    rows, cols = np.mgrid[-360:360, -540:540] / 649.0
-    sigma = 0.6 + 1.5 * (rows**2 + (cols + 0.25) ** 2)
-    steps = np.array([0.5, 0.8, 1.2, 1.7, 2.4])
-    blurred = np.stack([ndimage.gaussian_filter(scene, step) for step in steps])
-    at = np.clip(np.interp(sigma, steps, np.arange(5)), 0, 3.999)
-    low = at.astype(int)
-    r, c = np.indices(scene.shape)
-    soft = blurred[low, r, c] * (1 - (at - low)) + blurred[low + 1, r, c] * (at - low)
-    result = chosen(photo_of(soft.astype(np.float32), blur_px=0.01))
-
-    windows = len(result.patches) + len(result.rejected)
-    assert sum(r.reason == "defocus" for r in result.rejected) < 0.05 * windows
-    assert sum(p.position.r > 0.6 and abs(p.position.phi) < 0.8 for p in result.patches) >= 3
-
-
 def test_noise_alone_is_refused_with_a_remedy() -> None:
     noise = np.random.default_rng(5).normal(0.4, 0.003, (400, 500)).astype(np.float32)
 

@@ -38,13 +38,7 @@ def gallery(
         list[str] | None,
         typer.Option("--only", metavar="NAME", help="Only pictures whose name holds this; may be repeated."),
     ] = None,
-    mode: Annotated[
-        str | None, typer.Option(metavar="MODE", help="Mode of the lens model instead of the default one.")
-    ] = None,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes and threads.")] = 2,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Make stored results of these pictures anew.")
-    ] = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
@@ -70,8 +64,6 @@ def gallery(
     folder = data or (Path(named) if named else None)
     began = time.monotonic()
     with as_usage():
-        settings = run.GallerySettings(mode=mode, workers=workers, fresh=fresh)
-        _ = settings.model
         known = [] if folder is None else pictures.real_pictures(folder)
         chosen = pictures.chosen([*known, *pictures.simulated_pictures(output / run.CACHE)], only or [])
 
@@ -79,7 +71,7 @@ def gallery(
         shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
 
     entries = []
-    for entry in run.entries_of(chosen, output, settings, on_picture=progress):
+    for entry in run.entries_of(chosen, output, workers=workers, on_picture=progress):
         entries.append(entry)
         page = write_page(entries, output)  # after each: a run that is stopped leaves a page
     shown.result(text(entries))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,13 +24,11 @@ from lab.gallery.pictures import FRAMES, Picture, take
 from lab.gallery.rendering import Rendered, read_rendered, rendered
 from lab.images import BLOCK
 from lab.store import Unit, stored
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import LensSettings
-from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import develop
-from lensmodel.workflow import sampling
-from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.sampling import CalibrationEvent
 
 OnPicture = Callable[[str, int, int], None]
 """Hears what is being done, and how many of how many pictures are finished."""
@@ -69,22 +66,8 @@ class GalleryEntry:
     places: tuple[PicturePlace, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class GallerySettings:
-    """How pictures are worked on."""
-
-    mode: str | None = None  # mode of the lens model; None is the default one
-    workers: int = 2  # processes of a calibration, threads of a correction
-    fresh: bool = False  # whether stored results are made anew
-
-    @property
-    def model(self) -> ModelSettings:
-        """Settings of the lens model."""
-        return ModelSettings() if self.mode is None else ModelSettings(mode=self.mode)
-
-
 def entries_of(
-    pictures: Sequence[Picture], output: Path, settings: GallerySettings, *, on_picture: OnPicture
+    pictures: Sequence[Picture], output: Path, *, workers: int, on_picture: OnPicture
 ) -> Iterator[GalleryEntry]:
     """Make what the page shows, one picture after the other.
 
@@ -99,18 +82,16 @@ def entries_of(
         def say(words: str, done: int = done, name: str = picture.name) -> None:
             on_picture(f"{name}: {words}", done, len(pictures))
 
-        entry = _entry(picture, output, settings, say)
+        entry = _entry(picture, output, workers, say)
         say("done", done + 1)
         yield entry
 
 
-def _entry(
-    picture: Picture, output: Path, settings: GallerySettings, say: Callable[[str], None]
-) -> GalleryEntry:
+def _entry(picture: Picture, output: Path, workers: int, say: Words) -> GalleryEntry:
     if picture.unreadable:
         unit: Unit = {"state": "not read", "reason": picture.unreadable, "notes": []}
         return GalleryEntry(picture, unit, {}, {}, (), ())
-    folder, unit = work(picture, output / CACHE, settings, say)
+    folder, unit = work(picture, output / CACHE, workers, say)
     before = _mapped(folder / BEFORE)
     shown = _mapped(folder / AFTER) if (folder / AFTER).exists() else before
     known = None if picture.truth is None else _mapped(picture.truth)
@@ -137,7 +118,7 @@ def _entry(
     return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made))
 
 
-def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -> tuple[Path, Unit]:
+def work(picture: Picture, cache: Path, workers: int, say: Words) -> tuple[Path, Unit]:
     """Calibrate a picture from itself and correct it, unless that is stored.
 
     Returns
@@ -150,11 +131,8 @@ def work(picture: Picture, cache: Path, settings: GallerySettings, say: Words) -
     _taken(picture, say)
     content = _hash(picture.path)
     code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))
-    version = hashlib.sha256(f"{code} {settings.model}".encode()).hexdigest()[:8]
-    folder = cache / f"{picture.slug}-{content[:8]}-{version}"
-    if settings.fresh and folder.exists():
-        shutil.rmtree(folder)
-    unit, _ = stored(folder / "work.json", lambda: _worked(picture, folder, settings, say))
+    folder = cache / f"{picture.slug}-{content[:8]}-{code[:8]}"
+    unit, _ = stored(folder / "work.json", lambda: _worked(picture, folder, workers, say))
     return folder, unit
 
 
@@ -177,7 +155,7 @@ def _taken(picture: Picture, say: Words) -> None:
     take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
 
 
-def _worked(picture: Picture, folder: Path, settings: GallerySettings, say: Words) -> Unit:
+def _worked(picture: Picture, folder: Path, workers: int, say: Words) -> Unit:
     say("developing")
     developed = develop(picture.path)
     _save(folder / BEFORE, rendered(developed.planes, developed.encoding))
@@ -193,10 +171,18 @@ def _worked(picture: Picture, folder: Path, settings: GallerySettings, say: Word
         "announced": {},
     }
     began = time.monotonic()
+    say("calibrating")
+    reasons: list[str] = []
+
+    def heard(event: CalibrationEvent) -> None:
+        if event.stage == "skipped":
+            reasons.append(event.detail)
+
     try:
-        model = _model(picture, folder, settings, override, say)
+        lens = lensmodel.calibrate(picture.path, aperture=override.aperture, workers=workers, on_event=heard)
     except LensModelError as error:
-        return {**unit, "reason": f"calibration was refused: {error}", "seconds": [_since(began), 0.0]}
+        reason = f"calibration was refused: {reasons[0] if reasons else error}"
+        return {**unit, "reason": reason, "seconds": [_since(began), 0.0]}
     calibrated = _since(began)
     began = time.monotonic()
     say("correcting")
@@ -204,12 +190,7 @@ def _worked(picture: Picture, folder: Path, settings: GallerySettings, say: Word
         output = Path(name) / "corrected.tif"
         try:
             corrected = lensmodel.correct(
-                picture.path,
-                Lens(LensProfile(model)),
-                output,
-                aperture=override.aperture,
-                color_space="srgb",
-                workers=settings.workers,
+                picture.path, lens, output, aperture=override.aperture, color_space="srgb", workers=workers
             )
         except LensModelError as error:
             reason = f"correction was refused: {error}"
@@ -218,37 +199,6 @@ def _worked(picture: Picture, folder: Path, settings: GallerySettings, say: Word
         _save(folder / AFTER, read_rendered(output))
     announced = {zone: _finite(report.expected_gain_db) for zone, report in corrected.zones.items()}
     return {**unit, "state": "corrected", "announced": announced, "seconds": seconds}
-
-
-def _model(
-    picture: Picture, folder: Path, settings: GallerySettings, override: LensSettings, say: Words
-) -> LensModel:
-    path = folder / "own.lensprofile"
-    if path.exists():
-        return load_profile(path).model
-    reasons: list[str] = []
-    heard_last = [""]
-
-    def heard(event: sampling.CalibrationEvent) -> None:
-        if event.stage == "skipped":
-            reasons.append(event.detail)
-        quarter = f" {25 * (4 * event.done // event.total)} %" if event.total else ""
-        if heard_last[-1] != (words := f"calibrating: {event.stage}{quarter}"):
-            heard_last.append(words)
-            say(words)
-
-    try:
-        model = lensmodel.calibrate(
-            picture.path,
-            aperture=override.aperture,
-            model=settings.model,
-            workers=settings.workers,
-            on_event=heard,
-        ).model
-    except LensModelError as error:
-        raise InvalidInputError(reasons[0] if reasons else str(error)) from error
-    save_profile(path, LensProfile(model))
-    return model
 
 
 def _finite(value: float | None) -> float | None:

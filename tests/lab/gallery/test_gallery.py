@@ -28,7 +28,7 @@ from lab.gallery.measure import TILE, bars, measured
 from lab.gallery.page import text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, take
 from lab.gallery.rendering import rendered
-from lab.gallery.run import GallerySettings, entries_of
+from lab.gallery.run import entries_of
 from lab.images import gains
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
@@ -380,12 +380,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def known_lens(*args: Any, **options: Any) -> Lens:
-    return _known_lens(options["model"])
-
-
 @cache
-def _known_lens(model: Any) -> Lens:
+def known_lens(*args: Any, **options: Any) -> Lens:
     samples = [
         PsfSample(
             gaussian(15, np.eye(2)),
@@ -397,7 +393,7 @@ def _known_lens(model: Any) -> Lens:
         for r in (0.1, 0.5, 0.9)
         for phi in (-2.0, 0.5, 2.5)
     ]
-    return Lens(LensProfile(LensModel.fit(samples, model)))
+    return Lens(LensProfile(LensModel.fit(samples)))
 
 
 def refused(*args: Any, **options: Any) -> Lens:
@@ -423,11 +419,7 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     monkeypatch.setattr(lensmodel, "calibrate", known_lens)
     output = tmp_path / "gallery"
 
-    entries = list(
-        entries_of(
-            real_pictures(folder), output, GallerySettings(mode="default", workers=1), on_picture=ignore
-        )
-    )
+    entries = list(entries_of(real_pictures(folder), output, workers=1, on_picture=ignore))
     page = write_page(entries, output).read_text(encoding="utf-8")
 
     assert entries[0].work["state"] == "corrected"
@@ -444,9 +436,7 @@ def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
 ) -> None:
     monkeypatch.setattr(lensmodel, "calibrate", refused)
 
-    entries = list(
-        entries_of(real_pictures(folder), tmp_path / "gallery", GallerySettings(), on_picture=ignore)
-    )
+    entries = list(entries_of(real_pictures(folder), tmp_path / "gallery", workers=1, on_picture=ignore))
 
     assert entries[0].work["state"] == "left alone"
     assert "calibration was refused: no photo could be used" in write_page(
@@ -456,7 +446,7 @@ def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
     assert all(entries[0].bars.values())
 
 
-def test_what_is_stored_is_not_made_again_unless_asked(
+def test_what_is_stored_is_not_made_again(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
@@ -468,16 +458,16 @@ def test_what_is_stored_is_not_made_again_unless_asked(
     monkeypatch.setattr(lensmodel, "calibrate", counted)
     pictures = real_pictures(folder)
 
-    for fresh in (False, False, True):
-        list(entries_of(pictures, tmp_path / "gallery", GallerySettings(fresh=fresh), on_picture=ignore))
+    for _ in range(2):
+        list(entries_of(pictures, tmp_path / "gallery", workers=1, on_picture=ignore))
 
-    assert len(calls) == 2
+    assert len(calls) == 1
 
 
 def test_an_unreadable_file_is_named_with_its_reason(tmp_path: Path) -> None:
     picture = Picture("raw/odd.gpr", tmp_path / "odd.gpr", unreadable="packed as VC-5 is not read")
 
-    entries = list(entries_of([picture], tmp_path / "gallery", GallerySettings(), on_picture=ignore))
+    entries = list(entries_of([picture], tmp_path / "gallery", workers=1, on_picture=ignore))
 
     assert "packed as VC-5 is not read" in write_page(entries, tmp_path / "gallery").read_text(
         encoding="utf-8"

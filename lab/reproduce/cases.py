@@ -30,7 +30,7 @@ PROTOCOL: Final = 7
 METHODS: Final = ("standard", "paper")
 """Non-blind methods; here `paper` is the deconvolution alone, Richardson-Lucy, with our own PSFs."""
 
-RIVALS: Final = ("schuler", "kee")
+RIVALS: Final = ("schuler",)
 
 FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""

@@ -112,7 +112,7 @@ def _rivals(sources: Mapping[str, str]) -> str:
     if not sources:
         return ""
     named = "; ".join(f"{name}: {source}" for name, source in sources.items())
-    return f"Beside it, made anew by us, the blind rivals {named}. "
+    return f"Beside it, made anew by us, the blind rival {named}. "
 
 
 def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:

@@ -1,17 +1,14 @@
-"""The blind methods that the paper compares with, made anew: what they make of the same photos."""
+"""The blind method that the paper compares with, made anew: what it makes of the same photos."""
 
 from lab.rivals.basis import BasisField, RadialBasis, load_basis, principal
-from lab.rivals.kee import GaussianField, Kee
 from lab.rivals.rival import Rival
 from lab.rivals.schuler import Schuler
 from lensmodel.core.registry import Registry
 
-rivals: Registry[Rival] = Registry("rival", {"kee": Kee, "schuler": Schuler})
+rivals: Registry[Rival] = Registry("rival", {"schuler": Schuler})
 
 __all__ = [
     "BasisField",
-    "GaussianField",
-    "Kee",
     "RadialBasis",
     "Rival",
     "Schuler",

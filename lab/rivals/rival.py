@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import FieldPosition, NoiseModel, Plane, Planes
@@ -50,13 +49,3 @@ def windows_of(photos: Sequence[LinearPhoto]) -> list[PhotoWindow]:
             planes = np.ascontiguousarray(photo.planes[:, rows, cols])
             found.append(PhotoWindow(planes, photo.noise, patch.position))
     return found
-
-
-def powers(degree: int) -> list[tuple[int, int]]:
-    """Exponents of x and y of all terms of a polynomial in the plane, the constant first."""
-    return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
-
-
-def polynomial(x: NDArray[np.float64], y: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Terms of `powers` at places, shape (..., terms)."""
-    return np.stack([x**i * y**j for i, j in powers(degree)], axis=-1)

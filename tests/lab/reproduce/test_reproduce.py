@@ -262,7 +262,7 @@ def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages()
     } <= names
     assert not names & {f"lab/reproduce/{name}.py" for name in ("bars", "page", "tables")}
     rivals = {path.stem for path in code_of("lab.rivals")}
-    assert {"kee", "schuler", "gradients", "pyramid"} <= rivals
+    assert {"schuler", "gradients", "pyramid"} <= rivals
 
 
 def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
@@ -333,8 +333,8 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             },
             "paths": {},
             "rivals": {
-                "kee": {
-                    "pictures": {"kee-paper": "kee.png"},
+                "schuler": {
+                    "pictures": {"schuler-paper": "schuler.png"},
                     "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
                     "methods": {"paper": state(130, 31.0)},
                 }
@@ -347,7 +347,7 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
         "plan": {
             "size": "quick",
             "methods": ["paper"],
-            "rivals": {"kee": "Kee et al. 2011"},
+            "rivals": {"schuler": "Schuler et al. 2012"},
             "own_scenes": True,
         },
         "scenes": ["city", "lake"],
@@ -372,11 +372,11 @@ def test_share_of_a_small_gain_is_left_out() -> None:
 def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
     found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
     rows = {row["state"]: row for row in found["mtf"]["paper"]}
-    assert list(rows) == ["without correction", "denoised only", "kee, n = 1", "n = 1", "true PSF"]
+    assert list(rows) == ["without correction", "denoised only", "schuler, n = 1", "n = 1", "true PSF"]
     assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
     assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
     assert found["worse"]["paper"]["1"] == {"zones": 9, "worse": 6, "clearly_worse": 3}
-    assert found["psf_others"]["kee, n = 1"]["corner"] == pytest.approx(0.5)
+    assert found["psf_others"]["schuler, n = 1"]["corner"] == pytest.approx(0.5)
     assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
 
 
@@ -531,7 +531,7 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert "developed on 1 of them" in text
     text = markdown.read_text(encoding="utf-8")
     assert "| default, n = 1 | 160 |" in text
-    assert "| kee, n = 1 | 130 |" in text
+    assert "| schuler, n = 1 | 130 |" in text
     assert "MISSED" in text
 
 

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from lab.rivals import BasisField, Kee, RadialBasis, Schuler, load_basis, principal, rivals
+from lab.rivals import BasisField, RadialBasis, Schuler, load_basis, principal, rivals
 from lab.rivals.basis import save_basis
-from lab.rivals.kee import core_variance
-from lab.rivals.rival import PhotoWindow, polynomial, powers
+from lab.rivals.rival import PhotoWindow
 from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import distance, gaussian, second_moments
+from lensmodel.core.psf import distance, gaussian
 from lensmodel.core.types import FieldPosition, NoiseModel
 from lensmodel.simulate import draw_lens
 
@@ -29,21 +28,6 @@ NOISE = NoiseModel(1e-6, 1e-7)
 @lru_cache(maxsize=1)
 def leaves() -> np.ndarray:
     return dead_leaves(2 * 140, 3 * 140, np.random.default_rng(5), smallest=4.0)[1]
-
-
-@lru_cache(maxsize=1)
-def straight_edges() -> np.ndarray:
-    """Squares turned by many angles, four in each window, their borders area-sampled."""
-    rows, cols = np.mgrid[0:280, 0:420].astype(np.float64)
-    scene = np.full(rows.shape, 0.2)
-    for number in range(24):
-        middle = 35.0 + 70.0 * (number // 6), 35.0 + 70.0 * (number % 6)
-        angle = 0.13 + 1.7 * number
-        along = np.cos(angle) * (cols - middle[1]) - np.sin(angle) * (rows - middle[0])
-        beside = np.sin(angle) * (cols - middle[1]) + np.cos(angle) * (rows - middle[0])
-        share = np.clip(22.5 - np.maximum(np.abs(along), np.abs(beside)), 0.0, 1.0)
-        scene += share * (0.4 + 0.02 * (number % 5))
-    return scene
 
 
 def windows(kernel_of: object, scene: np.ndarray, side: int = 140) -> list[PhotoWindow]:
@@ -84,71 +68,6 @@ def test_every_rival_has_a_name_and_a_source() -> None:
         made = rivals.create(name)
         assert made.name == name
         assert "20" in made.source
-
-
-# --- Kee ---------------------------------------------------------------------------------------
-
-
-def test_polynomial_has_one_term_for_each_power() -> None:
-    terms = polynomial(np.array([2.0]), np.array([3.0]), 2)[0]
-    assert powers(2) == [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
-    assert terms.tolist() == [1.0, 2.0, 3.0, 4.0, 6.0, 9.0]
-
-
-def test_field_of_gaussians_is_found_from_exact_edge_widths() -> None:
-    rng = np.random.default_rng(3)
-    true = rng.normal(size=(6, 3))
-    places, angle = rng.uniform(-0.7, 0.7, (400, 2)), rng.uniform(0.0, math.pi, 400)
-    entries = polynomial(places[:, 0], places[:, 1], 2) @ true
-    normal = np.stack([-np.sin(angle), np.cos(angle)])
-    variance = (
-        entries[:, 0] * normal[0] ** 2
-        + 2 * entries[:, 1] * normal[0] * normal[1]
-        + entries[:, 2] * normal[1] ** 2
-    )
-    found = Kee(degree=2, pull=1e-9, expectile=0.5).solved(places, angle, variance)
-    assert found == pytest.approx(true, abs=1e-3)
-
-
-def test_soft_edges_of_the_scene_move_the_field_less_than_their_share() -> None:
-    rng = np.random.default_rng(4)
-    places, angle = rng.uniform(-0.7, 0.7, (600, 2)), rng.uniform(0.0, math.pi, 600)
-    variance = np.full(600, 1.0)
-    variance[rng.random(600) < 0.4] += rng.uniform(0.5, 6.0)
-    found = Kee(degree=0).solved(places, angle, variance)[0]
-    assert found[0] == pytest.approx(1.0, abs=0.1)
-    assert found[2] == pytest.approx(1.0, abs=0.1)
-
-
-def test_variance_of_a_gaussian_line_is_its_own() -> None:
-    s = (np.arange(72) - 36 + 0.5) * 0.25
-    # cut at a twentieth of the peak it loses a little
-    assert core_variance(np.exp(-0.5 * (s / 1.5) ** 2)) == pytest.approx(1.5**2, rel=0.15)
-
-
-@pytest.mark.slow  # its parts are tested above, each by itself
-def test_kee_recovers_widths_and_axes_of_a_field_of_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    def truth(place: FieldPosition) -> np.ndarray:
-        return gaussian(SIDE, local(place, 0.8, math.hypot(0.8, 1.5 * place.r)))
-
-    monkeypatch.setattr("lab.rivals.kee.windows_of", lambda _: windows(truth, straight_edges()))
-    field = Kee(expectile=0.5, softness_px2=0.0).field(())
-    errors = []
-    for window in windows(truth, straight_edges()):
-        found = field.kernel_at(window.position, "g", SIDE)
-        errors.append(distance(found, truth(window.position)).rel_l2)
-        rr, rc, cc = second_moments(found)[[0, 0, 1], [0, 1, 1]]
-        wanted = second_moments(truth(window.position))
-        assert np.sign(rc) == np.sign(wanted[0, 1]) or abs(wanted[0, 1]) < 0.1
-        assert (rr > cc) == (wanted[0, 0] > wanted[1, 1])
-    assert np.median(errors) < 0.12
-
-
-def test_kee_refuses_photos_without_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    flat = PhotoWindow(np.full((3, 128, 128), 0.5, dtype=np.float32), (NOISE,) * 3, FieldPosition(0.5, 0.0))
-    monkeypatch.setattr("lab.rivals.kee.windows_of", lambda _: [flat])
-    with pytest.raises(NotEnoughEvidenceError, match="straight edges"):
-        Kee().field(())
 
 
 # --- Schuler -----------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
@@ -24,8 +24,6 @@ Colour: TypeAlias = tuple[float, float, float]
 Mask: TypeAlias = NDArray[np.float32]
 
 _OVER: Final = 3  # drawings are made larger by this factor and averaged: sampled by area
-_DISC_PX: Final = 4.0  # radius of a point out of focus (chosen)
-_TRAIL_PX: Final = 11  # way of what moves while the shutter is open (chosen)
 _LAMPS: Final[tuple[Colour, ...]] = ((1.0, 0.85, 0.6), (1.0, 0.6, 0.25), (0.7, 0.9, 1.0), (1.0, 0.15, 0.1))
 """Linear light of street lamps: warm white, sodium, cold white and red, chosen."""
 
@@ -162,55 +160,21 @@ def text(scene: Planes, rng: np.random.Generator) -> Planes:
     return np.ascontiguousarray(np.stack([cells**2.2] * 3), dtype=np.float32)
 
 
-def two_depths(scene: Planes, rng: np.random.Generator) -> Planes:
-    """Near objects out of focus: two fifths of the picture, in a few large shapes."""
-    return out_of_focus(scene, _DISC_PX, _shapes(scene.shape[1:], rng, 0.4))
-
-
-def moving(scene: Planes, rng: np.random.Generator) -> Planes:
-    """Objects that moved 11 pixels while the shutter was open: two fifths of the picture."""
-    mask = _shapes(scene.shape[1:], rng, 0.4)
-    angle = float(rng.uniform(0.0, math.pi))
-    steps = np.linspace(-0.5, 0.5, _TRAIL_PX) * _TRAIL_PX
-
-    def trail(plane: NDArray[np.float32]) -> NDArray[np.float32]:
-        total = np.zeros(plane.shape, dtype=np.float32)
-        for step in steps:
-            by = (step * math.sin(angle), step * math.cos(angle))
-            total += ndimage.shift(plane, by, order=1, mode="nearest", prefilter=False)
-        return total / np.float32(len(steps))
-
-    matte = trail(mask.astype(np.float32))
-    planes = [(1.0 - matte) * plane + trail(plane * mask) for plane in scene]
-    return np.ascontiguousarray(np.stack(planes), dtype=np.float32)
-
-
 HARD_SCENES: Final[Mapping[str, Scenery]] = {
-    "depth": two_depths,
     "faces": faces,
     "foliage": foliage,
     "lamps": lamps,
-    "motion": moving,
     "night": night,
     "red-cars": red_cars,
     "sky": sky,
     "snow": snow,
     "text": text,
 }
-"""By name: near things out of focus, things that moved, and what their names say."""
+"""By name."""
 
 _OVER_WHAT: Final = {"red-cars": "colosseum", "snow": "lake", "sky": "lake"} | dict.fromkeys(
     ("faces", "foliage"), "tea-gardens"
 )
-
-
-def _shapes(shape: tuple[int, ...], rng: np.random.Generator, share: float) -> NDArray[np.bool_]:
-    """Mask of a few large shapes that cover a share of the picture."""
-    reach = min(shape) / 8.0
-    coarse = rng.normal(size=(max(shape[0] // 8, 2), max(shape[1] // 8, 2)))
-    smooth = ndimage.gaussian_filter(coarse, reach / 8.0, mode="nearest")
-    grown = ndimage.zoom(smooth, (shape[0] / smooth.shape[0], shape[1] / smooth.shape[1]), order=1)
-    return np.asarray(grown > np.quantile(grown, 1.0 - share))
 
 
 def _around(scene: Planes, rng: np.random.Generator, half_rows: float, half_cols: float) -> tuple[float, ...]:
@@ -407,40 +371,3 @@ def _leaf_radius(rng: np.random.Generator, smallest: float, largest: float) -> f
 def _leaf_colour(rng: np.random.Generator) -> NDArray[np.float32]:
     grey = rng.uniform(0.05, 0.9)
     return np.clip(grey * rng.uniform(0.75, 1.25, 3), 0.02, 0.95).astype(np.float32)
-
-
-def disc_kernel(radius: float) -> NDArray[np.float64]:
-    """Disc of sum 1, area-sampled 9 times a pixel and axis: blur of a point out of focus."""
-    if not 0.0 < radius <= 100.0:
-        raise InvalidInputError(f"disc radius must lie in 0..100 px, got {radius}")
-    half, fine = int(np.ceil(radius + 0.5)), 9
-    t = (np.arange((2 * half + 1) * fine) + 0.5) / fine - half - 0.5
-    inside = (t[:, None] ** 2 + t[None, :] ** 2 <= radius**2).astype(np.float64)
-    side = 2 * half + 1
-    disc = inside.reshape(side, fine, side, fine).sum(axis=(1, 3))
-    return disc / disc.sum()
-
-
-def out_of_focus(scene: Planes, radius: float, near: NDArray[np.bool_]) -> Planes:
-    """Two depths: the part `near` of a scene blurred by a disc, composed over the sharp rest.
-
-    Returns
-    -------
-    Planes, shape (3, H, W)
-    """
-    if near.shape != scene.shape[1:]:
-        raise InvalidInputError(f"the mask {near.shape} must have the scene's size {scene.shape[1:]}")
-    disc = disc_kernel(radius)
-    matte = _blurred(near.astype(np.float32), disc)
-    planes = [(1.0 - matte) * plane + _blurred(plane * near, disc) for plane in scene]
-    return np.ascontiguousarray(np.stack(planes), dtype=np.float32)
-
-
-def _blurred(plane: NDArray[np.float32], kernel: NDArray[np.float64]) -> NDArray[np.float32]:
-    half = kernel.shape[0] // 2
-    padded = np.pad(plane, half, mode="symmetric")
-    grid = [int(fft.next_fast_len(n + 2 * half, real=True)) for n in padded.shape]
-    product = fft.rfft2(padded, s=grid) * fft.rfft2(kernel.astype(np.float32), s=grid)
-    full = fft.irfft2(product, s=grid)
-    valid = full[2 * half : 2 * half + plane.shape[0], 2 * half : 2 * half + plane.shape[1]]
-    return np.clip(valid, 0.0, None).astype(np.float32)

@@ -14,7 +14,7 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import Image
 
-from lab.scenes import dead_leaves, disc_kernel, out_of_focus
+from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid
@@ -303,27 +303,6 @@ def test_dead_leaves_cover_everything_with_sharp_edges_and_a_natural_spectrum() 
     assert scene.min() >= 0.02
     assert scene.max() <= 0.95
     assert 1.2 < slope < 3.5
-
-
-def test_defocus_blurs_the_near_part_and_leaves_the_far_one() -> None:
-    scene = dead_leaves(96, 160, np.random.default_rng(2))
-    near = np.zeros((96, 160), dtype=bool)
-    near[:, :80] = True
-    mixed = out_of_focus(scene, 3.0, near)
-
-    np.testing.assert_allclose(mixed[:, :, 90:], scene[:, :, 90:], atol=1e-5)
-    assert np.diff(mixed[1, :, :70]).std() < 0.5 * np.diff(scene[1, :, :70]).std()
-    assert mixed.mean() == pytest.approx(scene.mean(), rel=0.02)
-
-
-def test_disc_has_the_second_moment_of_a_disc() -> None:
-    disc = disc_kernel(4.0)
-    t = np.arange(disc.shape[0]) - disc.shape[0] // 2
-
-    assert disc.sum() == pytest.approx(1.0)
-    assert (disc * t[:, None] ** 2).sum() == pytest.approx(
-        4.0 + 1 / 12, rel=0.01
-    )  # radius^2 / 4 and the pixel
 
 
 @pytest.mark.parametrize("name", DEMO_SCENES)

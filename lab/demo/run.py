@@ -15,15 +15,7 @@ from lensmodel.photo import develop
 
 
 def run(output: Path, say: Say) -> bool:
-    """Run the demo; return whether the figures show an improvement.
-
-    Parameters
-    ----------
-    output : Path
-        Folder for what it leaves behind; files of an earlier demo there are replaced.
-    say : callable
-        Takes one line of progress at a time.
-    """
+    """Run the demo; return whether the figures show an improvement."""
     output.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="lensmodel-demo-") as folder:

@@ -38,17 +38,7 @@ class ServiceDidNotStartError(LensModelError):
 
 @contextmanager
 def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None = None) -> Iterator[Client]:
-    """Start the real service on a free loopback port, wait until it is ready, and stop it at the end.
-
-    Parameters
-    ----------
-    data : Path
-        Folder of everything that it keeps.
-    log_file : Path
-        Where its log goes; what an earlier one wrote there is replaced.
-    settings : mapping of str to str, optional
-        Values of the environment, such as `LENS_ESTIMATOR`; nothing else of that prefix is passed on.
-    """
+    """Start the real service on a free loopback port, wait until it is ready, and stop it at the end."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
     environment |= settings or {}
     data.mkdir(parents=True, exist_ok=True)

@@ -86,10 +86,6 @@ def dots(before: Shown, after: Shown) -> NDArray[np.bool_]:
     In a channel, a dot exceeds the range of the original's 5 x 5 pixels by twice that range and by
     `STANDS_OUT` at least, and at most one of its own eight neighbours goes with it: what is sharpened
     along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`.
-
-    Returns
-    -------
-    ndarray of bool, shape (row, col)
     """
     found = np.zeros(before.shape[:2], dtype=bool)
     for k in range(3):
@@ -130,10 +126,6 @@ def hue_flips(before: Shown, after: Shown) -> NDArray[np.bool_]:
     get purer, up to twice, but not turn into another one. A small thing whose colour blur has washed out
     left a tenth of it, and a ridge (`TRACE`); only where all around it has the opposite hue did it leave
     nothing, and counts.
-
-    Returns
-    -------
-    ndarray of bool, shape (row, col)
     """
     old, new = chromaticity(before), chromaticity(after)
     size = np.linalg.norm(new, axis=-1)
@@ -189,11 +181,6 @@ def overshoots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArr
     profile is the mean of five lines across it; the overshoot is how far it leaves the plateaus 1 to 6 pixels
     away, in percent of the step. Where the truth is known, edges beside which it has a line that blur hid
     are left out as well: a perfect correction "overshoots" there.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Percent in the original and in the corrected picture.
     """
     old, new = luma(before), luma(after)
     if min(old.shape) < 3 * _REACH:
@@ -266,11 +253,6 @@ def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
 
     Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
     the original, more of it than rounding. Which of them are the flattest `grain_ratio` decides.
-
-    Returns
-    -------
-    ndarray, shape (n, 1 + 2 * bands)
-        Variance in the original, then its power by band, then that of the corrected picture.
     """
     height, width = (n // _BLOCK for n in before.shape[:2])
     found = []

@@ -30,16 +30,7 @@ Figures = dict[str, Any]
 
 
 def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figures:
-    """Take all figures of a picture.
-
-    Returns
-    -------
-    dict
-        `dots`, `hue_flips` (counts), `dots_at`, `hue_flips_at` (where most are, or None), `edges` (count),
-        `overshoot` (original and corrected, percent, or None), `grain` (ratio by band, or None),
-        `changed` (share of pixels that differ by more than 1 of 255) and, with a
-        truth, `gains`.
-    """
+    """Take all figures of a picture."""
     faults: dict[str, list[NDArray[np.intp]]] = {"dots": [], "hue_flips": []}
     edges, places, changed = [], [], 0
     for row, col, window, inner in _tiles(*before.shape[:2]):

@@ -69,15 +69,7 @@ FRAMES: Final = (
 def take(
     frame: SimulatedFrame, folder: Path, *, height: int = HEIGHT, width: int = WIDTH
 ) -> tuple[Path, Path]:
-    """Take a frame unless it is there.
-
-    Returns
-    -------
-    photo : Path
-        DNG or JPEG.
-    truth : Path
-        npy, uint16 `(row, col, 3)`: what a perfect lens would have shown, rendered as the photo is.
-    """
+    """Take a frame unless it is there."""
     photo, truth = folder / frame.file, folder / f"{frame.name}-truth.npy"
     if photo.exists() and truth.exists():
         return photo, truth

@@ -69,13 +69,7 @@ class GalleryEntry:
 def entries_of(
     pictures: Sequence[Picture], output: Path, *, workers: int, on_picture: OnPicture
 ) -> Iterator[GalleryEntry]:
-    """Make what the page shows, one picture after the other.
-
-    Yields
-    ------
-    GalleryEntry
-        Of each picture as soon as it is finished.
-    """
+    """Make what the page shows, one picture after the other."""
     (output / CROPS).mkdir(parents=True, exist_ok=True)
     for done, picture in enumerate(pictures):
 
@@ -119,15 +113,7 @@ def _entry(picture: Picture, output: Path, workers: int, say: Words) -> GalleryE
 
 
 def work(picture: Picture, cache: Path, workers: int, say: Words) -> tuple[Path, Unit]:
-    """Calibrate a picture from itself and correct it, unless that is stored.
-
-    Returns
-    -------
-    folder : Path
-        Holds the original as `BEFORE` and, where it was corrected, `AFTER`.
-    unit : dict
-        `state` ("corrected" or "left alone"), `reason`, `notes`, `announced` (dB by zone), `seconds`.
-    """
+    """Calibrate a picture from itself and correct it, unless that is stored."""
     _taken(picture, say)
     content = _hash(picture.path)
     code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))

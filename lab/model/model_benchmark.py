@@ -93,13 +93,7 @@ def run_model_benchmark(
     psf_field: Path | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
-    """Compare methods of regression by the error of their predictions.
-
-    Returns
-    -------
-    dict
-        `rows` of method, photos, errors by zone, seconds; and what was asked.
-    """
+    """Compare methods of regression by the error of their predictions."""
     fits = _fits(methods)
     if psf_field is not None:
         samples = load_field(psf_field)

@@ -204,24 +204,7 @@ def _lens_of(case: Case) -> tuple[object, ...]:
 def planned(
     size: Size, *, scenes: Path | None = None, lenses: Sequence[str] = (), compare: bool = False
 ) -> Reproduction:
-    """Plan a run.
-
-    Parameters
-    ----------
-    size : {"quick", "default"}
-        Small frames and one or two photos of four lenses, or the largest frames that can be composed and up
-        to ten photos.
-    scenes : Path, optional
-    lenses : sequence of str
-        Seeds of third-order lenses and grid files of ray-traced ones; none means those of the size.
-    compare : bool
-        See `Reproduction`.
-
-    Raises
-    ------
-    InvalidInputError
-        If a lens is neither a seed nor a file, or two are the same.
-    """
+    """Plan a run."""
     files = scene_files(scenes)
     chosen: Sequence[int | Path] = [_lens(text) for text in lenses]
     if not chosen:

@@ -53,13 +53,7 @@ def scene_files(folder: Path | None) -> tuple[Path, ...]:
 
 
 def layout_for(files: Sequence[Path], wanted: tuple[int, int] | None = None) -> Layout:
-    """Decide how to make frames that cover `wanted` rows and columns; the largest where it is None.
-
-    Raises
-    ------
-    InvalidInputError
-        If the photographs are too few to keep those of one frame apart, or too small.
-    """
+    """Decide how to make frames that cover `wanted` rows and columns; the largest where it is None."""
     grids = [(rows, cols) for rows, cols in _GRIDS if 2 * rows * cols <= len(files)]
     if not grids:
         raise InvalidInputError(f"two photographs are needed at least, there are {len(files)}")
@@ -78,19 +72,7 @@ def _layout(files: Sequence[Path], grid: tuple[int, int]) -> Layout:
 
 
 def frame_scene(files: Sequence[Path], layout: Layout, number: int | None) -> Planes:
-    """Compose a frame from photographs in the given order.
-
-    Parameters
-    ----------
-    files : sequence of Path
-    layout : Layout
-    number : int or None
-        Of the photos that are learned from; None is the photo that is held out.
-
-    Returns
-    -------
-    Planes, shape (3, rows * tile height, cols * tile width)
-    """
+    """Compose a frame from photographs in the given order."""
     per = layout.rows * layout.cols
     if number is None:
         parts = [_part(path, layout, 0) for path in files[:per]]

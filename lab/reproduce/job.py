@@ -72,13 +72,7 @@ def run_reproduction(
     workers: int = 1,
     learner: NewLearner = LibraryLearner,
 ) -> dict[str, Any]:
-    """Run what is missing and return everything.
-
-    Returns
-    -------
-    dict
-        Plain values: `code`, `plan`, `scenes`, `cases`, `figures`.
-    """
+    """Run what is missing and return everything."""
     version = fingerprint()
     cache, shown = folder / "cache", folder / "pictures"
     shown.mkdir(parents=True, exist_ok=True)

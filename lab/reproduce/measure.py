@@ -36,14 +36,7 @@ def places() -> list[Place]:
 
 
 def psf_errors(answers: Sequence[Answer], truth: PsfField) -> dict[str, Any]:
-    """Compare the answers at `places()` with the truth, after sub-pixel alignment.
-
-    Returns
-    -------
-    dict
-        `rel_l2`: median by channel and zone; `mtf_rmse` alike; `predicted_right`: share of places
-        where the model's own prediction of the relative L2 lies within a factor of 1.5.
-    """
+    """Compare the answers at `places()` with the truth, after sub-pixel alignment."""
     rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     right = []

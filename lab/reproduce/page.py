@@ -38,12 +38,7 @@ _PAPER = [
 
 
 def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
-    """Write `reproduction.md` and `reproduction.html`; the pictures lie in `pictures` beside them.
-
-    Returns
-    -------
-    tuple of Path
-    """
+    """Write `reproduction.md` and `reproduction.html`; the pictures lie in `pictures` beside them."""
     page = Page()
     page.title("The paper's figures with this software", 1)
     page.text(_conditions(result))
@@ -116,13 +111,7 @@ def _rivals(sources: Mapping[str, str]) -> str:
 
 
 def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
-    """Take tables and curves of a finished benchmark; None where there is none.
-
-    Returns
-    -------
-    dict or None
-        `rows`, one a method and noise level; `settings`; `pictures`, names of the copies.
-    """
+    """Take tables and curves of a finished benchmark; None where there is none."""
     path = folder / "blind.json"
     if not path.exists():
         return None

@@ -67,19 +67,7 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return everything that the tables show, as plain values.
-
-    Returns
-    -------
-    dict
-        `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
-        `share`: share of the true-PSF gain in MTF50;
-        `highest_mtf`: the highest corrected MTF of any lens;
-        `psnr_kept`: share of its gain in PSNR;
-        `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
-        the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
-        that a correction expects of itself in a zone, dB.
-    """
+    """Return everything that the tables show, by figure, method, number of photos and zone."""
     methods = result["plan"]["methods"]
     return {
         "lenses": len(result["cases"]),
@@ -172,13 +160,7 @@ def _highest_mtf(result: Result, method: str) -> dict[str, dict[str, float | Non
 
 
 def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
-    """Count zones of lenses whose PSNR fell.
-
-    Returns
-    -------
-    dict
-        By number of photos: `zones`; `worse` and `clearly_worse`, PSNR at all and by more than is tolerated.
-    """
+    """Count zones of lenses whose PSNR fell."""
     return {
         str(n): counted(
             (case, zone, case["learned"][str(n)]["methods"][method])
@@ -190,15 +172,7 @@ def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
 
 
 def paths(result: Result) -> dict[str, dict[str, Any]]:
-    """What other kinds of files gain, by their names.
-
-    Returns
-    -------
-    dict
-        `lenses`; `refused` (photos that were not learned from); `gain` and `true`: mean gain in dB of PSNR by
-        zone of the correction learned from one photo, and of the true PSF; `share`: of the gain that raw
-        photos have from one, of all lenses together; `counts` of `counted`.
-    """
+    """What other kinds of files gain, by their names."""
     method = result["plan"]["methods"][0]
     found: dict[str, dict[str, Any]] = {}
     for name in sorted({name for case in result["cases"] for name in case["paths"]}):

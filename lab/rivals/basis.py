@@ -53,17 +53,7 @@ class RadialBasis:
 
 
 def principal(fields: NDArray[np.floating], radii: Sequence[float], count: int) -> RadialBasis:
-    """Take the principal components of fields.
-
-    Parameters
-    ----------
-    fields : ndarray, shape (n, J, K, K)
-        Kernels in the local frame; mirror images across u are added.
-    radii : sequence of float
-        J of them.
-    count : int
-        m.
-    """
+    """Take the principal components of fields."""
     both = np.concatenate([fields, fields[:, :, ::-1]]).astype(np.float64)
     if len(both) < count:
         raise InvalidInputError(f"{count} components need as many fields, got {len(both)} with their mirrors")

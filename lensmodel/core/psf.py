@@ -23,18 +23,7 @@ _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
 
 
 def as_kernel(values: npt.ArrayLike) -> Kernel:
-    """Check and normalise an array to a kernel of sum 1, read-only, not yet centred.
-
-    Parameters
-    ----------
-    values : array_like, shape (k, k)
-        k odd; finite, non-negative and not all zero.
-
-    Raises
-    ------
-    InvalidKernelError
-        If the array cannot be a PSF.
-    """
+    """Check and normalise an array to a kernel of sum 1, read-only, not yet centred."""
     kernel = np.array(values, dtype=np.float64)  # a copy of our own, never the caller's
     if kernel.ndim != 2 or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0:
         raise InvalidKernelError(f"kernel must be square with an odd side, got shape {kernel.shape}")
@@ -53,15 +42,7 @@ def delta(size: int) -> Kernel:
 
 
 def gaussian(size: int, covariance: npt.ArrayLike) -> Kernel:
-    """Gaussian kernel integrated over the pixel: the sum of 5 x 5 samples in each.
-
-    Parameters
-    ----------
-    size : int
-        Odd side in pixels.
-    covariance : array_like, shape (2, 2)
-        Covariance in px², axes (row, col).
-    """
+    """Gaussian kernel of a covariance in px², axes (row, col), integrated over the pixel: 5 x 5 samples."""
     over = 5
     cov = np.asarray(covariance, dtype=np.float64) + np.eye(2) * 1e-4
     half = (size * over) // 2

@@ -160,18 +160,7 @@ def _to_xyz(values: NDArray[np.float64], icc: bytes, space: str) -> NDArray[np.f
 def declared_profile(
     white: tuple[float, float], primaries: Sequence[float], curve: float | NDArray[np.float64] | None
 ) -> bytes:
-    """Make the profile of a colour space that a file declares by numbers.
-
-    Parameters
-    ----------
-    white : tuple of float
-        Chromaticity x, y.
-    primaries : sequence of six float
-        x, y of red, green and blue.
-    curve : float, ndarray or None
-        Exponent from the file's numbers to linear light; or linear light 0..1 at evenly spaced numbers, shape
-        (n,) or (3, n), n at most 4096; None is the curve of sRGB.
-    """
+    """Make a profile of chromaticities x, y and an exponent or a table of linear light; None is sRGB's."""
     if curve is None:
         curve = srgb_to_linear(np.linspace(0.0, 1.0, _CURVE_POINTS))
     chosen = (
@@ -195,15 +184,7 @@ def _undated(icc: bytes) -> bytes:
 
 
 def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:
-    """Make an ICC profile, version 2, of linear RGB with the given primaries.
-
-    Parameters
-    ----------
-    to_xyz_d50 : ndarray, shape (3, 3)
-        Linear RGB to XYZ under D50.
-    name : str
-        Shown by programs; ASCII.
-    """
+    """Make an ICC profile, version 2, of linear RGB with the given primaries."""
 
     def xyz(vector: NDArray[np.float64]) -> bytes:
         return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(float(v) * 65536) for v in vector))

@@ -56,34 +56,7 @@ def write_bayer_dng(
     description: str = "",
     baseline_exposure: float | None = None,
 ) -> None:
-    """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        Where to; an existing file is replaced.
-    mosaic : ndarray, shape (H, W), uint16
-        Raw numbers, even sides.
-    black, white : int
-        Black level and saturation.
-    pattern : {"RGGB", "BGGR", "GRBG", "GBRG"}
-        Colours of the top left 2 x 2 cell, row by row.
-    color_matrix : array_like, shape (3, 3)
-        CIE XYZ (D65) to camera colours (DNG ColorMatrix1).
-    as_shot_neutral : sequence of float
-        Camera colours of a grey scene: one over the white balance multipliers.
-    metadata : PhotoMetadata
-        What is known of camera, lens and exposure; serials and orientation are written, too.
-    description : str
-        Free text.
-    baseline_exposure : float, optional
-        Stops by which a raw converter is asked to brighten the picture.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is out of its range.
-    """
+    """Write a raw mosaic as an uncompressed DNG; the file appears whole or not at all."""
     if mosaic.ndim != 2 or mosaic.dtype != np.uint16 or mosaic.shape[0] % 2 or mosaic.shape[1] % 2:
         raise InvalidInputError(f"a mosaic is uint16 with even sides, got {mosaic.dtype} {mosaic.shape}")
     if pattern not in BAYER_PATTERNS:
@@ -115,32 +88,11 @@ def write_linear_dng(
     opcodes_3: bytes = b"",
     gps: Directory | None = None,
 ) -> None:
-    """Write a demosaiced linear image as a DNG (LinearRaw); the file appears whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        Where to; an existing file is replaced.
-    planes : ndarray, shape (3, H, W), uint16
-        Camera colours, linear, not white balanced, black at 0: LibRaw 0.22 takes a black level of
-        linear images off the values but not off the white level.
-    white, color_matrix, as_shot_neutral, metadata, description, baseline_exposure
-        See `write_bayer_dng`.
-    xmp : bytes
-        A packet to put in.
-    opcodes_2, opcodes_3 : bytes
-        What raw converters are to do with the linear image, and with the developed one.
-    gps : Directory, optional
-        Where it was taken.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is out of its range.
-    """
+    """Write a demosaiced linear image as a DNG (LinearRaw); the file appears whole or not at all."""
     if planes.ndim != 3 or planes.shape[0] != 3 or planes.dtype != np.uint16:
         raise InvalidInputError(f"planes are uint16 of shape (3, H, W), got {planes.dtype} {planes.shape}")
     tags = _common_tags(3, _LINEAR_RAW, metadata, description, baseline_exposure)
+    # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
     _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
     if xmp:
         tags.raw(700, BYTE, xmp)
@@ -216,16 +168,7 @@ def _write(path: Path, tags: Directory, below: Mapping[int, Directory], pixels: 
 def write_strip(
     file: BinaryIO, tags: Directory, below: Mapping[int, Directory], pixels: NDArray[np.generic]
 ) -> None:
-    """Write a TIFF structure and the pixels that it describes, as one strip that is not compressed.
-
-    Parameters
-    ----------
-    tags : Directory
-        All of the picture but size and place of the strip, and pointers.
-    below
-        As `laid_out` takes it.
-    pixels : ndarray, shape (H, W) or (H, W, samples)
-    """
+    """Write a TIFF structure and the pixels that it describes, as one strip that is not compressed."""
     height, width = pixels.shape[:2]
     tags.longs(256, width)
     tags.longs(257, height)

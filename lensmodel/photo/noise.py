@@ -90,13 +90,6 @@ def coding_noise(coarseness: float, codes: NDArray[np.floating]) -> NoiseModel:
     It is not seen in flat places, where the coefficients are zero before and after, but where detail is.
     The middle one of the steps speaks for all: the coarsest are those of frequencies of which a lens
     leaves little.
-
-    Parameters
-    ----------
-    coarseness : float
-        Step in the file's numbers.
-    codes : ndarray
-        Linear light of each of these numbers, ascending.
     """
     levels, widths = codes[1:-1].astype(np.float64), np.gradient(codes)[1:-1]
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
@@ -109,18 +102,6 @@ def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
 
     The variance of means over 4 x 4 pixels, times 16, over that of the pixels, both of differences between
     neighbours. Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
-
-    Parameters
-    ----------
-    plane, clip
-        As `estimate_noise` takes them.
-    noise : NoiseModel
-        What it found.
-
-    Returns
-    -------
-    float
-        1 where nothing can be measured.
     """
     fine = _sampled(np.asarray(plane, dtype=np.float32))
     rows, cols = (extent // GRAIN for extent in fine.shape)

@@ -29,22 +29,7 @@ _PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
 
 
 def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
-    """Decode a TIFF, PNG or JPEG.
-
-    Returns
-    -------
-    pixels : ndarray, shape (height, width, 3)
-        uint8, uint16 or float32; grey as three equal planes, alpha dropped, palettes applied.
-    transparent : bool
-        Whether the alpha that was dropped was anything but opaque.
-
-    Raises
-    ------
-    UnsupportedFormatError
-        For CMYK, CIE Lab and the like.
-    TruncatedImageError, NotAnImageError
-        If the pixel data end early or are damaged.
-    """
+    """Decode to numbers `(row, col, 3)`, and say whether alpha was dropped that was not opaque."""
     if header.kind == "tiff":
         pixels = _read_tiff(path, header.directory)
     elif header.kind == "png" and header.bits == 16:

@@ -209,19 +209,7 @@ class Calibration:
         ahead: int = AHEAD,
         on_event: EventHook = ignore_event,
     ) -> Iterator[PhotoVerdict]:
-        """Learn from photos in their order, and give what becomes of each.
-
-        Parameters
-        ----------
-        paths : iterable of Path
-        executor : Executor, optional
-            Runs whole photos, whose bytes are sent to it: of other machines too. Without one, processes of
-            this machine share the patches of one photo after the other.
-        ahead : int
-            Photos that are sent at once.
-        on_event : callable
-            Learns of each step that is done here; raising `CancelledError` there stops the work.
-        """
+        """Learn from photos in their order, on an executor if there is one, and give what becomes of each."""
         paths = list(paths)
         orders: dict[Path, tuple[str, Identity]] = {}
 

@@ -402,23 +402,7 @@ def samples_of_photo(
     siblings: Iterable[Path] = (),
     on_event: EventHook = ignore_event,
 ) -> list[PsfSample]:
-    """Develop one photo, find its patches and estimate a PSF for each patch and channel.
-
-    Parameters
-    ----------
-    path : Path
-    config : Config, optional
-    key : str
-        What samples call the photo (`photo_id`); found out if empty.
-    admit : callable, optional
-        Looks at the metadata before the photo is decoded; raising there refuses it.
-    executor : Executor, optional
-        Estimates cells; it sees the files of this machine. Without one, `workers` processes do (all cores by
-        default), for this photo alone. The result does not depend on it.
-    siblings : iterable of Path
-        As `photo.develop` takes them.
-    on_event : callable
-    """
+    """Develop one photo, find its patches and estimate a PSF for each patch and channel."""
     config = config or Config()
     config.check()
 

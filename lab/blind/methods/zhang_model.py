@@ -159,11 +159,6 @@ def pooled_kernel(posteriors: Sequence[tuple[GradientPosterior, float]], kernel:
     """Update k >= 0 to the minimum of the summed free energies of posteriors with their weights 1 / λ.
 
     min over k >= 0 of  sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ_l
-
-    Returns
-    -------
-    ndarray of float64, shape (side, side)
-        Not normalised.
     """
     terms = [Term(b.grid, b.y, b.x, weight, b.grid.sums_of(b.variance)) for b, weight in posteriors]
     return least_squares_kernel(terms, kernel)

@@ -71,13 +71,7 @@ def default_prior() -> EdgePatchPrior:
 
 
 def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
-    """Mark thin edges: strongest responses to elongated derivative filters, local maxima across.
-
-    Returns
-    -------
-    ndarray of bool, shape (H, W)
-        False within 2 px of the border, where no window fits.
-    """
+    """Mark thin edges: strongest responses to elongated derivative filters, local maxima across."""
     responses = np.stack([np.abs(ndimage.correlate(x, f, mode="nearest")) for f in _bank()])
     strength, way = responses.max(axis=0), responses.argmax(axis=0)
     crest = np.zeros(x.shape, dtype=bool)
@@ -117,13 +111,7 @@ def local_range(x: Image) -> Image:
 
 
 def target(x: Image, mask: NDArray[np.bool_], prior: EdgePatchPrior) -> tuple[Image, Image]:
-    """Mean of the sharp windows over each pixel, and how many lie over it.
-
-    Returns
-    -------
-    q, count : ndarray, shape (H, W)
-        sum_i |P_i x - q_i|² = sum_p count(p) (x(p) - q(p))² + const.
-    """
+    """Mean of the sharp windows over each pixel, and how many lie over it: q and count, both (H, W)."""
     rim = SIDE // 2
     rows, cols = np.nonzero(mask)
     windows = sliding_window_view(x, (SIDE, SIDE))[rows - rim, cols - rim].reshape(-1, SIDE * SIDE)

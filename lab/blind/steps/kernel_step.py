@@ -99,11 +99,6 @@ def least_squares_kernel(
     The normal matrix of the valid convolution is nearly Toeplitz. Each turn takes the exact gradient
     at k and the nearest Toeplitz matrix, by which accelerated projected gradients run on a small
     FFT; a few turns come to the exact minimum, where the matrix no longer matters.
-
-    Returns
-    -------
-    ndarray of float64, shape (side, side)
-        Not normalised.
     """
     side = kernel.shape[0]
     n = int(fft.next_fast_len(2 * side, real=True))

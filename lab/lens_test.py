@@ -122,7 +122,7 @@ def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: 
     h = (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
     kernel = lens.kernel_at_field(
         h, LensSettings(aperture=lens.widest(), channel="g"), _SIZE,
-        pitch_um=pitch_um, defocus=0.0, offset=(0.0, 0.0),
+        pitch_um=pitch_um, offset=(0.0, 0.0),
     )  # fmt: skip
     t = np.arange(_SIZE) - _SIZE // 2
     along = t[None, :] * math.cos(normal) - t[:, None] * math.sin(normal)

@@ -178,15 +178,13 @@ class GridLens:
         size: int,
         *,
         pitch_um: float,
-        defocus: float = 0.0,
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
         """Kernel at field vector `h`, its centre of mass at `offset` (row, col) pixels."""
         grid = self._grid(settings)
-        if defocus != 0.0 or abs(pitch_um / grid.pitch_um - 1.0) > 1e-3:
+        if abs(pitch_um / grid.pitch_um - 1.0) > 1e-3:
             raise InvalidInputError(
-                f"this lens has kernels for a pitch of {grid.pitch_um:g} um in focus, "
-                f"got {pitch_um:g} um and a defocus of {defocus:g}"
+                f"this lens has kernels for a pitch of {grid.pitch_um:g} um, got {pitch_um:g} um"
             )
         kernel = grid.kernel_at_field(h, settings.channel, size)
         return kernel if offset == (0.0, 0.0) else _moved(kernel, offset)

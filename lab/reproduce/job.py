@@ -10,16 +10,14 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
     <key>/general.json                with a general profile of the lens model
     <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
 
-They hold figures only, some ten kilobytes a lens. Photos lie in `photos` of the output folder, models of an
-unfinished case in `work`, pictures in `pictures`.
+They hold figures only, some ten kilobytes a lens. Photos lie in `photos` of the output folder, pictures in
+`pictures`.
 """
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -53,8 +51,8 @@ PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")
 
 _SEVERAL: Final = ("learned", "paths", "paper", "rivals")
 _ALONE: Final = ("truth", "measured", "general")
-NewLearner: TypeAlias = Callable[[Path, Preset, int], Learner]
-"""From a folder that keeps what was learned, the way of learning, and a number of processes."""
+NewLearner: TypeAlias = Callable[[Preset, int], Learner]
+"""From the way of learning and a number of processes."""
 
 
 class OnWork(Protocol):
@@ -78,12 +76,9 @@ def run_reproduction(
     shown.mkdir(parents=True, exist_ok=True)
     keys = [key_of(case, plan, version) for case in plan.cases]
     jobs = [
-        CaseJob(
-            case, plan, cache / key, folder / "photos" / photos_of(case, plan), folder / "work" / key, shown,
-            workers, learner,
-        )
+        CaseJob(case, plan, cache / key, folder / "photos" / photos_of(case, plan), shown, workers, learner)
         for case, key in zip(plan.cases, keys, strict=True)
-    ]  # fmt: skip
+    ]
     done, total = 0, sum(len(job.files) for job in jobs) + plan.compare
 
     def told(words: str, *, fresh: bool) -> None:
@@ -92,8 +87,6 @@ def run_reproduction(
         on_work(words, done, total, fresh=fresh)
 
     finished = [job.run(told) for job in jobs]
-    with suppress(OSError):  # not there, or another run's work is in it
-        (folder / "work").rmdir()
     drawn: Unit = {}
     if plan.compare:
         make = partial(figures.draw, plan, jobs[0].photos, shown, workers=workers)
@@ -131,7 +124,6 @@ class CaseJob:
     plan: Reproduction
     folder: Path
     photos: Path
-    work: Path
     shown: Path
     workers: int
     learner: NewLearner
@@ -161,13 +153,12 @@ class CaseJob:
         makers: dict[str, Callable[[str], Unit]] = {}
         if not complete:
             shots = take(case, self.plan.files(), self.photos)
-            self.work.mkdir(parents=True, exist_ok=True)
             own, paper = PRESETS["default"], paper_way(case)
             makers = {
                 "truth": lambda _: self._truth(shots),
-                "learned": partial(self._learned, self._learning("models", own), shots, own_way=False),
+                "learned": partial(self._learned, self._learning(own), shots, own_way=False),
                 "paths": lambda name: self._path(cast("Container", name), own, shots),
-                "paper": partial(self._learned, self._learning("paper", paper), shots, own_way=True),
+                "paper": partial(self._learned, self._learning(paper), shots, own_way=True),
                 "measured": lambda _: self._measured(shots),
                 "general": lambda _: self._by_field(general_field(case), 0.0, shots, "general"),
                 "rivals": lambda name: self._rival(name, shots),
@@ -177,8 +168,6 @@ class CaseJob:
             unit, fresh = stored(path, partial(makers[part], name)) if makers else (read(path), False)
             units.setdefault(part, {})[name] = unit
             told(f"{case.title}: {part} {name}".rstrip(), fresh=fresh)
-        if not complete:
-            shutil.rmtree(self.work)
         return {
             "name": case.name,
             "title": case.title,
@@ -191,8 +180,8 @@ class CaseJob:
             **units,
         }
 
-    def _learning(self, name: str, way: Preset) -> _Learning:
-        return _Learning(partial(self.learner, self.work / name, way, self.workers))
+    def _learning(self, way: Preset) -> _Learning:
+        return _Learning(partial(self.learner, way, self.workers))
 
     def _truth(self, shots: Shots) -> Unit:
         case, photo, chart = self.case, develop(shots.held_out), develop(shots.chart)
@@ -218,7 +207,7 @@ class CaseJob:
         """What becomes of the first and the held-out photo as files of another kind, learned from the one."""
         learned, asked = (in_container(path, container) for path in (shots.learn[0], shots.held_out))
         photo, method = develop(asked), self.plan.methods[0]
-        learner, refused, _ = self._learning(container, way).of([learned])
+        learner, refused, _ = self._learning(way).of([learned])
         true = corrected_with(photo, self.truth, method, self._tiles, workers=self.workers)
         after = photo.planes if refused else learner.corrected(asked, method, self._tiles).planes
         states = {"before": photo.planes, "true": true, "after": after}
@@ -233,7 +222,7 @@ class CaseJob:
         """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
         try:
             began = time.monotonic()
-            field = measured_field(self.case, self.work / "target.dng")
+            field = measured_field(self.case, self.photos / "target.dng")
         except LensModelError as error:  # frames too small for a page: the row is left out
             return {"refused": str(error), "psf": None, "methods": {}, "pictures": {}}
         return self._by_field(field, time.monotonic() - began, shots, "measured")

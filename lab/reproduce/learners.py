@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
@@ -16,7 +15,7 @@ from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.correction import correct_planes
-from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
+from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.lateral import LateralColour, resample
 from lensmodel.workflow import correcting, sampling
@@ -74,53 +73,27 @@ def paper_way(case: Case) -> Preset:
 
 
 class LibraryLearner:
-    """The library in this process.
+    """The library in this process, by a way of learning, on so many processes."""
 
-    Parameters
-    ----------
-    folder : Path
-        Where models are kept between runs.
-    way : Preset
-        How the lens is learned.
-    workers : int
-        Processes.
-    """
-
-    def __init__(self, folder: Path, way: Preset, workers: int) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._way, self._workers = folder, way, workers
+    def __init__(self, way: Preset, workers: int) -> None:
+        self._way, self._workers = way, workers
         self._seen: dict[str, str] = {}
         self._model: LensModel | None = None
 
     def learn(self, photo: Path) -> str:
         """Learn from one more photo; see `Learner`."""
         name = sampling.photo_id(photo)
-        if name in self._seen:
-            return self._seen[name]
-        self._seen[name] = self._learned(photo, name)
+        if name not in self._seen:
+            self._seen[name] = self._learned(photo)
         return self._seen[name]
 
-    def _learned(self, photo: Path, name: str) -> str:
+    def _learned(self, photo: Path) -> str:
+        config = sampling.Config(estimator=self._way.estimator, kernel_size=self._way.kernel_size)
+        try:
+            samples = sampling.samples_of_photo(photo, config, workers=self._workers)
+        except LensModelError as error:
+            return str(error)
         chosen = ModelSettings(mode=self._way.mode)
-        stored = self._folder / f"{name}.lensprofile"
-        refused = self._folder / f"{name}.json"
-        if refused.exists():
-            return str(json.loads(refused.read_text(encoding="utf-8")))
-        if stored.exists():
-            samples = load_profile(stored).model.samples
-        else:
-            try:
-                samples = tuple(
-                    sampling.samples_of_photo(
-                        photo,
-                        sampling.Config(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
-                        workers=self._workers,
-                    )
-                )
-            except LensModelError as error:
-                refused.write_text(json.dumps(str(error)), encoding="utf-8")
-                return str(error)
-            save_profile(stored, LensProfile(LensModel.fit(samples, chosen)))
         self._model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
         return ""
 

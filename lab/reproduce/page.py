@@ -17,10 +17,8 @@ from lab.reproduce.tables import (
     deconvolution,
     groups,
     number,
-    others,
     paths,
     shown,
-    states,
     summary,
 )
 from lensmodel.core.errors import InvalidInputError
@@ -50,7 +48,7 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
         _psf_tables(page, found, label)
         _photo_tables(page, found, label)
         _paths_table(page, group, label)
-    _lenses(page, result)
+    _refused(page, result)
     _fig1(page, result["figures"].get("fig1"))
     _fig2(page, result["figures"].get("fig2"))
     _fig4(page, result["figures"].get("fig4"))
@@ -297,20 +295,8 @@ def _which_lenses(page: Page, result: Mapping[str, Any]) -> None:
     page.table(["family", "lens", "source", "", "general profile"], rows)
 
 
-def _lenses(page: Page, result: Mapping[str, Any]) -> None:
-    """Every lens in every state."""
-    page.title("Every lens")
-    for method in result["plan"]["methods"]:
-        page.title(f"Every lens, deconvolution: {deconvolution(method)}", 3)
-        rows = []
-        for case in result["cases"]:
-            beside = others(case)
-            for name, state in states(case, method).items():
-                unit = case["learned"].get(name.removeprefix("n = ")) or beside.get(name)
-                psf = None if unit is None or unit["psf"] is None else unit["psf"]["rel_l2"]["g"]
-                rows.append([case["title"], shown(name), *_lens_cells(state, psf)])
-        head = ["lens", "", *(f"{z} {what}" for z in ZONES for what in ("MTF50", "max", "PSNR", "PSF error"))]
-        page.table(head, rows)
+def _refused(page: Page, result: Mapping[str, Any]) -> None:
+    """Name the photos that did not count."""
     refused = [
         f"{case['title']}: {reason}"
         for case in result["cases"]
@@ -323,19 +309,6 @@ def _lenses(page: Page, result: Mapping[str, Any]) -> None:
     ]
     if refused:
         page.text("Photos that gave no usable patch and did not count: " + "; ".join(refused) + ".")
-
-
-def _lens_cells(state: Mapping[str, Any], psf: Mapping[str, float] | None) -> list[str]:
-    cells = []
-    for zone in ZONES:
-        edge = state["edges"].get(zone, {})
-        cells += [
-            number(edge.get("mtf50")),
-            number(edge.get("mtf_max"), 2),
-            number(state["psnr"].get(zone), 2),
-            number(None if psf is None else psf.get(zone), 2),
-        ]
-    return cells
 
 
 def _count_rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:

@@ -28,7 +28,6 @@ from lensmodel.workflow.calibrating import AHEAD
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import PRESETS, preset_of
 
-Estimator = Annotated[str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}.")]
 Selector = Annotated[
     str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
 ]

@@ -304,10 +304,6 @@ class ModelField:
         settings = self.settings.with_channel(channel)
         return self.model.query(position, settings, size, pitch_um=self.pitch_um)
 
-    def error_at(self, position: FieldPosition, channel: Channel) -> float:
-        """Return the relative L2 error that is expected of the kernel at a field position."""
-        return self.answer_at(position, channel, 15).predicted_error
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:

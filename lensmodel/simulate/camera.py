@@ -216,7 +216,6 @@ class BlurOptions:
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
     size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
     step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
-    defocus: float = 0.0  # focus error of this photo, waves at the open aperture
     lateral: bool = True  # whether to simulate lateral colour
 
     def __post_init__(self) -> None:
@@ -407,9 +406,7 @@ def _kernel(
     if options.lateral and channel != "g" and r > 0:
         outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
         offset = (-outwards * h[1] / r, outwards * h[0] / r)
-    return lens.kernel_at_field(
-        h, settings, options.size, pitch_um=options.pitch_um, defocus=options.defocus, offset=offset
-    )
+    return lens.kernel_at_field(h, settings, options.size, pitch_um=options.pitch_um, offset=offset)
 
 
 def _convolved(light: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:

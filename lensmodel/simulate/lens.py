@@ -96,7 +96,6 @@ class CameraLens(Protocol):
         size: int,
         *,
         pitch_um: float,
-        defocus: float,
         offset: tuple[float, float],
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), its centre of mass at `offset` (row, col) pixels."""
@@ -111,8 +110,7 @@ class SimulatedLens:
 
     Notes
     -----
-    The focus distance takes no part: every photo is taken at the distance of best focus, give or
-    take the `defocus` passed to `kernel`.
+    The focus distance takes no part: every photo is taken at the distance of best focus.
     """
 
     # one for every entry of `focal_mm`; between them a zoom interpolates in log focal length
@@ -166,11 +164,10 @@ class SimulatedLens:
         size: int = DEFAULT_SIZE,
         *,
         pitch_um: float = DEFAULT_PITCH_UM,
-        defocus: float = 0.0,
     ) -> Kernel:
         """Exact kernel at a place of the field, integrated over square pixels, centred."""
         h = (position.r * math.cos(position.phi), position.r * math.sin(position.phi))
-        return self.kernel_at_field(h, settings or LensSettings(), size, pitch_um=pitch_um, defocus=defocus)
+        return self.kernel_at_field(h, settings or LensSettings(), size, pitch_um=pitch_um)
 
     def kernel_at_field(
         self,
@@ -179,7 +176,6 @@ class SimulatedLens:
         size: int,
         *,
         pitch_um: float = DEFAULT_PITCH_UM,
-        defocus: float = 0.0,
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), also outside the frame; see `kernel`.
@@ -191,7 +187,7 @@ class SimulatedLens:
         if not 0.5 <= pitch_um <= 50.0:
             raise InvalidInputError(f"pixel pitch must lie in 0.5..50 um, got {pitch_um}")
         optics, n = self.at_focal(settings.focal_mm), self.f_number(settings)
-        wavefront, aperture = WaveError.of(optics, h, n, defocus), CatsEye.of(optics, h, n)
+        wavefront, aperture = WaveError.of(optics, h, n), CatsEye.of(optics, h, n)
         (col, row), spread = ray_statistics(wavefront, aperture, WAVELENGTH_NM[settings.channel] / 1000.0, n)
         response = pixel_otf(
             wavefront,
@@ -209,10 +205,9 @@ class SimulatedLens:
         settings: LensSettings | None = None,
         *,
         pitch_um: float = DEFAULT_PITCH_UM,
-        defocus: float = 0.0,
     ) -> SimulatedField:
         """The exact PSF of every place and channel at these settings, remembering what was asked."""
-        return SimulatedField(self, settings or LensSettings(), pitch_um, defocus)
+        return SimulatedField(self, settings or LensSettings(), pitch_um)
 
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
@@ -228,7 +223,6 @@ class SimulatedField:
     lens: SimulatedLens
     settings: LensSettings
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch of the camera in micrometres
-    defocus: float = 0.0  # as of `SimulatedLens.kernel`
     _known: dict[tuple[float, float, Channel, int], Kernel] = field(default_factory=dict, repr=False)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
@@ -240,7 +234,6 @@ class SimulatedField:
                 self.settings.with_channel(channel),
                 size,
                 pitch_um=self.pitch_um,
-                defocus=self.defocus,
             )
         return self._known[key]
 
@@ -430,13 +423,12 @@ class WaveError:
     stop: float  # s = N0 / N
 
     @classmethod
-    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float, defocus: float) -> WaveError:
-        """Collect the terms at field vector `h`, aperture `f_number` and a focus error."""
+    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float) -> WaveError:
+        """Collect the terms at field vector `h` and aperture `f_number`."""
         s = optics.f_number / f_number
         x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
         focus = (
             optics.defocus
-            + defocus
             + optics.tilt[0] * h[0]
             + optics.tilt[1] * h[1]
             + optics.field_curvature * (x * x + y * y)

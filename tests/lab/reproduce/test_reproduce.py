@@ -717,9 +717,8 @@ def reproduced(folder: Path, learner: Nothing, chosen: Reproduction) -> dict[str
         del words, fresh
         announced.append((done, total))
 
-    def opened(work: Path, way: Preset, workers: int) -> Nothing:
+    def opened(way: Preset, workers: int) -> Nothing:
         del way, workers
-        work.mkdir(parents=True, exist_ok=True)
         return learner
 
     made = run_reproduction(chosen, folder, on_work=on_work, learner=opened)
@@ -734,16 +733,14 @@ def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) ->
     assert reproduced(tmp_path, again, chosen) == first
     assert again.learned == []
     assert len(quick_photos) == 1
-    assert not list(tmp_path.rglob("work"))
 
 
 def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path, quick_photos: list[str]) -> None:
     del quick_photos
     opened: list[tuple[str, int]] = []
 
-    def open_one(folder: Path, way: Preset, workers: int) -> Nothing:
+    def open_one(way: Preset, workers: int) -> Nothing:
         del workers
-        folder.mkdir(parents=True, exist_ok=True)
         opened.append((way.estimator, way.kernel_size))
         return Nothing()
 
@@ -779,7 +776,6 @@ def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
     again = Nothing()
     made = reproduced(tmp_path / "killed", again, chosen)
     assert kept_result.stat().st_mtime_ns == written
-    assert not list((tmp_path / "killed").rglob("work"))
 
     def timeless(found: dict[str, Any]) -> list[Any]:
         units = [unit for one in found["cases"] for unit in one["learned"].values()]

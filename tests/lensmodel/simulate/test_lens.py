@@ -34,7 +34,7 @@ def diffraction_mtf(frequency: NDArray[np.float64], cutoff: float) -> NDArray[np
 
 def otf_of(f_number: float, wavelength_um: float, size: int = 55, **terms: object) -> PixelOtf:
     optics = Aberrations(f_number=f_number, **terms)  # type: ignore[arg-type]
-    wavefront = WaveError.of(optics, (0.0, 0.0), f_number, 0.0)
+    wavefront = WaveError.of(optics, (0.0, 0.0), f_number)
     return pixel_otf(wavefront, disc, [(wavelength_um, 1.0)], size=size, pitch_um=PITCH, f_number=f_number)
 
 
@@ -178,8 +178,8 @@ def test_stopped_down_wavefront_is_the_inner_part_of_the_open_one() -> None:
         f_number=2.0, spherical=2.0, coma=1.0, astigmatism=0.7, defocus=-1.0, tilt=(0.2, 0.1)
     )
     h = (0.5, -0.4)
-    open_wave = WaveError.of(optics, h, 2.0, 0.3)
-    closed = WaveError.of(optics, h, 4.0, 0.3)
+    open_wave = WaveError.of(optics, h, 2.0)
+    closed = WaveError.of(optics, h, 4.0)
     px = np.linspace(-1, 1, 9, dtype=np.float32)[None, :]
     py = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
 
@@ -190,7 +190,7 @@ def test_ray_gradient_is_the_derivative_of_the_wavefront() -> None:
     optics = Aberrations(
         f_number=2.0, spherical=2.0, coma=1.5, astigmatism=0.7, uniform_astigmatism=(0.3, 0.4)
     )
-    wave = WaveError.of(optics, (0.6, 0.3), 2.0, 0.0)
+    wave = WaveError.of(optics, (0.6, 0.3), 2.0)
     x, y, e = 0.4, -0.3, 1e-3
 
     def w(px: float, py: float) -> float:

@@ -203,7 +203,7 @@ def test_overexposure_clips_at_the_white_level() -> None:
 def test_photo_knows_the_truth_and_repeats_by_seed() -> None:
     camera = SimulatedCamera(64, 96)
     scene = dead_leaves(64 + 10, 96 + 10, np.random.default_rng(3))
-    options = BlurOptions(size=SIZE, step=0.3, defocus=0.5)
+    options = BlurOptions(size=SIZE, step=0.3)
     first, again = (
         photograph(scene, PERFECT, LensSettings(), camera, np.random.default_rng(7), options=options)
         for _ in range(2)

@@ -229,4 +229,4 @@ def test_the_photo_that_is_corrected_joins_the_samples_once(
     assert len(other.model.samples) > len(model.samples)
     assert {sample.photo for sample in other.model.samples} == {sampling.photo_id(p) for p in paths.values()}
     assert same.model is model
-    assert 0.0 < other.error_at(FieldPosition(0.5, 0.3), "g") <= 1.0
+    assert 0.0 < other.answer_at(FieldPosition(0.5, 0.3), "g", 15).predicted_error <= 1.0

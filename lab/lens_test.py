@@ -81,15 +81,15 @@ def squares_chart(
     squares : tuple of Square
         In coordinates of the frame.
     """
-    pitch = min(frame.height / rows, frame.width / cols) * 0.97
-    half = fill * pitch / 2.0
+    spacing = min(frame.height / rows, frame.width / cols) * 0.97
+    half = fill * spacing / 2.0
     turn = math.radians(lean_deg)
     height, width = frame.height + 2 * MARGIN, frame.width + 2 * MARGIN
     plane = np.full((height, width), bright)
     squares = []
     for i in range(rows):
         for j in range(cols):
-            right, down = (j - (cols - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch
+            right, down = (j - (cols - 1) / 2) * spacing, (i - (rows - 1) / 2) * spacing
             row = frame.center[0] + down * math.cos(turn) - right * math.sin(turn)
             col = frame.center[1] + right * math.cos(turn) + down * math.sin(turn)
             squares.append(Square(row, col, 2 * half))

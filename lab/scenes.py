@@ -156,8 +156,8 @@ def text(scene: Planes, rng: np.random.Generator) -> Planes:
         line = " ".join(bytes(word.astype(np.uint8)).decode("ascii") for word in words)
         pen.text((8, row), line[: int(page.width / (0.45 * size))], fill=20, font=font)
         row += int(1.35 * size)
-    cells = np.asarray(page, dtype=np.float32).reshape(height, over, width, over).mean(axis=(1, 3)) / 255.0
-    return np.ascontiguousarray(np.stack([cells**2.2] * 3), dtype=np.float32)
+    fine = np.asarray(page, dtype=np.float32).reshape(height, over, width, over).mean(axis=(1, 3)) / 255.0
+    return np.ascontiguousarray(np.stack([fine**2.2] * 3), dtype=np.float32)
 
 
 HARD_SCENES: Final[Mapping[str, Scenery]] = {
@@ -358,8 +358,8 @@ def dead_leaves(
         canvas[top:bottom, left:right][leaf] = colour
         free[leaf] = False
     canvas[empty] = _leaf_colour(rng)
-    cells = canvas.reshape(height, oversampling, width, oversampling, 3)
-    return np.ascontiguousarray(cells.mean(axis=(1, 3)).transpose(2, 0, 1))
+    fine = canvas.reshape(height, oversampling, width, oversampling, 3)
+    return np.ascontiguousarray(fine.mean(axis=(1, 3)).transpose(2, 0, 1))
 
 
 def _leaf_radius(rng: np.random.Generator, smallest: float, largest: float) -> float:

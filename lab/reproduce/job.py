@@ -208,8 +208,8 @@ class CaseJob:
         learned, asked = (in_container(path, container) for path in (shots.learn[0], shots.held_out))
         photo, method = develop(asked), self.plan.methods[0]
         learner, refused, _ = self._learning(way).of([learned])
-        true = corrected_with(photo, self.truth, method, self._tiles, workers=self.workers)
-        after = photo.planes if refused else learner.corrected(asked, method, self._tiles).planes
+        true = corrected_with(photo, self.truth, method, self._parts, workers=self.workers)
+        after = photo.planes if refused else learner.corrected(asked, method, self._parts).planes
         states = {"before": photo.planes, "true": true, "after": after}
         made = {name: measure.state(None, v, shots, self.case, raw=False) for name, v in states.items()}
         return {
@@ -266,14 +266,14 @@ class CaseJob:
         """Correct and measure chart and photo with a field; the name of the picture, if it has a label."""
         edges, after = (
             corrected_with(seen, field, method, parts, workers=self.workers)
-            for seen, parts in ((chart, measure.chart_tiles(self.case)), (photo, self._tiles))
+            for seen, parts in ((chart, measure.chart_parts(self.case)), (photo, self._parts))
         )
         name = {} if label is None else {f"{label}-{method}": self._picture(f"{label}-{method}", after)}
         return measure.state(edges, after, shots, self.case), name
 
     @property
-    def _tiles(self) -> list[Roi]:
-        return measure.tiles(self.case.camera.frame)
+    def _parts(self) -> list[Roi]:
+        return measure.parts(self.case.camera.frame)
 
     def _learned(self, learning: _Learning, shots: Shots, number: str, *, own_way: bool) -> Unit:
         """What is known after so many photos, and what corrections with it come to."""
@@ -292,8 +292,8 @@ class CaseJob:
             return {**unit, "psf": None, "methods": dict.fromkeys(methods, self._before)}
         unit["methods"] = {}
         for method in methods:
-            after = learner.corrected(shots.held_out, method, self._tiles)
-            edges = learner.corrected(shots.chart, method, measure.chart_tiles(case)).planes
+            after = learner.corrected(shots.held_out, method, self._parts)
+            edges = learner.corrected(shots.chart, method, measure.chart_parts(case)).planes
             state = measure.state(edges, after.planes, shots, case)
             state["nothing_to_correct"] = after.nothing_to_correct
             light = self._before["light"]

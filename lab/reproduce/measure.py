@@ -24,7 +24,7 @@ PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what t
 NEAR: Final = 1.5
 """A predicted error within this factor of the true one counts as right."""
 
-TILE: Final = 256
+PART: Final = 256
 """Pixels: side of the parts of a frame that are compared (chosen: four blocks and their borders)."""
 
 _EDGES: Final = 6  # of the chart, in its order
@@ -57,19 +57,19 @@ def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, d
     return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
 
 
-def tiles(frame: Frame) -> list[Roi]:
+def parts(frame: Frame) -> list[Roi]:
     """The parts of a frame that are corrected and compared: centre, two half way out, the four corners.
 
     A correction of all of a large frame takes minutes and tells no more.
     """
-    side = min(TILE, frame.height // 3 // 2 * 2, frame.width // 3 // 2 * 2)
+    side = min(PART, frame.height // 3 // 2 * 2, frame.width // 3 // 2 * 2)
     bottom, right = frame.height - side, frame.width - side
     inner = [(bottom // 2, right // 2), (bottom // 4, right // 4), (3 * bottom // 4, 3 * right // 4)]
     corners = [(row, col) for row in (0, bottom) for col in (0, right)]
     return [(row // 2 * 2, col // 2 * 2, side, side) for row, col in inner + corners]
 
 
-def chart_tiles(case: Case) -> list[Roi]:
+def chart_parts(case: Case) -> list[Roi]:
     """The edges of the chart that are corrected and measured: two in the centre, four towards one corner."""
     return [(row // 2 * 2, col // 2 * 2, height // 2 * 2 + 2, width // 2 * 2 + 2)
             for row, col, height, width in _edge_boxes(case)]  # fmt: skip
@@ -97,7 +97,7 @@ def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
 
 
 def pictures(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dict[str, dict[Zone, float]]:
-    """PSNR and SSIM of the held-out photo against the sharp scene in `tiles`; see `fidelity`.
+    """PSNR and SSIM of the held-out photo against the sharp scene in `parts`; see `fidelity`.
 
     Photos of the raw path are white-balanced for it; others are already.
     """
@@ -108,7 +108,7 @@ def pictures(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> di
 
 def _blocks(case: Case) -> list[tuple[int, int]]:
     every = []
-    for row, col, height, width in tiles(case.camera.frame):
+    for row, col, height, width in parts(case.camera.frame):
         rows, cols = ({*range(0, n - BLOCK, BLOCK - 2 * BORDER), n - BLOCK} for n in (height, width))
         every += [(row + r, col + c) for r in sorted(rows) for c in sorted(cols)]
     return every

@@ -172,8 +172,8 @@ def _statistics(developed: LinearPhoto, patch: Patch) -> NDArray[np.float32]:
 
 def _colours(pattern: Sequence[Sequence[int]], row: int, col: int) -> NDArray[np.int8]:
     """Color of each sample of a window that begins at a pixel."""
-    cell = np.roll(np.asarray(pattern, dtype=np.int8), (-(row % 2), -(col % 2)), axis=(0, 1))
-    return np.tile(cell, (WINDOW // 2, WINDOW // 2))
+    turned = np.roll(np.asarray(pattern, dtype=np.int8), (-(row % 2), -(col % 2)), axis=(0, 1))
+    return np.tile(turned, (WINDOW // 2, WINDOW // 2))
 
 
 def _middle(plane: Plane) -> Plane:

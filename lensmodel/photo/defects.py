@@ -82,9 +82,9 @@ class Neighbours:
     def __init__(self, colours: NDArray[np.uint8], period: int) -> None:
         self.shape, self.period = colours.shape, period
         self._step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
-        cell = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
+        pattern = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
         self.alike: dict[tuple[int, int], _Offsets] = {
-            (row, col): _alike(cell, row, col) for row, col in np.ndindex(period, period)
+            (row, col): _alike(pattern, row, col) for row, col in np.ndindex(period, period)
         }
 
     def inside(self, rows: NDArray[np.integer], cols: NDArray[np.integer]) -> tuple[Places, Places]:
@@ -112,14 +112,14 @@ class Neighbours:
         return at[0] * self.shape[1] + at[1]
 
 
-def _alike(cell: NDArray[np.integer], row: int, col: int) -> _Offsets:
+def _alike(pattern: NDArray[np.integer], row: int, col: int) -> _Offsets:
     """Offsets of the nearest pixels of the colour of one site, by distance."""
-    period, reach = len(cell), range(-_REACH, _REACH + 1)
+    period, reach = len(pattern), range(-_REACH, _REACH + 1)
     alike = [
         (down, right)
         for down in reach
         for right in reach
-        if (down or right) and cell[(row + down) % period, (col + right) % period] == cell[row, col]
+        if (down or right) and pattern[(row + down) % period, (col + right) % period] == pattern[row, col]
     ]
     return tuple(sorted(alike, key=lambda at: (at[0] ** 2 + at[1] ** 2, at))[:_NEIGHBOURS])
 

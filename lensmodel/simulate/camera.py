@@ -43,7 +43,7 @@ class SimulatedCamera:
     bits: int = 14  # of the mosaic's numbers
     black: int = 512  # black and white level
     white: int = 15872
-    pattern: str = "RGGB"  # colours of the 2 x 2 cell, row by row
+    pattern: str = "RGGB"  # colours of the 2 x 2 pattern, row by row
     # multipliers for r, g, b that make a grey scene grey: the sensor sees scene / multiplier
     white_balance: tuple[float, float, float] = (2.0, 1.0, 1.6)
     maker: str = "Simulated Camera"  # as written into the metadata of its photos
@@ -100,8 +100,8 @@ class SimulatedCamera:
 
     def channel_map(self) -> NDArray[np.intp]:
         """Index into r, g, b of the colour filter over every pixel, `(height, width)`."""
-        cell = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
-        return np.tile(cell, (self.height // 2, self.width // 2))
+        pattern = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
+        return np.tile(pattern, (self.height // 2, self.width // 2))
 
     def balanced(self, planes: Planes) -> Planes:
         """What the sensor sees of a scene: each channel over its white balance multiplier."""

@@ -637,8 +637,8 @@ def test_photo_of_another_kind_shows_what_the_raw_one_does(
 
 
 @pytest.mark.parametrize("frame", [Frame(480, 640), Frame(1808, 2816)])
-def test_tiles_lie_in_the_frame_and_meet_every_zone(frame: Frame) -> None:
-    found = measure.tiles(frame)
+def test_parts_lie_in_the_frame_and_meet_every_zone(frame: Frame) -> None:
+    found = measure.parts(frame)
     assert len(found) == len(set(found)) == 7
     for row, col, height, width in found:
         assert 0 <= row <= frame.height - height

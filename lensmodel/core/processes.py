@@ -1,25 +1,16 @@
-"""Where loops over patches, cells and photos run: any executor will do, here or on other machines.
-
-Python's spawned processes import the main module again: of a script without `if __name__ == "__main__"`
-each worker would begin the script anew. The workers here only run functions of this library and what was
-sent to them, so they leave the main module out: a script, a notebook and a command can start them alike.
-"""
+"""Where loops over patches, cells and photos run: any executor will do, here or on other machines."""
 
 from __future__ import annotations
 
 import os
 import pickle
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import parent_process
-from multiprocessing.context import SpawnContext, SpawnProcess
-from multiprocessing.process import BaseProcess
-from types import ModuleType
+from multiprocessing import get_context, parent_process
 from typing import Any, Final, ParamSpec, TypeVar
 
 A = TypeVar("A")
@@ -28,8 +19,6 @@ P = ParamSpec("P")
 
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """The work is parallel over processes; threads of linear algebra in each only get in one another's way."""
-
-_starting = threading.Lock()
 
 
 def portable(part: object) -> bool:
@@ -51,7 +40,7 @@ def pool(executor: Executor | None, workers: int | None, part: object = None) ->
         return
     count = max(1, workers or os.cpu_count() or 1)
     own: Executor = (
-        ProcessPoolExecutor(count, mp_context=_Context(), initializer=_begin)
+        ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin)
         if portable(part)
         else ThreadPoolExecutor(count)
     )
@@ -75,26 +64,6 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-class _Process(SpawnProcess):
-    """A spawned process that is told of an empty main module."""
-
-    @staticmethod
-    def _Popen(process_obj: BaseProcess) -> Any:  # noqa: ANN401, N802 - as multiprocessing calls it
-        with _starting:
-            main = sys.modules["__main__"]
-            sys.modules["__main__"] = ModuleType("__main__")
-            try:
-                return SpawnProcess._Popen(process_obj)  # noqa: SLF001 - the only place to step in
-            finally:
-                sys.modules["__main__"] = main
-
-
-class _Context(SpawnContext):
-    """`multiprocessing.get_context("spawn")` with such processes."""
-
-    Process = _Process
 
 
 class Here(Executor):

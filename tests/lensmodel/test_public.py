@@ -294,21 +294,6 @@ def test_a_registered_method_is_seen_by_a_correction(monkeypatch: pytest.MonkeyP
 
 # --- worker processes -------------------------------------------------------------------------
 
-UNGUARDED = """
-from lensmodel.core import processes
-print("begun")
-with processes.pool(None, 1) as pool:
-    print(pool.submit(len, "four").result())
-"""
-
-
-def test_a_script_without_a_guard_may_start_workers(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(UNGUARDED, encoding="utf-8")
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
-
-    assert done.stdout.split() == ["begun", "4"], done.stderr
-
 
 def test_what_other_processes_cannot_load_runs_in_threads_of_this_one() -> None:
     own = type("Own", (), {"__module__": "__main__"})()

@@ -34,10 +34,7 @@ BANDS: Final = {"coarse": (0.06, 0.15), "middle": (0.15, 0.3), "fine": (0.3, 0.5
 """Cycles per pixel."""
 
 _FAR: Final = 2.0
-"""How many ranges beyond the range a dot lies.
-
-Chosen: with 1.5, correct sharpening of twigs and letters to half their width had up to 70 dots a megapixel.
-"""
+"""Ranges beyond the range of a dot (chosen): with 1.5 correct twigs and letters had dots."""
 _HINT: Final = 0.1  # share of a colour that the original must have there for its line to be traced (chosen)
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
@@ -57,11 +54,7 @@ _STEP: Final = 0.2  # least step of an edge, full scale is 1 (chosen: 50 of 255)
 _EVEN: Final = 0.06
 """Standard deviation of a plateau beside an edge, as a share of the step: chosen, half of the bar."""
 _HALO: Final = 5.0
-"""Percent of the step by which an original may leave its plateaus beside an edge that counts.
-
-Chosen: with 25 the truth itself "overshoots" by 26 percent in foliage, by lines and texture that blur hid;
-with 5 by 5.5. Edges that a camera gave halos are left out.
-"""
+"""Percent of the step beyond its plateaus at an edge that counts (chosen): with 25 the truth overshoots."""
 _LEAST_EDGES: Final = 50
 """Chosen: below it the 99th percentile is the worst edge."""
 

@@ -20,8 +20,7 @@ OVERSHOOT_PERCENT: Final = 12.0
 GRAIN: Final = (0.7, 1.0)
 ZONE_LOSS_DB: Final = 0.05
 LOSS_SHARE: Final = 0.01
-"""What must hold for every picture of a release (chosen): the most overshoot in percent of the step, noise
-power over the original's, the most that a zone loses, and the share of blocks that lose."""
+"""Bars (chosen): most overshoot in percent, grain over the original's, a zone's loss, losing blocks."""
 
 _MARGIN: Final = 14  # pixels around a tile: the reach of a profile, and two for its slope
 _SQUARE: Final = 48  # pixels (chosen): half of a crop of `lab.gallery.crops`

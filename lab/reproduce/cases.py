@@ -36,8 +36,7 @@ FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""
 
 SEEDS: Final = (1008, *range(1001, 1008))
-"""Of third-order lenses that are run, one of each kind; 1008 is the soft, fast one instead of 1000, so that
-half of them are unseen."""
+"""Of third-order lenses, one of each kind; the soft 1008 instead of 1000, so that half are unseen."""
 
 SOFT_SEED: Final = 1008
 

@@ -26,8 +26,7 @@ Roi: TypeAlias = tuple[int, int, int, int]
 """Row, column, height and width of a part of a frame."""
 
 _SMALL_FRAME: Final = 2e6
-"""Pixels below which the paper's way estimates kernels of the default's size (chosen): its 55 pixels are of
-frames of 21 megapixels, a hundredth of their width, and take several times as long."""
+"""Pixels below which the paper's way takes kernels of the default's size (chosen): 55 are of 21 MP."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

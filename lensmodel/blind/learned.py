@@ -34,8 +34,7 @@ from lensmodel.patches.windows import Patch, Selection
 from lensmodel.photo.values import LinearPhoto
 
 _DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)
-"""Of planes that a converter or a camera made: what their noise became no model tells, and the network was
-trained with this."""
+"""Of planes that a converter or a camera made: what the network was trained with."""
 
 _HELD: Final = 0.999
 """Share of its light that the array of a sample's kernel holds (chosen)."""

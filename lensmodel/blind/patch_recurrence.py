@@ -38,20 +38,16 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_ste
 log = logging.getLogger(__name__)
 
 _BORDER = 3
-"""Pixels left out along the rim: fewer patches overlap there, so that the latent picture is worse
-(chosen)."""
+"""Pixels left out along the rim: fewer patches overlap there (chosen)."""
 _ERROR: Final[Mapping[str, float]] = fitted("blind")["recurrence_error"]
-"""Expected relative L2 error by the disagreement of the halves of the patches: a line through 24 patches,
-whose halves lie 0.14 apart and whose mean error is 0.61, see `data/README.md`. It ranks patches weakly (rank
-correlation 0.28)."""
+"""Relative L2 error by the disagreement of the patches' halves, a fitted line: see `data/README.md`."""
 
 ALPHA = 4.0 / 3.0
 """Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
 
 SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
 _COMPONENTS = 10
-"""Principal ones by which neighbours are found: they hold nearly all of a patch's power, more slow the search
-(chosen)."""
+"""By which neighbours are found: they hold nearly all of a patch's power (chosen)."""
 _NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
 
 _STRIDE = 2  # pixels from patch to patch: every pixel is in several (chosen)

@@ -31,8 +31,7 @@ _CANDIDATES: Final = 4 * NEAREST
 """Nearest samples among which the photos share (chosen: a dozen photos at one place)."""
 
 _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / support.UNITS
-"""Steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen: it reaches
-much farther)."""
+"""Steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen)."""
 
 _MEMORIES: Final = 64
 """Neighbourhoods whose keys are kept (chosen: those of a whole picture; each takes a megabyte)."""

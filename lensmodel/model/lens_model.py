@@ -21,8 +21,7 @@ from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
 
 _LEAST_ERROR: Final = 0.01
-"""Relative L2 error below which no part of an answer is believed (chosen: of an answer of several parts one
-would silence the others)."""
+"""Relative L2 below which no part of an answer is believed (chosen): it would silence the others."""
 
 _LISTED: Final = 1e-3
 """Share of the weight from which on a photo is counted: less shows in no digit (chosen)."""

@@ -32,8 +32,7 @@ from lensmodel.model.validation import CrossValidation, bandwidth, cross_validat
 from lensmodel.model.widths import WidthField
 
 _DRIFT: Final = 0.15
-"""Relative L2 error for each unit of `support` beyond the first between a question and the nearest sample
-(chosen: kernels change by as much)."""
+"""Relative L2 error for each unit of `support` beyond the first to the nearest sample (chosen)."""
 
 _WIDEST: Final = 255
 """Pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory."""

@@ -33,15 +33,13 @@ from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.local_frame import LocalKernels
 
 MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-"""Of the bandwidth by the normal reference rule: in steps of a root of two, up to which errors hardly differ
-(chosen)."""
+"""Of the bandwidth by the rule: in steps of a root of two, in which errors hardly differ (chosen)."""
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
 """The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
 _CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
 _CV_PHOTOS = 3
-"""Photos from which on leaving one out tells of bandwidths: of two, each would be foretold by one alone
-(chosen)."""
+"""Photos from which on leaving one out tells of bandwidths: of two, one would foretell one (chosen)."""
 _CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
 _SCORED = 800
 """Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""

@@ -27,8 +27,7 @@ from lensmodel.model import variables as va
 # Of 1, r, r^2, then the rest: weak, only against too few samples (chosen)
 _PLACE_RIDGE = np.array([1e-6, 1e-3, 1e-2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
 _SETTING_RIDGE = 0.05
-"""Of the terms of the settings: with none, two apertures of few patches would scale kernels at will
-(chosen)."""
+"""Of the terms of the settings: with none, two apertures would scale kernels at will (chosen)."""
 _RANGE = (0.45, 2.5)  # factors by which a kernel is scaled at most: beyond, its shape is another one (chosen)
 _HUBER = 0.15  # of a logarithm of the width: the scatter of estimates (chosen)
 _MIN_SAMPLES = 6  # below, widths are carried nowhere: the fit over the field has more terms (chosen)

@@ -25,16 +25,13 @@ BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, mid
 BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
 
 EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
-"""Bands of the frequencies that blur takes away: below 0.1 cycles/pixel lenses leave nearly all, above 0.4
-demosaicing and compression leave little to see."""
+"""Bands that blur takes away: lenses leave nearly all below 0.1, demosaicing little above 0.4."""
 
 NON_UNIFORMITY: Final = 0.005
-"""Standard deviation of the gain of a sensor's pixels, relative: 0.3 to 1 percent is usual in data sheets by
-the standard EMVA 1288. Weaker structure is the sensor's and no noise model of light holds it."""
+"""Relative standard deviation of the gain of a sensor's pixels: 0.3 to 1 percent by EMVA 1288."""
 
 DYNAMIC_RANGE: Final = 2.0**14.8
-"""Full level over the noise of darkness of the best camera sensors; noise said to be less was eaten by
-rounding or denoising."""
+"""Full level over the dark noise of the best sensors: less noise was eaten by rounding or denoising."""
 
 _JPEG_BLOCK = 8  # pixels: ITU-T T.81
 _MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
@@ -263,8 +260,7 @@ def _kurtosis(values: NDArray[np.float64]) -> float:
 
 
 LEAST_PATCHES: Final = 6
-"""Patches that lie apart. A plane over the field, which is the least that tells a centred lens from a
-decentred one, has three unknowns; so many again tell whether the first three agree."""
+"""Patches that lie apart: a plane over the field has three unknowns, so many again tell if it fits."""
 
 LEAST_PARTS: Final = 3
 """Parts of the picture that they lie in: three places off one line determine a plane over the field."""

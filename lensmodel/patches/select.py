@@ -33,19 +33,16 @@ logger = logging.getLogger(__name__)
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
 CLIPPED_LIMIT: Final = 0.005
-"""Share of a window's pixels: a few specular points do little harm, and none at all would leave sunlit scenes
-out (chosen)."""
+"""Share of a window's pixels (chosen): a few specular points do little harm."""
 BLOB_LIMIT: Final = 20
 """Connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)."""
 DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
 FLAT_CONTRAST: Final = 4.0
 """Variance of signal over that of noise: below, noise decides the estimate (chosen)."""
 FLAT_EIGENVALUE: Final = 10.0
-"""Smaller eigenvalue of the structure tensor over that of noise: ten times what a window without edges has by
-chance (chosen)."""
+"""Smaller eigenvalue of the structure tensor over that of noise: ten times that of chance (chosen)."""
 ONE_DIRECTION_RATIO: Final = 0.05
-"""Smaller eigenvalue of the structure tensor over the larger: a single line has next to nothing across
-(chosen)."""
+"""Smaller eigenvalue of the structure tensor over the larger: a line has next to nothing (chosen)."""
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
 PERIOD_LIMIT: Final = 0.8
 """See `Details.period`: a repetition is as alike as that, other scenes seldom (chosen)."""
@@ -54,8 +51,7 @@ BLOCKINESS_LIMIT: Final = 1.8
 JPEG_WEIGHT: Final = 0.3
 """JPEG files were sharpened and gamma-coded: their patches count for less."""
 EVIDENCE_FLOOR: Final = 0.25
-"""Bits a frequency between 0.1 and 0.4 cycles/pixel that a patch needs: signal as strong as the noise over a
-quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
+"""Bits a frequency from 0.1 to 0.4 cycles/pixel: signal as strong as noise over a quarter of them."""
 SHORTLIST_A_SECTOR: Final = 8
 """Windows that the costlier scores look at: several times as many as are taken (chosen)."""
 

@@ -22,8 +22,7 @@ from lensmodel.photo.values import LinearPhoto
 RINGS: Final = 8  # of equal width in r: as many as are needed to follow blur along the radius (chosen)
 OCTANTS: Final = 8  # eighths of a turn, by definition
 PATCHES_A_CELL: Final = 3
-"""Of all that were asked for, on average: more leave places of the field without any, one alone is a poor
-estimate (chosen)."""
+"""Of all asked for, on average: more leave places without any, one alone is a poor estimate (chosen)."""
 MOST_A_CELL: Final = 4
 """Pooling the normal equations of four patches is worth most of what twelve give."""
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
@@ -32,8 +31,7 @@ MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (cho
 
 SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
 MOST_STEPS: Final = 4
-"""Distances to the nearest seed count in steps of one window, up to four: beyond, any other window is far
-enough, and the better one is taken (chosen)."""
+"""Distances to the nearest seed count in window sides up to this; beyond, the better one wins (chosen)."""
 
 
 def sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

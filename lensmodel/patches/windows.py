@@ -70,29 +70,23 @@ class Selection:
 
 
 ORIENTATIONS: Final = 8
-"""Bins of gradient direction over half a turn: corners need a few directions, each must hold edges enough for
-a histogram (chosen)."""
+"""Bins of gradient direction over half a turn: each must hold edges enough for a histogram (chosen)."""
 
 BLOCKS_A_SIDE: Final = 4
-"""A window is this many blocks wide, and windows start at every block: finer starts cost time and find nearly
-the same windows (chosen)."""
+"""Of a window, and windows start at every block: finer starts find nearly the same ones (chosen)."""
 
 WIDTH_BINS: Final = 28
 WIDTH_STEP_PX: Final = 0.2
 """Histogram of edge widths, 0 to 5.6 px (chosen: finer than the widths of sharp and soft photos differ)."""
 
 EDGE_SIGMAS: Final = 4.0
-"""Of a gradient's noise, above which a pixel is an edge: noise alone exceeds it in one pixel of 3000
-(chosen)."""
+"""Of a gradient's noise, above which a pixel is an edge: noise exceeds it in one of 3000 (chosen)."""
 WIDTH_SIGMAS: Final = 10.0
-"""The same where a width is measured: noise must not move the places where an edge begins and ends
-(chosen)."""
+"""The same where a width is measured: noise must not move where an edge ends (chosen)."""
 CLIP_SHARE: Final = 0.98
-"""Of the clipping level, above which a pixel is clipped: noise and demosaicing leave it a little lower
-(chosen)."""
+"""Of the clipping level: noise and demosaicing leave clipped pixels a little below it (chosen)."""
 DARK_SNR: Final = 5.0
-"""A pixel below this ratio of level to noise counts as dark. One percent of full range is the noise of
-the published lens-blur benchmark; ten times that level would already throw out half a photo there."""
+"""A pixel below this ratio of level to noise is dark: ten would throw out half a photo of 1 % noise."""
 
 _MARGIN = 18  # half an r-map window and the smoothing
 _STRIP_PIXELS = 2_000_000
@@ -287,9 +281,7 @@ MIN_RIDGE_PIXELS: Final = 30
 """Fewer edge pixels do not give a width: nine of them would lie below its quantile (chosen)."""
 
 WIDTH_QUANTILE: Final = 0.3
-"""Soft edges of the scene widen the upper half of the widths, not the lower: on sharp photographs, half of
-each defocused by a disc of 2 px, this told the halves apart better than the median or the 15th percentile.
-Measured once, no command repeats it."""
+"""Soft edges of the scene widen the upper half of the widths, not the lower (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,7 @@ CODES: Final = 65536  # of 16 bits
 _CURVE_POINTS: Final = 4096  # of a profile's table: the most that all programs read
 _LEAST_COLUMN: Final = 1e-3  # of XYZ: a channel that gives no light has no curve
 _ADDITIVE: Final = 2e-3
-"""Error in XYZ, white is 1, up to which channels add up (chosen): what is rounded to 16 bits stays a tenth
-of it."""
+"""Error in XYZ, white is 1, up to which channels add up (chosen): rounding to 16 bits is a tenth of it."""
 
 Curve: TypeAlias = NDArray[np.float32]
 """Linear light at the codes k / 65535, shape (65536,), not decreasing."""

@@ -17,19 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SIGMAS: Final = {"sure": 25.0, "likely": 10.0, "possible": 10.0}
-"""Least height above the neighbours of the colour, in standard deviations of the noise (chosen), of what one
-photo shows for sure, of what it makes likely, and of what needs a second photo: less does no harm."""
+"""Least height above the neighbours of the colour, in standard deviations of the noise (chosen)."""
 
 _CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
 """Least height relative to how much the neighbours of the colour differ (chosen): texture stays below."""
 
 _BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
-"""Largest share of the height by which the pixels beside it may stand out (chosen): of a point of light
-through the sharpest lenses they get a fifth, of the weakest colour a tenth."""
+"""Most of the height by which pixels beside it stand out (chosen): beside points of light a tenth."""
 
 _MANY: Final = 3.0
-"""Where so many times more are sure than likely, the likely ones are defects too (chosen): of photos without
-defects none is sure, and up to two dozen are likely."""
+"""Where so many times more are sure than likely, the likely ones are defects too (chosen)."""
 
 _MOST: Final = 2e-3
 """Share of the pixels above which what was found is a picture after all, such as a sky of stars (chosen)."""
@@ -44,11 +41,9 @@ _NEARLY: Final = 0.8  # of the least height (chosen): above all neighbours but o
 _SAMPLES: Final = 60_000  # pixels that tell of the noise (chosen): more would not change it
 _LEVELS: Final = 24  # at which noise is measured (chosen)
 _QUIET: Final = 0.3
-"""Share of the pixels of one level, those most like their neighbours, that tell of the noise: the rest may be
-texture (chosen)."""
+"""Share of the pixels of one level, most like their neighbours, that tell of the noise (chosen)."""
 _QUIET_HEIGHT: Final = 0.42
-"""Quantile `_QUIET` of how far white noise of unit variance is from the median of eight neighbours: that of
-|N(0, 1 + pi / 16)|."""
+"""Quantile `_QUIET` of |N(0, 1 + pi / 16)|: white noise against the median of eight neighbours."""
 _SMALL: Final = (24, 36)  # of the pictures by which scenes are told apart (chosen)
 
 Places: TypeAlias = NDArray[np.int64]

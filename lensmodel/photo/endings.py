@@ -9,8 +9,7 @@ _RAW: Final = (
     "mos mrw nef nrw orf ori pef ptx pxn qtk r3d raf raw rdc rw2 rwl rwz sr2 srf srw sti x3f"
 )
 RAW_ENDINGS: Final = frozenset(f".{ending}" for ending in _RAW.split())
-"""Of RAW files that LibRaw knows (LibRaw 0.22, the list of supported cameras), and those that it may refuse:
-what a file is, its content tells."""
+"""Of RAW files that LibRaw 0.22 knows or may refuse: what a file is, its content tells."""
 
 ENDINGS: Final = RAW_ENDINGS | {".jpg", ".jpeg", ".tif", ".tiff", ".png"}
 

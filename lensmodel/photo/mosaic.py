@@ -24,8 +24,7 @@ _STRAYS: Final = 0.02
 """Share of a pile that may lie above it: hot pixels; more is a bright part of the picture."""
 
 _EDGE: Final = 0.02
-"""Share of a pile below its lower end: pixels whose full well is the least; 0 would take the darkest stray
-(chosen)."""
+"""Share of a pile below its lower end: 0 would take the darkest stray (chosen)."""
 
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""

@@ -14,17 +14,14 @@ BLOCK: Final = 8
 """Side of the blocks in pixels: flat places of this size exist in almost any photo."""
 
 GRAIN: Final = 4
-"""Side in pixels of the blocks whose means tell of coarse grain: fine grain averages out over 16 pixels, what
-is left is coarse (chosen)."""
+"""Side in pixels of blocks whose means tell of coarse grain: fine grain averages out there (chosen)."""
 
 _GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)
-"""Shares of the pixels that are darker than the levels at which grain is compared: a dark, a middle and a
-bright one that the photo has (chosen)."""
+"""Shares of the pixels darker than the levels at which grain is compared (chosen)."""
 
 _BINS: Final = 24  # levels at most, from dark to bright (chosen): a line of two terms needs no more
 _FLAT_SHARE: Final = 0.15
-"""Share of the blocks of one level, the least textured, that count: more holds texture, fewer are too few to
-measure (chosen)."""
+"""Share of the blocks of one level, the least textured, that count (chosen)."""
 
 _MIN_BLOCKS: Final = 24  # of a level (chosen): 1,536 pixels tell a standard deviation within some percent
 _ENOUGH_PIXELS: Final = 3_000_000  # of a plane (chosen): more would not change the fit

@@ -25,10 +25,7 @@ Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float
 _PROCESSED: Final = 16.0
 """How much more noise variance a photo without its mosaic has than its flat places show."""
 _USUAL_GRAIN, _COARSEST = 14.0, 4.0
-"""How coarse grain may be, by `noise.graininess`, before more of it counts, and how much more at most.
-
-Demosaicing leaves 6 to 9; texture in places that are none too flat looks coarse as well.
-"""
+"""Coarseness of grain above which more of it counts, and how much more at most; demosaicing has 6 to 9."""
 _DEMOSAICED: Final = (3.7, 1.9, 3.7)
 """Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`."""
 _COARSEST_POWER: Final = 64.0

@@ -43,8 +43,7 @@ _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the differe
 _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)
 
 _ALONG: Final = math.cos(math.radians(10.0))
-"""Edges whose normal lies further from u and v belong to neither (chosen: of points three times as long as
-wide ten degrees take a tenth of the MTF50)."""
+"""Edges whose normal lies further from u and v belong to neither (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,7 @@ from lensmodel.workflow.sampling import estimate_cell, find_patches, preset_of
 log = logging.getLogger(__name__)
 
 SEEN_DB: Final = 0.3
-"""Expected gain of a photo below which it is left as it is (chosen): at 0.2 dB nobody saw a difference in
-photos enlarged three times."""
+"""Expected gain below which a photo is left (chosen): at 0.2 dB nobody saw a difference at 3:1."""
 
 LOSSY_SHARE: Final = 0.7
 """Share of the correction that compressed photos get (chosen). Their camera has sharpened and smoothed

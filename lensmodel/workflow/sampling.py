@@ -49,13 +49,11 @@ log = logging.getLogger(__name__)
 Stage = Literal["developing", "selecting", "estimating"]
 
 DEFAULT_KERNEL_SIZE: Final = 31
-"""Pixels: holds the blur of usual lenses, while the cost grows with the square of it; the paper's largest has
-55 (chosen)."""
+"""Pixels: holds the blur of usual lenses, and the cost grows with its square (chosen)."""
 _PATCH_SIZE: Final = 192  # pixels: room for a kernel, few enough for one blur (chosen)
 _SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
 KERNEL_PATCHES: Final = 24
-"""Patches that an estimator of kernels looks at: enough for every ring and octant of the field to get one,
-while each costs a second."""
+"""Patches that an estimator of kernels looks at: each costs a second (chosen)."""
 
 
 # --- which parts --------------------------------------------------------------------------

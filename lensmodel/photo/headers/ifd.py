@@ -21,12 +21,10 @@ MAX_ENTRIES: Final = 1024
 """Entries read of one directory: cameras write below 150, and a false count must not cost time (chosen)."""
 
 MAX_DIRECTORIES: Final = 64
-"""Directories followed in one chain or tree: cameras write a dozen, and a tree must not cost time
-(chosen)."""
+"""Directories followed: cameras write a dozen, and a tree must not cost time (chosen)."""
 
 MAX_VALUE_BYTES: Final = 16 << 20
-"""Bytes read of one value: the largest honest ones, ICC profiles and offset tables, are far smaller, and a
-false size must not fill the memory (chosen)."""
+"""Bytes read of one value: honest ones are smaller, a false size must not fill the memory (chosen)."""
 
 # Type -> format of `struct`: TIFF 6.0, section 2, and from 16 on BigTIFF; 13 is an offset of a directory.
 _FORMATS: Final[Mapping[int, str]] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -12,7 +12,6 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from skimage.metrics import structural_similarity
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
@@ -68,40 +67,6 @@ def psnr(image: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
 def _same_shape(image: NDArray[np.floating], reference: NDArray[np.floating]) -> None:
     if image.shape != reference.shape or image.ndim < 2:
         raise InvalidInputError(f"pictures must have the same shape, got {image.shape} and {reference.shape}")
-
-
-def block_means(
-    image: NDArray[np.floating],
-    reference: NDArray[np.floating],
-    frame: Frame,
-    maps: Callable[[NDArray[np.floating], NDArray[np.float64]], Sequence[NDArray[np.float64]]],
-    corners: Iterable[tuple[int, int]],
-) -> dict[Zone, NDArray[np.float64]]:
-    """Means by zone of what `maps` says of the inner pixels of each block and of its truth.
-
-    A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
-    a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
-    distortion of the picture, not blur. So the truth of each block, which has no noise, is moved to where
-    it lies best.
-    """
-    _same_shape(image, reference)
-    if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
-        raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
-    radius = _radii(frame)
-    found, wanted = (picture.reshape(-1, *picture.shape[-2:]) for picture in (image, reference))
-
-    def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
-        window = tuple(slice(start, start + BLOCK) for start in corner)
-        picture = found[:, *window]
-        drawn = maps(picture, moved(wanted[:, *window], picture))
-        zones = zone_masks(radius[window][CORE])
-        return {z: np.array([*(m[mask].sum() for m in drawn), mask.sum()]) for z, mask in zones.items()}
-
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        # in the order of the blocks: the same sum for any number of threads
-        parts = list(pool.map(compared, corners))
-    sums = {zone: np.sum([part[zone] for part in parts], axis=0) for zone in ZONES}
-    return {zone: total[:-1] / total[-1] for zone, total in sums.items() if total[-1]}
 
 
 def blocks(frame: Frame, most: int | None = None) -> list[tuple[int, int]]:
@@ -188,17 +153,6 @@ def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.f
     return moved[..., _SHIFT_PAD : _SHIFT_PAD + height, _SHIFT_PAD : _SHIFT_PAD + width]
 
 
-def _ssim_map(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """SSIM around each pixel (Z. Wang et al., IEEE TIP 13, 2004; Gaussian of 1.5 px), mean over planes."""
-    maps = [
-        structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
-            x, y, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
-        )[1]
-        for x, y in zip(a, b, strict=True)
-    ]
-    return np.asarray(np.mean(maps, axis=0))
-
-
 # --- by zone and by block -----------------------------------------------------------------------
 
 EVERY: Final = 120
@@ -217,28 +171,32 @@ def fidelity(
     *,
     srgb: bool = True,
     corners: Sequence[tuple[int, int]] | None = None,
-) -> dict[str, dict[Zone, float]]:
-    """PSNR in dB by zone, each block of 128 pixels at its best shift; of sRGB-encoded pictures SSIM too.
+) -> dict[Zone, float]:
+    """PSNR in dB by zone, each block of 128 pixels at its best shift, as shown or of linear light.
 
-    A blind method leaves the place of the picture free, and the centre of mass of a PSF is not its core: the
-    truth of each block, which has no noise, is moved to where it lies best. Blocks are those at `corners`, or
-    all over the frame.
-
-    Returns
-    -------
-    dict
-        `psnr` and `ssim`, each by zone; zones of which no block was compared are left out.
+    A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
+    a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
+    distortion of the picture, not blur. So the truth of each block, which has no noise, is moved to where
+    it lies best. Blocks are those at `corners`, or all over the frame; zones without one are left out.
     """
+    _same_shape(image, reference)
+    if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
+        raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
     found, wanted = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
-    means = block_means(
-        found,
-        wanted,
-        frame,
-        lambda a, b: [block_error(a, b), *([_ssim_map(a, b)[CORE]] if srgb else [])],
-        blocks(frame, EVERY) if corners is None else corners,
-    )
-    psnrs = {zone: psnr_of(float(mean[0])) for zone, mean in means.items()}
-    return {"psnr": psnrs, **({"ssim": {z: float(mean[1]) for z, mean in means.items()}} if srgb else {})}
+    radius = _radii(frame)
+
+    def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
+        window = tuple(slice(start, start + BLOCK) for start in corner)
+        picture = found[:, *window]
+        error = block_error(picture, moved(wanted[:, *window], picture))
+        zones = zone_masks(radius[window][CORE])
+        return {zone: np.array([error[mask].sum(), mask.sum()]) for zone, mask in zones.items()}
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        # in the order of the blocks: the same sum for any number of threads
+        parts = list(pool.map(compared, blocks(frame, EVERY) if corners is None else corners))
+    sums = {zone: np.sum([part[zone] for part in parts], axis=0) for zone in ZONES}
+    return {zone: psnr_of(float(error / count)) for zone, (error, count) in sums.items() if count}
 
 
 @dataclass(frozen=True, slots=True)

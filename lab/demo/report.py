@@ -120,7 +120,7 @@ def psf_error(client: Client, lens_id: str, version: int) -> dict[Zone, float]:
 def psnr(planes: Planes, shot: DemoShot) -> dict[Zone, float]:
     """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone, registered block by block."""
     gains = np.asarray(CAMERA.white_balance, dtype=np.float32)[:, None, None]
-    return fidelity(planes * gains, shot.sharp * gains, CAMERA.frame)["psnr"]
+    return fidelity(planes * gains, shot.sharp * gains, CAMERA.frame)
 
 
 def sharpness(planes: Planes) -> dict[Zone, Sharpness]:

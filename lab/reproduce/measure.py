@@ -96,8 +96,8 @@ def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
     return row
 
 
-def pictures(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dict[str, dict[Zone, float]]:
-    """PSNR and SSIM of the held-out photo against the sharp scene in `parts`; see `fidelity`.
+def picture(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dict[Zone, float]:
+    """PSNR of the held-out photo against the sharp scene in `parts`; see `fidelity`.
 
     Photos of the raw path are white-balanced for it; others are already.
     """
@@ -129,11 +129,14 @@ def forecast(
 def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
     """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
     made = fidelity(photo, shots.truth(), case.camera.frame, srgb=False, corners=_blocks(case))
-    return dict(made["psnr"].items())
+    return dict(made.items())
 
 
 def state(
     chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, raw: bool = True
 ) -> dict[str, Any]:
     """Everything about one version of the chart, if there is one, and of the held-out photo."""
-    return {"edges": {} if chart is None else edges(chart, case), **pictures(photo, shots, case, raw=raw)}
+    return {
+        "edges": {} if chart is None else edges(chart, case),
+        "psnr": picture(photo, shots, case, raw=raw),
+    }

@@ -186,20 +186,16 @@ def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
 
 
 def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
-    """PSNR and SSIM of the photo never learned from."""
+    """PSNR of the photo never learned from."""
     page.title(f"A photo never used for calibration, {label}")
     page.text(
-        "PSNR in dB and SSIM of the sRGB-encoded picture against the sharp scene, each block of 128 "
+        "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 "
         "pixels at its best shift, before and after alike; of large frames every second block, as on a "
         f"chessboard. {DENOISED.capitalize()} is the control: the correction with a PSF that is a point."
     )
     for method, psnr in found["psnr"].items():
         page.title(f"Deconvolution: {deconvolution(method)}", 3)
-        rows = [
-            [shown(row["state"]), *(number(row[z], 2) for z in ZONES), *(number(other[z], 4) for z in ZONES)]
-            for row, other in zip(psnr, found["ssim"][method], strict=True)
-        ]
-        page.table(["", *(f"PSNR {z}" for z in ZONES), *(f"SSIM {z}" for z in ZONES)], rows)
+        page.table(["", *ZONES], [[shown(row["state"]), *(number(row[z], 2) for z in ZONES)] for row in psnr])
         page.text("Share of the gain of the true PSF in PSNR, where that is measurable:")
         kept = found["psnr_kept"][method]
         page.table(["", *ZONES], [[f"n = {n}", *(number(kept[n][z], 2) for z in ZONES)] for n in kept])

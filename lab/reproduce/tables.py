@@ -74,8 +74,7 @@ def summary(result: Result) -> dict[str, Any]:
         "mtf": {method: _mtf(result, method) for method in methods},
         "share": {method: _by_count(result, partial(shares, method=method)) for method in methods},
         "highest_mtf": {method: _highest_mtf(result, method) for method in methods},
-        "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
-        "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
+        "psnr": {method: _psnr(result, method) for method in methods},
         "psnr_kept": {method: _by_count(result, partial(kept, method=method)) for method in methods},
         "worse": {method: worse(result, method) for method in methods},
         "psf_others": _psf_of_others(result),
@@ -245,12 +244,12 @@ def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _fidelity(result: Result, method: str, of: str) -> list[dict[str, Any]]:
+def _psnr(result: Result, method: str) -> list[dict[str, Any]]:
     every = [states(case, method) for case in result["cases"]]
     return [
         {
             "state": name,
-            **{zone: mean(get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
+            **{zone: mean(get(one[name]["psnr"], zone) for one in every if name in one) for zone in ZONES},
         }
         for name in _names(every)
     ]

@@ -69,7 +69,7 @@ def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
     shift = best_shift(bent, sharp)
     corner = frame.polar(rows, cols)[0] > CORNER_ZONE_R
     plain = psnr(shifted(bent, *shift)[corner][None], sharp[corner][None])
-    registered, blurred = (fidelity(p, sharp, frame, srgb=False)["psnr"]["corner"] for p in (bent, soft))
+    registered, blurred = (fidelity(p, sharp, frame, srgb=False)["corner"] for p in (bent, soft))
 
     assert registered > plain + 6.0
     assert blurred < registered - 3.0

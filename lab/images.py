@@ -182,7 +182,8 @@ def fidelity(
     _same_shape(image, reference)
     if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
         raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
-    found, wanted = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
+    pair = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
+    found, wanted = (picture.reshape(-1, *picture.shape[-2:]) for picture in pair)
     radius = _radii(frame)
 
     def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from lab.correction.frame_window import FRAME, FrameWindow, view
 from lab.gallery import figures
-from lab.gallery.rendering import Rendered, rendered
+from lab.gallery.pictures import Rendered, rendered
 from lab.images import psnr
 from lab.reproduce import cases
 from lab.scenes import hard_scene

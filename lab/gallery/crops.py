@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.gallery.rendering import Rendered
+from lab.gallery.pictures import Rendered
 from lab.images import Picture as Shown
 from lab.images import crop_boxes
 

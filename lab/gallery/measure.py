@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.gallery import figures
-from lab.gallery.rendering import Rendered
+from lab.gallery.pictures import Rendered
 from lab.images import gains
 
 TILE: Final = 1024

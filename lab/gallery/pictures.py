@@ -3,23 +3,43 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import tifffile
+from numpy.typing import NDArray
 
-from lab.code_version import version_of
-from lab.gallery.rendering import rendered
 from lab.reproduce.frames import MARGIN
 from lab.reproduce.shots import JPEG_QUALITY
 from lab.scenes import hard_scene
+from lab.stored import version_of
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotAnImageError
 from lensmodel.core.files import atomic
-from lensmodel.core.types import LensSettings
-from lensmodel.photo import develop, inspect, write_image
+from lensmodel.core.types import LensSettings, Planes
+from lensmodel.photo import Encoding, develop, inspect, write_image
 from lensmodel.simulate import SimulatedCamera, draw_lens, photograph, write_photo
+
+Rendered = NDArray[np.uint16]
+"""A picture `(row, col, 3)`, sRGB, 0 to 65535, in sensor orientation."""
+
+
+def rendered(planes: Planes, encoding: Encoding) -> Rendered:
+    """Render linear planes as the program writes them for a viewer: an sRGB TIFF of 16 bits."""
+    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
+        path = Path(name) / "picture.tif"
+        write_image(path, planes, encoding, format="tiff16", color_space="srgb")
+        return read_rendered(path)
+
+
+def read_rendered(path: Path) -> Rendered:
+    """Read a TIFF of 16 bits a channel."""
+    picture: Rendered = tifffile.imread(path)[..., :3].astype(np.uint16, copy=False)
+    return picture
+
 
 HEIGHT: Final = 832
 WIDTH: Final = 1248

@@ -18,12 +18,10 @@ import numpy as np
 from PIL import Image
 
 import lensmodel
-from lab.code_version import version_of
 from lab.gallery import crops, measure
-from lab.gallery.pictures import FRAMES, Picture, take
-from lab.gallery.rendering import Rendered, read_rendered, rendered
+from lab.gallery.pictures import FRAMES, Picture, Rendered, read_rendered, rendered, take
 from lab.images import BLOCK
-from lab.store import Unit, stored
+from lab.stored import Unit, stored, version_of
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import LensSettings

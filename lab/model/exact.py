@@ -15,6 +15,7 @@ compared with, not to be used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,11 +23,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lab.local_frame import local_to_pixel, pixel_to_local
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import variables as va
+
+
+def pixel_to_local(
+    drow: NDArray[np.floating] | float, dcol: NDArray[np.floating] | float, phi: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn pixel offsets into local `(u, v)` at a place of angle `phi`.
+
+    With a = dcol to the right and b = -drow upwards::
+
+        u =  a cos phi + b sin phi        radially outwards
+        v = -a sin phi + b cos phi        +90 degrees from u in the sense of phi
+    """
+    a, b = np.asarray(dcol, dtype=np.float64), -np.asarray(drow, dtype=np.float64)
+    c, s = math.cos(phi), math.sin(phi)
+    return a * c + b * s, b * c - a * s
+
+
+def local_to_pixel(
+    u: NDArray[np.floating] | float, v: NDArray[np.floating] | float, phi: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn local `(u, v)` into pixel offsets `(drow, dcol)`; the inverse of `pixel_to_local`."""
+    u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    c, s = math.cos(phi), math.sin(phi)
+    return -(u * s + v * c), u * c - v * s
+
 
 PAD = 4
 """Rows and columns of zeros round each sample: a PSF is zero outside its support, not unknown."""

@@ -11,8 +11,8 @@ from typing import Final, Literal, TypeAlias
 
 import lensmodel
 from lab import traced as stored
-from lab.code_version import version_of
 from lab.reproduce.frames import Layout, content_of, layout_for, scene_files
+from lab.stored import version_of
 from lab.traced import GridLens
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfField

@@ -27,7 +27,6 @@ import numpy as np
 from PIL import Image
 
 from lab.cases import photo_half
-from lab.code_version import version_of
 from lab.images import as_shown
 from lab.reproduce import figures, measure
 from lab.reproduce.cases import Case, Reproduction, fingerprint, key_of, photos_of
@@ -35,7 +34,7 @@ from lab.reproduce.fields import PointField, Remembered, general_field, general_
 from lab.reproduce.learners import Answer, Learner, LibraryLearner, Roi, corrected_with, paper_way
 from lab.reproduce.shots import Container, Shots, in_container, take
 from lab.rivals import rivals
-from lab.store import Unit, read, stored
+from lab.stored import Unit, read, stored, version_of
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes

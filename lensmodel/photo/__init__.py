@@ -1,8 +1,7 @@
 """Photo files in and out: RAW, DNG, TIFF, PNG, JPEG; EXIF, ICC; which lens it was."""
 
-from lensmodel.photo.development import develop
-from lensmodel.photo.headers.sniffing import HEAD_BYTES, sniff
-from lensmodel.photo.inspection import inspect
+from lensmodel.photo.development import develop, inspect
+from lensmodel.photo.headers.opening import HEAD_BYTES, sniff
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.tags.metadata import is_placeholder, read_metadata
 from lensmodel.photo.values import (

@@ -1,30 +1,151 @@
-"""From a photo file to linear light."""
+"""From a photo file to what is known of it without decoding it, and to linear light."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import rawpy
 
-from lensmodel.core.errors import UnreadablePhotoError
+from lensmodel.core.errors import (
+    LensModelError,
+    NotAnImageError,
+    UnreadablePhotoError,
+    UnsupportedFormatError,
+)
 from lensmodel.core.geometry import Frame
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
 from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
 from lensmodel.photo.defects import Suspects
-from lensmodel.photo.headers.header import Header
+from lensmodel.photo.headers.header import Header, check_size
 from lensmodel.photo.headers.opening import opened_header
-from lensmodel.photo.inspection import info_of
+from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
-from lensmodel.photo.raw import develop_raw, opened_raw, stored_levels
-from lensmodel.photo.siblings import suspects_of_siblings
-from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
-from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer, remarks_log
+from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw, stored_levels
+from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags, is_centred, metadata_of
+from lensmodel.photo.turned import ORIENTATION, turns_to_sensor
+from lensmodel.photo.values import (
+    Encoding,
+    Limits,
+    LinearPhoto,
+    PhotoInfo,
+    PhotoMetadata,
+    PlaneNoise,
+    Transfer,
+    remarks_log,
+)
+
+MIN_SIDE = 16
+"""Smaller pictures are icons, not photos."""
+
+
+_UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
+"""Compressions of DNG that LibRaw, as built for Python, opens but cannot decode."""
+
+
+def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
+    """Read kind, size and metadata from the header, and refuse what cannot be developed.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; its name does not matter, its content decides.
+    limits : Limits, optional
+        How large it may be.
+
+    Raises
+    ------
+    NotAnImageError, UnsupportedFormatError
+        If it is no photo, or none that we read.
+    TruncatedImageError, RawDecodeError
+        If the header already shows that it ends early or is damaged.
+    ImageTooLargeError, DecompressionBombError
+        If it is larger than the limits allow, or claims to be out of all proportion.
+    """
+    path, limits = Path(path), limits or Limits()
+    with opened_header(path, limits) as header:
+        if header.kind not in {"raw", "dng"}:
+            return info_of(path, header, limits)
+        with opened_raw(path) as raw:
+            return info_of(path, header, limits, raw)
+
+
+def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None = None) -> PhotoInfo:
+    """Put together what a parsed header says, and LibRaw where it has a RAW file open; see `inspect`."""
+    width, height, metadata = header.width, header.height, metadata_of(header)
+    if raw is not None:
+        if (packing := _UNDECODED.get(header.compression)) is not None:
+            raise UnsupportedFormatError(
+                f"RAW data packed as {packing} are not read; convert it to a plain DNG or TIFF"
+            )
+        width, height = raw.sizes.width, raw.sizes.height
+        if header.camera is not None:
+            metadata = exposure_of(raw, metadata)
+        check_size(width, height, path.stat().st_size, limits)
+    if header.kind == "jpeg" and header.channels == 4:
+        raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
+    if min(width, height) < MIN_SIDE:
+        raise NotAnImageError(
+            f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
+        )
+    turns = turns_to_sensor(path, header, metadata) if raw is None else 0
+    if turns:
+        width, height, metadata = height, width, replace(metadata, orientation=ORIENTATION[turns])
+    return PhotoInfo(header.kind, width, height, metadata, is_centred(header, metadata), turns)
+
+
+_MOST: Final = 7
+"""Photos that are asked (chosen): with eight a pixel that stands out in one of three pictures is found."""
+
+_KEPT: Final = 256  # answers (chosen): each is some thousand numbers
+_RAW: Final = {"raw", "dng"}
+
+
+def suspects_of_siblings(
+    path: Path, metadata: PhotoMetadata, siblings: Iterable[Path], limits: Limits
+) -> list[Suspects]:
+    """Ask other RAW photos of the same body; what cannot be read, or is of another body, is passed over."""
+    told: list[Suspects] = []
+    for sibling in siblings:
+        if len(told) == _MOST:
+            break
+        try:
+            status = sibling.stat()
+            if os.path.samestat(status, path.stat()):
+                continue
+            one = _suspects(sibling, status.st_mtime_ns, status.st_size, limits)
+        except (LensModelError, OSError):
+            continue
+        if one is not None and one[0] == _body(metadata):
+            told.append(one[1])
+    return told
+
+
+@lru_cache(maxsize=_KEPT)
+def _suspects(
+    path: Path, changed_ns: int, size: int, limits: Limits
+) -> tuple[tuple[str, ...], Suspects] | None:
+    """The body of a photo and what its mosaic shows; None without a mosaic or a known body."""
+    del changed_ns, size  # a file that changed is another one
+    with opened_header(path, limits) as header:
+        body = _body(metadata_of(header))
+        if header.kind not in _RAW or not body[0]:
+            return None
+        with opened_raw(path) as raw:
+            mosaic = Mosaic.of(raw)
+            return None if mosaic is None else (body, mosaic.suspects())
+
+
+def _body(metadata: PhotoMetadata) -> tuple[str, ...]:
+    return name_key(metadata.camera_model), serial_key(metadata.body_serial)
 
 
 def develop(

@@ -43,7 +43,7 @@ from lensmodel.photo.tags.exif_block import (
     exif_directory,
     main_directory,
 )
-from lensmodel.photo.tags.xmp_block import xmp_packet
+from lensmodel.photo.tags.xmp import xmp_packet
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
 
 _ROWS: Final = 256

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.local_frame import local_to_pixel, pixel_to_local
+from lab.model.exact import local_to_pixel, pixel_to_local
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition
 

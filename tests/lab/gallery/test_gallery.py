@@ -26,8 +26,7 @@ from lab.gallery.figures import (
 )
 from lab.gallery.measure import TILE, bars, measured
 from lab.gallery.page import text, write_page
-from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, take
-from lab.gallery.rendering import rendered
+from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
 from lab.gallery.run import entries_of
 from lab.images import gains
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError

@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from lab.code_version import ROOT, code_of, version_of
 from lab.images import EVERY, as_shown, blocks, fidelity, to_srgb
 from lab.reproduce import job, measure
 from lab.reproduce.bars import bars, held, missed
@@ -38,6 +37,7 @@ from lab.reproduce.page import collected, write_json, write_page
 from lab.reproduce.shots import Shots, in_container
 from lab.reproduce.tables import groups, kept, paths, shares, summary
 from lab.scenes import HARD_SCENES
+from lab.stored import ROOT, code_of, version_of
 from lab.traced import read_grid
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of

@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 
 from lab.rivals import BasisField, RadialBasis, Schuler, load_basis, principal, rivals
 from lab.rivals.basis import save_basis
-from lab.rivals.rival import PhotoWindow
+from lab.rivals.schuler import PhotoWindow
 from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame

@@ -1,15 +1,18 @@
-"""Which code a figure depends on: the modules that a module imports, and those that they import."""
+"""Stored results, whole or not at all, and the version of the code that they depend on."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import lensmodel
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import write_atomically
 
 ROOT: Final = Path(lensmodel.__file__).parents[1]
 _DATA: Final = (".npz", ".json")
@@ -69,3 +72,33 @@ def _imported(tree: ast.Module, root: Path) -> Iterator[str]:
             yield from names
             if not all(_file_of(name, root) for name in names):
                 yield node.module
+
+
+Unit: TypeAlias = dict[str, Any]
+"""What one file holds: plain values."""
+
+
+def stored(path: Path, make: Callable[[], Unit]) -> tuple[Unit, bool]:
+    """Return the unit of a file, or make it and write it; the file appears whole or not at all.
+
+    Returns
+    -------
+    unit : dict
+    fresh : bool
+        Whether it was made now.
+    """
+    if path.exists():
+        return read(path), False
+    unit = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(unit, indent=1, allow_nan=False).encode())
+    return unit, True
+
+
+def read(path: Path) -> Unit:
+    """Read a stored result."""
+    try:
+        unit: Unit = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"{path} is damaged; delete it and run again") from error
+    return unit

@@ -139,9 +139,6 @@ def model(
     ] = "1000:1004",
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
-    psf_field: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs.")
-    ] = None,
     json_output: JsonFile = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -153,7 +150,7 @@ def model(
 
         lensmodel bench model --seeds 1000:1001 --photos 1 --methods eff-linear
 
-        lensmodel bench model --psf-field stars.npz --json model.json
+        lensmodel bench model --json model.json
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
@@ -174,7 +171,6 @@ def model(
             seeds=range(first, last),
             photos=counts,
             methods=None if methods is None else _names(methods),
-            psf_field=psf_field,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
     _tell(shown, json_output, result, table(result))

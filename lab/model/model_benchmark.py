@@ -1,14 +1,8 @@
-"""How well regressions predict the PSF where no sample was: simulated lenses, or measured fields.
+"""How well regressions predict the PSF where no sample was, on lenses of `draw_lens` whose kernels are known.
 
-Two kinds of input:
-
-* lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
-  n photos and asked at places in between and beyond;
-* a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
-  aperture and group): groups are held out in turn.
-
-Compared with two ways of the trade: linear interpolation between PSFs of the image plane, which is
-what efficient filter flow does, and a polynomial of the place for each pixel, as PSFEx fits.
+Models are fed with true kernels at the patches of n photos and asked at places in between and beyond.
+Compared with two ways of the trade: linear interpolation between PSFs of the image plane, which is what
+efficient filter flow does, and a polynomial of the place for each pixel, as PSFEx fits.
 """
 
 from __future__ import annotations
@@ -16,8 +10,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,8 +20,8 @@ from lab import page
 from lab.model.exact import PaperModel
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfSample, as_kernel, centred, distance
-from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
+from lensmodel.core.psf import PsfSample, as_kernel, distance
+from lensmodel.core.types import ZONES, FieldPosition, Kernel, StepHook, Zone, ignore_step
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.answer import MODES
 from lensmodel.simulate import draw_lens
@@ -68,41 +60,15 @@ def asked_places() -> list[FieldPosition]:
     return [FieldPosition(r, phi) for radii, angles in rings for r in radii for phi in angles]
 
 
-@dataclass(frozen=True, slots=True)
-class MethodErrors:
-    """Errors of one method: mean relative L2 by zone after sub-pixel alignment.
-
-    `worst` are the means of the lens that is worst in each zone, where there were several. `net` is what of
-    the root of the mean square is left without the noise of the held-out PSFs, where those say how noisy they
-    are.
-    """
-
-    method: str
-    photos: int
-    errors: Mapping[Zone, float]
-    seconds: float
-    net: Mapping[Zone, float] | None = None
-    worst: Mapping[Zone, float] | None = None
-
-
 def run_model_benchmark(
     *,
     seeds: Sequence[int] = (1000, 1001, 1002, 1003),
     photos: Sequence[int] = (1, 5),
     methods: Sequence[str] | None = None,
-    psf_field: Path | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
     """Compare methods of regression by the error of their predictions."""
     fits = _fits(methods)
-    if psf_field is not None:
-        samples = load_field(psf_field)
-        rows: list[MethodErrors] = []
-        for name, fit in fits.items():
-            on_step(len(rows), len(fits))
-            rows.append(_held_out(name, fit, samples))
-        on_step(len(fits), len(fits))
-        return {"psf_field": psf_field.name, "samples": len(samples), "rows": [_plain(r) for r in rows]}
     collected: dict[tuple[str, int], list[list[tuple[Zone, float]]]] = {}
     seconds: dict[tuple[str, int], float] = {}
     done, total = 0, len(seeds) * len(photos) * len(fits)
@@ -127,37 +93,13 @@ def run_model_benchmark(
                 collected.setdefault((name, count), []).append(found)
                 done += 1
                 on_step(done, total)
-    rows = [_over_lenses(*key, lenses, seconds[key]) for key, lenses in collected.items()]
-    return {"seeds": list(seeds), "rows": [_plain(row) for row in rows]}
+    rows = [_row(*key, lenses, seconds[key]) for key, lenses in collected.items()]
+    return {"seeds": list(seeds), "rows": rows}
 
 
 def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
     """Fit one of the methods of `run_model_benchmark` to samples; all of the same settings."""
     return _fits([method])[method](samples)
-
-
-def load_field(path: Path) -> list[PsfSample]:
-    """Read measured PSFs from an npz; negative pixels are noise and become zero."""
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            psf, r, phi = stored["psf"], stored["r"], stored["phi"]
-            aperture = stored["aperture"] if "aperture" in stored else np.full(len(psf), np.nan)
-            group = stored["group"] if "group" in stored else np.arange(len(psf)) % 5
-    except (OSError, ValueError, KeyError) as error:
-        raise InvalidInputError(
-            f"{path.name} must be an npz with psf (n, k, k), r and phi (n,), optionally aperture and group"
-        ) from error
-    if psf.ndim != 3 or not len(psf) == len(r) == len(phi) == len(aperture) == len(group):
-        raise InvalidInputError(f"{path.name}: psf must be (n, k, k) and the others (n,), got {psf.shape}")
-    return [
-        PsfSample(
-            centred(np.maximum(psf[i], 0.0)),
-            FieldPosition(float(r[i]), float(phi[i])),
-            LensSettings(aperture=None if math.isnan(aperture[i]) else float(aperture[i])),
-            photo=str(group[i]),
-        )
-        for i in range(len(psf))
-    ]
 
 
 def _fits(methods: Sequence[str] | None) -> dict[str, Fit]:
@@ -218,52 +160,35 @@ def _polynomial(samples: Sequence[PsfSample]) -> Predictor:
     return lambda place: as_kernel(np.maximum(features(_xy([place])) @ solved, 0.0).reshape(size, size))
 
 
-def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> MethodErrors:
-    groups = sorted({s.photo for s in samples})
-    start, errors, noise = time.process_time(), [], list[float]()
-    for group in groups:
-        predict = fit([s for s in samples if s.photo != group])
-        held = [s for s in samples if s.photo == group]
-        errors += [(zone_of(s.position.r), distance(predict(s.position), s.kernel).rel_l2) for s in held]
-        noise += [0.0 if s.error is None else s.error for s in held]
-    row = _row(name, len(groups) - 1, errors, time.process_time() - start)
-    if not any(noise):
-        return row
-    beyond = _row("", 0, [(z, e**2 - n**2) for (z, e), n in zip(errors, noise, strict=True)], 0.0)
-    return replace(row, net={z: math.sqrt(max(e, 0.0)) for z, e in beyond.errors.items()})
-
-
-def _over_lenses(
+def _row(
     name: str, photos: int, lenses: Sequence[Sequence[tuple[Zone, float]]], seconds: float
-) -> MethodErrors:
-    mean = _row(name, photos, [error for errors in lenses for error in errors], seconds)
-    alone = [_row(name, photos, errors, 0.0).errors for errors in lenses]
-    return replace(mean, worst={zone: max(one.get(zone, 0.0) for one in alone) for zone in mean.errors})
-
-
-def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> MethodErrors:
-    by_zone = {zone: [e for z, e in errors if z == zone] for zone in ZONES}
-    return MethodErrors(name, photos, {z: float(np.mean(e)) for z, e in by_zone.items() if e}, seconds)
-
-
-def _plain(row: MethodErrors) -> dict[str, Any]:
+) -> dict[str, Any]:
+    """Mean relative L2 by zone of a method, and the means of the lens that is worst in each zone."""
+    alone = [
+        {zone: float(np.mean([error for z, error in errors if z == zone])) for zone in ZONES}
+        for errors in lenses
+    ]
     return {
-        "method": row.method,
-        "photos": row.photos,
-        "errors": dict(row.errors),
-        "seconds": round(row.seconds, 2),
-        **({} if row.net is None else {"net": dict(row.net)}),
-        **({} if row.worst is None else {"worst": dict(row.worst)}),
+        "method": name,
+        "photos": photos,
+        "errors": {zone: float(np.mean([one[zone] for one in alone])) for zone in ZONES},
+        "worst": {zone: max(one[zone] for one in alone) for zone in ZONES},
+        "seconds": round(seconds, 2),
     }
 
 
 def table(result: Mapping[str, Any]) -> str:
     """Write the rows of a result as a Markdown table."""
-    net = any("net" in row for row in result["rows"])
-    more = [f"{zone}, net of noise" for zone in ZONES] if net else []
-    rows = []
-    for row in sorted(result["rows"], key=lambda r: (r["photos"], r["errors"].get("corner", 0.0))):
-        kinds = [row["errors"], row["net"]] if net else [row["errors"]]
-        cells = [f"{kind[zone]:.3f}" if zone in kind else "-" for kind in kinds for zone in ZONES]
-        rows.append([row["method"], str(row["photos"]), *cells, f"{row['seconds']:.1f}"])
-    return page.table(["method", "photos", *ZONES, *more, "CPU s"], rows)
+    ordered = sorted(result["rows"], key=lambda row: (row["photos"], row["errors"]["corner"]))
+    return page.table(
+        ["method", "photos", *ZONES, "CPU s"],
+        [
+            [
+                row["method"],
+                str(row["photos"]),
+                *(f"{row['errors'][zone]:.3f}" for zone in ZONES),
+                f"{row['seconds']:.1f}",
+            ]
+            for row in ordered
+        ],
+    )

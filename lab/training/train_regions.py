@@ -1,13 +1,12 @@
-"""Train and judge the learned choice of patches (`lensmodel.patches.good_regions`).
+"""Train the learned choice of patches (`lensmodel.patches.good_regions`).
 
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz
-    python -m lab.training.train_regions judge TABLE.jsonl MODEL.npz
 
 `collect` blurs photographs by simulated lenses, estimates the kernel in some windows of each and
 writes one line a window: its features and how wrong the kernel was. It goes on where it stopped.
 `fit` learns from the development half of the photos and reports on the test half; lenses of the
-two halves differ as well. `judge` reports on the test half for a model that is there.
+two halves differ as well.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from lab.blind.judges import HyperLaplacian, squared_error
 from lab.blind.methods import BlindMethod, compared
 from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
@@ -41,7 +39,6 @@ SIZE: Final = 192  # pixels of a window: that of a calibration
 KERNEL_SIZE: Final = 55  # pixels: that of patch recurrence
 WINDOWS_A_GROUP: Final = 8  # of one photo behind one lens (chosen)
 FIRST_SEED: Final = {"dev": 7000, "test": 8000}  # of the lenses of each half: they differ (chosen)
-TOP: Final = 3  # windows of a group that a choice is judged by (chosen)
 _ARGUMENTS = 4  # of `collect` with GROUPS; one less at least
 
 
@@ -53,11 +50,7 @@ class Labelled:
     half: str
     features: tuple[float, ...]
     r_map_score: float
-    ncc: float
-    rel_l2: float
-    mtf_rmse: float
-    error_ratio: float
-    untouched_ratio: float
+    ncc: float  # similarity S of the kernel estimated in it and the true one
 
 
 def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[Labelled]:
@@ -68,8 +61,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
     place = FieldPosition(float(rng.uniform(0.2, 1.0)), float(rng.uniform(-math.pi, math.pi)))
     kernel = lens.kernel(place, LensSettings(channel="g"), size=KERNEL_SIZE)
     sigma = float(np.exp(rng.uniform(math.log(0.003), math.log(0.015))))
-    green, margin = scene_of(photo)[1], KERNEL_SIZE // 2
-    blurred = signal.fftconvolve(green.astype(np.float64), kernel, mode="valid")
+    blurred = signal.fftconvolve(scene_of(photo)[1].astype(np.float64), kernel, mode="valid")
     plane = (blurred + rng.normal(0.0, sigma, blurred.shape)).astype(np.float32)
     noise = NoiseModel.white(sigma)
     blocks = measure_blocks(plane, noise, SIZE // BLOCKS_A_SIDE, 1.0, ignore_step)
@@ -90,27 +82,17 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
         ]
     )
     features, r_map = features_of(part, looked), RMapSelector().score(part, looked)
-    judge = HyperLaplacian()
-    for i, patch in enumerate(patches):
-        row, col = int(part.rows[i]) + margin, int(part.cols[i]) + margin
-        sharp = green[row : row + SIZE, col : col + SIZE]
+    for own, score, patch in zip(features, r_map, patches, strict=True):
         try:
             found = np.asarray(estimator.estimate([patch], [noise], size=31).kernel)
         except NotEnoughEvidenceError:
             found = psf.delta(3)
-        distance = psf.distance(found, kernel)
-        floor = squared_error(judge.deconvolve(patch, kernel, sigma, (0.0, 0.0)), sharp)
-        restored = judge.deconvolve(patch, found, sigma, distance.shift)
         yield Labelled(
             group=f"{photo.stem}/{number}",
             half=half,
-            features=tuple(round(float(v), 5) for v in features[i]),
-            r_map_score=float(r_map[i]),
-            ncc=distance.ncc,
-            rel_l2=distance.rel_l2,
-            mtf_rmse=distance.mtf_rmse,
-            error_ratio=squared_error(restored, sharp) / floor,
-            untouched_ratio=squared_error(patch, sharp) / floor,
+            features=tuple(round(float(v), 5) for v in own),
+            r_map_score=float(score),
+            ncc=psf.distance(found, kernel).ncc,
         )
 
 
@@ -136,15 +118,7 @@ def read_table(table: Path) -> list[Labelled]:
 
 @dataclass(frozen=True, slots=True)
 class RegionsReport:
-    """How well scores foretell the quality of an estimate on held-out photos and lenses.
-
-    `overall` and `within` are Spearman's rank correlations of the predicted with the true kernel
-    similarity S, over all windows, and the mean over groups of one photo and lens. Then, each for
-    the best-scored windows of every group by the learned score, by the r-map's, and for all
-    windows: the mean S; the mean relative L2 error; and the geometric mean of the error ratio over
-    that of the untouched window. (The error ratio itself favours windows without detail, where
-    even the true kernel restores little.)
-    """
+    """Spearman's rank correlations of scores with S: over all held-out windows, and the mean over groups."""
 
     windows: int
     groups: int
@@ -152,9 +126,6 @@ class RegionsReport:
     within: float
     r_map_overall: float
     r_map_within: float
-    similarity: tuple[float, float, float]
-    rel_l2: tuple[float, float, float]
-    error_ratio_over_untouched: tuple[float, float, float]
 
 
 def fit(table: Path, model: Path, seed: int = 0) -> RegionsReport:
@@ -219,24 +190,14 @@ def _arrays(model: object) -> TreeEnsemble:
 
 
 def judged(ensemble: TreeEnsemble, rows: Sequence[Labelled]) -> RegionsReport:
-    """Compare learned scores, r-map scores and chance on held-out windows."""
+    """Compare learned scores and r-map scores on held-out windows."""
     learned = -ensemble.predict(_features(rows))
-    r_map = np.array([row.r_map_score for row in rows])
-    similarity, error = np.array([row.ncc for row in rows]), np.array([row.rel_l2 for row in rows])
-    ratio = np.log([row.error_ratio / row.untouched_ratio for row in rows])
+    r_map, similarity = (np.array([getattr(row, name) for row in rows]) for name in ("r_map_score", "ncc"))
     groups = [np.flatnonzero([row.group == name for row in rows]) for name in sorted({r.group for r in rows})]
 
     def within(score: NDArray[np.float64]) -> float:
         return float(np.mean([_spearman(score[g], similarity[g]) for g in groups]))
 
-    def best(value: NDArray[np.float64]) -> tuple[float, float, float]:
-        tops = [
-            float(np.mean([value[g[np.argsort(-score[g])[:TOP]]].mean() for g in groups]))
-            for score in (learned, r_map)
-        ]
-        return tops[0], tops[1], float(value.mean())
-
-    by_ratio = best(ratio)
     return RegionsReport(
         windows=len(rows),
         groups=len(groups),
@@ -244,9 +205,6 @@ def judged(ensemble: TreeEnsemble, rows: Sequence[Labelled]) -> RegionsReport:
         within=within(learned),
         r_map_overall=_spearman(r_map, similarity),
         r_map_within=within(r_map),
-        similarity=best(similarity),
-        rel_l2=best(error),
-        error_ratio_over_untouched=(math.exp(by_ratio[0]), math.exp(by_ratio[1]), math.exp(by_ratio[2])),
     )
 
 
@@ -258,20 +216,14 @@ def main(arguments: Sequence[str]) -> None:
     """Run `collect` or `fit` from the command line."""
     if len(arguments) < _ARGUMENTS - 1:
         raise InvalidInputError(
-            "usage: train_regions collect PHOTOS TABLE [GROUPS [METHOD]] | (fit or judge) TABLE MODEL"
+            "usage: train_regions collect PHOTOS TABLE [GROUPS [METHOD]] | fit TABLE MODEL"
         )
     verb, first, second, *rest = arguments
     if verb == "collect":
         groups, method = int(rest[0]) if rest else 240, rest[1] if len(rest) > 1 else "default"
         collect(Path(first), Path(second), groups, method)
     else:
-        table, model = Path(first), Path(second)
-        if verb == "judge":
-            held = [row for row in read_table(table) if row.half == "test"]
-            report = judged(TreeEnsemble.load(model), held)
-        else:
-            report = fit(table, model)
-        sys.stdout.write(json.dumps(asdict(report), indent=1) + "\n")
+        sys.stdout.write(json.dumps(asdict(fit(Path(first), Path(second))), indent=1) + "\n")
 
 
 if __name__ == "__main__":

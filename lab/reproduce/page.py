@@ -47,7 +47,6 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
         _table1(page, found, label)
         _psf_tables(page, found, label)
         _photo_tables(page, found, label)
-        _paths_table(page, group, label)
     _refused(page, result)
     _fig1(page, result["figures"].get("fig1"))
     _fig2(page, result["figures"].get("fig2"))
@@ -72,40 +71,18 @@ def write_json(result: Mapping[str, Any], path: Path) -> Path:
 
 
 def _conditions(result: Mapping[str, Any]) -> str:
-    plan, cases = result["plan"], result["cases"]
+    """What was run, in numbers; docs/lab/reproduction.md says how."""
+    plan, cases, seen = result["plan"], result["cases"], result["developed_on"]
     frames = sorted({(c["settings"]["width"], c["settings"]["height"]) for c in cases})
-    sizes = ", ".join(f"{w} x {h} ({w * h / 1e6:.1f} MP)" for w, h in frames)
+    sizes = ", ".join(f"{w} x {h}" for w, h in frames)
     whose = "the library's own" if plan["own_scenes"] else "given from outside"
-    seen = result["developed_on"]
     unseen = f"methods were developed on {len(seen)} of them" if seen else "nothing was developed on them"
-    scenes = f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}"
-    families = ", ".join(
-        f"{sum(c['family'] == name for c in cases)} {name}"
-        for name in dict.fromkeys(c["family"] for c in cases)
-    )
-    paper = (
-        "The paper's own way from end to end (Michaeli and Irani's kernels up to "
-        f"{plan['paper_kernel']} pixels, its regression, Richardson-Lucy deconvolution alone) stands beside "
-        "the default; it runs in the library. "
-        if plan.get("paper_kernel")
-        else ""
-    )
+    named = "".join(f" {name}: {source}." for name, source in plan["rivals"].items())
     return (
-        f"Size {plan['size']}: {len(cases)} simulated lenses ({families}), each wide open. {scenes}; "
-        "those of the photo that is corrected serve in no other, the rest again, mirrored and elsewhere. "
-        f"Frames of {sizes}, of which the center, two squares half way out and the corners are compared. "
-        "The photos are Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping "
-        f"and lateral colour. {paper}{_rivals(plan['rivals'])}"
-        "The true PSF and the control go through the same correction. "
-        f"Code {result['code']}."
+        f"Size {plan['size']}: {len(cases)} simulated lenses, wide open, at base ISO, in frames of {sizes}. "
+        f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}.{named} "
+        f"How it is done, and what the figures mean: docs/lab/reproduction.md. Code {result['code']}."
     )
-
-
-def _rivals(sources: Mapping[str, str]) -> str:
-    if not sources:
-        return ""
-    named = "; ".join(f"{name}: {source}" for name, source in sources.items())
-    return f"Beside it, made anew by us, the blind rival {named}. "
 
 
 def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
@@ -133,12 +110,8 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
     """MTF50 by zone, with what makes it honest."""
     page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
     page.text(
-        f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges. MTF50 "
-        "alone proves nothing, because a PSF that is too wide scores above the truth: read it with the "
-        "highest MTF (1.00 is right) and the overshoot of the edge in percent of the step, "
-        "both the largest of the zone. "
-        f"{PAPER_WAY.capitalize()} is learned and corrected as the paper says from end to end; its rows are "
-        "the same under each deconvolution. Other PSFs are corrected with the deconvolution of the title."
+        f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges, and the largest "
+        "MTF and overshoot (percent of the step), without which MTF50 proves nothing."
     )
     for method, rows in found["mtf"].items():
         page.title(f"Deconvolution: {deconvolution(method)}", 3)
@@ -176,22 +149,14 @@ def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     )
     beside = [[name, *(number(row[z], 3) for z in ZONES)] for name, row in found["psf_others"].items()]
     page.table(["", *ZONES], [*beside, *_count_rows(found["psf"], 3)])
-    page.text("Red and blue:")
-    by_channel = [
-        [f"{word}, {row[0]}", *row[1:]]
-        for channel, word in (("r", "red"), ("b", "blue"))
-        for row in _count_rows(found["psf_by_channel"][channel], 3)
-    ]
-    page.table(["", *ZONES], by_channel)
 
 
 def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     """PSNR of the photo never learned from."""
     page.title(f"A photo never used for calibration, {label}")
     page.text(
-        "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 "
-        "pixels at its best shift, before and after alike; of large frames every second block, as on a "
-        f"chessboard. {DENOISED.capitalize()} is the control: the correction with a PSF that is a point."
+        "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 pixels at its "
+        f"best shift. {DENOISED.capitalize()} is the control: the correction with a PSF that is a point."
     )
     for method, psnr in found["psnr"].items():
         page.title(f"Deconvolution: {deconvolution(method)}", 3)
@@ -238,37 +203,6 @@ def _verdict(bar: Bar) -> str:
     if bar.met is None:
         return "not told"
     return "held" if bar.met else "MISSED"
-
-
-def _paths_table(page: Page, group: Mapping[str, Any], label: str) -> None:
-    """What other kinds of files gain."""
-    rows = paths(group)
-    page.title(f"Other kinds of files, {label}")
-    page.text(
-        "Each lens learns from one photo of this kind, and another one is corrected. Gains in dB of PSNR "
-        "over the photo as it was, center / mid / corner; the share is of what raw photos gain."
-    )
-    head = ["", "lenses", "not learned from", "gain", "true PSF", "share of raw's", "worse zones", "clearly"]
-    page.table(
-        head,
-        [
-            [
-                {"tiff": "16-bit TIFF", "jpeg": "JPEG, quality 92"}[name],
-                str(row["lenses"]),
-                str(row["refused"]),
-                _slashed(row["gain"], 2),
-                _slashed(row["true"], 2),
-                _slashed(row["share"], 2),
-                f"{row['counts']['worse']} of {row['counts']['zones']}",
-                str(row["counts"]["clearly_worse"]),
-            ]
-            for name, row in rows.items()
-        ],
-    )
-
-
-def _slashed(row: Mapping[str, float | None], digits: int) -> str:
-    return " / ".join(number(row[zone], digits) for zone in ZONES)
 
 
 def _which_lenses(page: Page, result: Mapping[str, Any]) -> None:

@@ -162,7 +162,7 @@ def main() -> None:
     lenses = [KnownLens(str(seed), draw_lens(seed), seed, camera, wanted.hot) for seed in seeds]
     for number, path in enumerate(wanted.grids):
         traced = GridLens.read(path)
-        own = replace(camera, pitch_um=traced.grids[0].pitch_um)
+        own = replace(camera, pitch_um=traced.grid.pitch_um)
         lenses.append(KnownLens(path.stem, traced, 2000 + number, own, wanted.hot))
     print("| lens | n | gain center / mid / corner, dB | expected | PSF error (expected) | lost | worst |")
     print("|---|---|---|---|---|---|---|")

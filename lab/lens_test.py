@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=0, help="from which the lens is learned too")
     asked = parser.parse_args()
     lens = GridLens.read(asked.grid)
-    camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grids[0].pitch_um)
+    camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grid.pitch_um)
     scene, squares = squares_chart(camera.frame)
     shot = photograph(scene, lens, LensSettings(aperture=lens.widest()), camera, np.random.default_rng(0))
     with tempfile.TemporaryDirectory() as folder:

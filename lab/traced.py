@@ -133,43 +133,42 @@ def read_grid(path: str | Path) -> GridField:
 
 @dataclass(frozen=True, eq=False)
 class GridLens:
-    """A traced lens in front of a simulated camera, at the apertures that it has grids for."""
+    """A traced lens in front of a simulated camera, at the aperture that it has a grid for."""
 
-    grids: tuple[GridField, ...]  # of one copy, by aperture, widest first
+    grid: GridField
     maker: str = "Traced Optics"  # as written into the metadata of its photos
-    model: str = ""
     serial: str = "TRC0000001"
 
-    def __post_init__(self) -> None:
-        apertures = [grid.f_number for grid in self.grids]
-        if not apertures or apertures != sorted(apertures):
-            raise InvalidInputError(f"grids must be sorted from the widest aperture on, got {apertures}")
-        if not self.model:
-            facts = self.grids[0].facts
-            name = f"Traced {facts['design'].title()} {self.focal_mm[0]:.0f}mm f/{apertures[0]:g}"
-            object.__setattr__(self, "model", name)
-
     @classmethod
-    def read(cls, *paths: str | Path) -> GridLens:
-        """Read the grids of one copy."""
-        return cls(tuple(sorted((read_grid(path) for path in paths), key=lambda grid: grid.f_number)))
+    def read(cls, path: str | Path) -> GridLens:
+        """Read the grid of a copy."""
+        return cls(read_grid(path))
+
+    @property
+    def model(self) -> str:
+        """As written into the metadata of its photos."""
+        return f"Traced {self.grid.facts['design'].title()} {self.focal_mm[0]:.0f}mm f/{self.widest():g}"
 
     @property
     def focal_mm(self) -> tuple[float, ...]:
         """The focal length, rounded to a tenth of a millimetre as lenses tell it."""
-        return (round(float(self.grids[0].facts["focal_mm"]), 1),)
+        return (round(float(self.grid.facts["focal_mm"]), 1),)
 
     def widest(self, focal_mm: float | None = None) -> float:
-        """Widest aperture."""
-        return self.grids[0].f_number
+        """Its aperture."""
+        return self.grid.f_number
 
     def f_number(self, settings: LensSettings) -> float:
-        """Working f-number of the settings; unknown means wide open."""
-        return self._grid(settings).f_number
+        """Working f-number of the settings; unknown means its own, and no other is known."""
+        own = self.grid.f_number
+        if settings.aperture is not None and abs(settings.aperture / own - 1.0) > 0.02:
+            raise InvalidInputError(f"this lens has PSFs for f/{own:g}, got f/{settings.aperture:g}")
+        return own
 
     def field(self, settings: LensSettings | None = None) -> GridField:
         """The PSF of every place and channel at these settings."""
-        return self._grid(settings or LensSettings())
+        self.f_number(settings or LensSettings())
+        return self.grid
 
     def kernel_at_field(
         self,
@@ -181,29 +180,17 @@ class GridLens:
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
         """Kernel at field vector `h`, its centre of mass at `offset` (row, col) pixels."""
-        grid = self._grid(settings)
+        grid = self.field(settings)
         if abs(pitch_um / grid.pitch_um - 1.0) > 1e-3:
-            raise InvalidInputError(
-                f"this lens has kernels for a pitch of {grid.pitch_um:g} um, got {pitch_um:g} um"
-            )
+            raise InvalidInputError(f"this lens has a pitch of {grid.pitch_um:g} um, got {pitch_um:g} um")
         kernel = grid.kernel_at_field(h, settings.channel, size)
         return kernel if offset == (0.0, 0.0) else _moved(kernel, offset)
 
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
-        grid = self.grids[0]
-        c1, c3 = grid.lateral[channel]
-        half_diagonal_px = 1000.0 * float(grid.facts["half_diagonal_mm"]) / grid.pitch_um
+        c1, c3 = self.grid.lateral[channel]
+        half_diagonal_px = 1000.0 * float(self.grid.facts["half_diagonal_mm"]) / self.grid.pitch_um
         return (c1 * r + c3 * r**3) / half_diagonal_px
-
-    def _grid(self, settings: LensSettings) -> GridField:
-        if settings.aperture is None:
-            return self.grids[0]
-        for grid in self.grids:
-            if abs(settings.aperture / grid.f_number - 1.0) < 0.02:
-                return grid
-        known = ", ".join(f"f/{grid.f_number:g}" for grid in self.grids)
-        raise InvalidInputError(f"this lens has PSFs for {known}, got f/{settings.aperture:g}")
 
 
 def _centred(kernel: Kernel) -> Kernel:

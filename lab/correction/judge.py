@@ -62,7 +62,7 @@ class Case:
             aperture = drawn.at_focal().f_number
             return drawn, drawn.field(LensSettings(aperture=aperture), pitch_um=PITCH_UM), aperture
         traced = cases.traced(cases.repository_grids()[self.grid])
-        return traced, traced.field(), traced.grids[0].f_number
+        return traced, traced.field(), traced.grid.f_number
 
 
 CASES: Final = {

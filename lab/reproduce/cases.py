@@ -68,7 +68,7 @@ def traced(path: Path) -> GridLens:
 
 def design(path: Path) -> str:
     """Name of the design of a grid."""
-    return str(traced(path).grids[0].facts["design"])
+    return str(traced(path).grid.facts["design"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +110,7 @@ class Case:
     def source(self) -> str:
         """Where the lens comes from."""
         return (
-            f"drawn, seed {self.seed}"
-            if self.grid is None
-            else str(traced(self.grid).grids[0].facts["source"])
+            f"drawn, seed {self.seed}" if self.grid is None else str(traced(self.grid).grid.facts["source"])
         )
 
     @property

@@ -110,7 +110,7 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
     """MTF50 by zone, with what makes it honest."""
     page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
     page.text(
-        f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges, and the largest "
+        f"Mean over {found['lenses']} lenses; in each zone the median over its edges, and the largest "
         "MTF and overshoot (percent of the step), without which MTF50 proves nothing."
     )
     for method, rows in found["mtf"].items():

@@ -33,7 +33,7 @@ def lens_of(name: str) -> tuple[simulate.SimulatedLens | GridLens, float]:
     """A lens and its f-number wide open."""
     if name == "traced":
         grid = read_grid(GRID)
-        return GridLens((grid,)), grid.f_number
+        return GridLens(grid), grid.f_number
     drawn = simulate.draw_lens(NEARLY_PERFECT)
     return drawn, drawn.at_focal().f_number
 

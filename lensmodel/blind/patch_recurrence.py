@@ -17,7 +17,7 @@ with the third power of the side and not with the fourth, see `window_products`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, TypeAlias
@@ -30,17 +30,16 @@ from scipy import fft, ndimage
 
 from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.files import fitted
 from lensmodel.core.least_squares import nonnegative_least_squares
-from lensmodel.core.psf import as_kernel, centred, distance, otf, resized
+from lensmodel.core.psf import as_kernel, otf, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 log = logging.getLogger(__name__)
 
 _BORDER = 3
 """Pixels left out along the rim: fewer patches overlap there (chosen)."""
-_ERROR: Final[Mapping[str, float]] = fitted("blind")["recurrence_error"]
-"""Relative L2 error by the disagreement of the patches' halves, a fitted line: see `data/README.md`."""
+_ERROR: Final = 0.61
+"""Expected relative L2 error, of every patch alike: its mean on 24 patches of `lensmodel bench blind`."""
 
 ALPHA = 4.0 / 3.0
 """Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
@@ -293,32 +292,27 @@ class PatchRecurrence:
             levels -= 1
         kernel, latent = start, [view.y for view in (s.at(levels - 1) for s in scaled)]
         total, done = levels * self.iterations, 0
-        state: _Equations | None = None
         for level in reversed(range(levels)):
             side = max(5, _odd(widest / ALPHA**level))
             views = [s.at(level) for s in scaled]
             kernel = _start(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
             latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
             for _ in range(self.iterations):
-                state = self._step(views, latent, kernel, side)
-                kernel = state.kernel
+                kernel = self._step(views, latent, kernel, side)
                 done += 1
                 on_step(done, total)
-        if state is None:
-            raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
-        apart = self._disagreement(state, views, latent)
-        error = _ERROR["at_agreement"] + _ERROR["by_disagreement"] * apart
-        report = {"support": float(widest), "levels": float(levels), "disagreement": apart}
-        return finished(state.kernel, size=size, error=error, diagnostics=report)
+        report = {"support": float(widest), "levels": float(levels)}
+        assert kernel is not None, "there is a level, and an iteration on it"
+        return finished(kernel, size=size, error=_ERROR, diagnostics=report)
 
-    def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> _Equations:
-        parts, responses = [], []
+    def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> Kernel:
+        """Match and sharpen each latent image, in place, and solve for the kernel that they share."""
+        parts = []
         for i, view in enumerate(views):
             z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise))
             latent[i], response = blend(view.y, kernel, z, self.beta)
             parts.append(normal_equations(latent[i], view.y, side, view.noise, response))
-            responses.append(response)
-        return _Equations(self._solved(parts, views, np.asarray(resized(kernel, side))), responses)
+        return self._solved(parts, views, np.asarray(resized(kernel, side)))
 
     def _solved(self, parts: Sequence[Part], views: Sequence[_Scaled], begin: NDArray[np.float64]) -> Kernel:
         """Kernel of the normal equations of all patches together."""
@@ -334,35 +328,9 @@ class PatchRecurrence:
             raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
         return as_kernel(solved.reshape(begin.shape))
 
-    def _disagreement(self, state: _Equations, views: Sequence[_Scaled], latent: Sequence[Image]) -> float:
-        """Relative L2 distance of the kernels that the left and the right halves of the patches give alone.
-
-        1 where the halves are too narrow for a kernel.
-        """
-        begin, halves = np.asarray(state.kernel), []
-        if latent[0].shape[1] // 2 < 2 * (_BORDER + begin.shape[0] // 2) + begin.shape[0]:
-            return 1.0
-        middle = latent[0].shape[1] // 2
-        for half in (slice(None, middle), slice(middle, None)):
-            parts = [
-                normal_equations(x[:, half], view.y[:, half], begin.shape[0], view.noise, response)
-                for x, view, response in zip(latent, views, state.responses, strict=True)
-            ]
-            try:
-                halves.append(centred(self._solved(parts, views, begin)))
-            except NotEnoughEvidenceError:
-                return 1.0
-        return min(distance(*halves).rel_l2, 1.0)
-
 
 Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], float]
 """Normal equations of one patch: A, b, and the most by which an eigenvalue of A can be below zero."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    kernel: Kernel
-    responses: list[NDArray[np.float64]]
 
 
 def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]) -> Part:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 from collections.abc import Iterator
@@ -12,16 +11,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-
-
-def fitted(room: str) -> dict[str, Any]:
-    """Return the constants that were fitted for a room of the library, from its `data/fitted.json`.
-
-    The README beside it names the command that prints each.
-    """
-    path = Path(__file__).parents[1] / room / "data" / "fitted.json"
-    constants: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return constants
 
 
 @contextmanager

@@ -78,21 +78,14 @@ Unit: TypeAlias = dict[str, Any]
 """What one file holds: plain values."""
 
 
-def stored(path: Path, make: Callable[[], Unit]) -> tuple[Unit, bool]:
-    """Return the unit of a file, or make it and write it; the file appears whole or not at all.
-
-    Returns
-    -------
-    unit : dict
-    fresh : bool
-        Whether it was made now.
-    """
+def stored(path: Path, make: Callable[[], Unit]) -> Unit:
+    """Return the unit of a file, or make it and write it; the file appears whole or not at all."""
     if path.exists():
-        return read(path), False
+        return read(path)
     unit = make()
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(unit, indent=1, allow_nan=False).encode())
-    return unit, True
+    return unit
 
 
 def read(path: Path) -> Unit:

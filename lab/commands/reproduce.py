@@ -87,41 +87,18 @@ def reproduce(
     from lab.reproduce.page import collected, write_json, write_page  # noqa: PLC0415 - same
 
     plan = planned(cast("Size", size), scenes=_external(), lenses=lens or (), compare=compare)
-    work = WorkLines(quiet=shown.quiet)
-    result = run_reproduction(plan, output, on_work=work, workers=os.cpu_count() or 1)
+    began = time.monotonic()
+
+    def on_work(words: str, done: int, total: int) -> None:
+        shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
+
+    result = run_reproduction(plan, output, on_work=on_work, workers=os.cpu_count() or 1)
     result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
     written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
     if assert_bars and (lines := missed(result)):
         shown.error("\n".join(["these bars are missed:", *lines]))
         raise typer.Exit(1)
-
-
-class WorkLines:
-    """One line on standard error after each result, with the time left."""
-
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._quiet = quiet
-        self._began = time.monotonic()
-        self._computed = 0
-
-    def __call__(self, words: str, done: int, total: int, *, fresh: bool) -> None:
-        """Say what was done; see `OnWork`."""
-        self._computed += fresh
-        if self._quiet:
-            return
-        left = ""
-        if self._computed and done < total:
-            seconds = (time.monotonic() - self._began) / self._computed * (total - done)
-            left = f", about {_duration(seconds)} left"
-        typer.echo(f"[{100 * done / total:3.0f} %] {words}{left}", err=True)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def _external() -> Path | None:

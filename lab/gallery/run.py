@@ -89,7 +89,7 @@ def _entry(picture: Picture, output: Path, workers: int, say: Words) -> GalleryE
     known = None if picture.truth is None else _mapped(picture.truth)
     say("measuring")
     name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
-    found, _ = stored(folder / name, lambda: measure.measured(before, shown, known))
+    found = stored(folder / name, lambda: measure.measured(before, shown, known))
     columns, sheets = ["original", "corrected"], [before, shown]
     if known is not None:
         columns.append("truth")
@@ -116,7 +116,7 @@ def work(picture: Picture, cache: Path, workers: int, say: Words) -> tuple[Path,
     content = _hash(picture.path)
     code = version_of("lab.gallery.run", without=("lab.gallery.measure", "lab.gallery.crops"))
     folder = cache / f"{picture.slug}-{content[:8]}-{code[:8]}"
-    unit, _ = stored(folder / "work.json", lambda: _worked(picture, folder, workers, say))
+    unit = stored(folder / "work.json", lambda: _worked(picture, folder, workers, say))
     return folder, unit
 
 

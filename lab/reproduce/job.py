@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias, cast
+from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
 from PIL import Image
@@ -54,11 +54,8 @@ NewLearner: TypeAlias = Callable[[Preset, int], Learner]
 """From the way of learning and a number of processes."""
 
 
-class OnWork(Protocol):
-    """Hears of progress."""
-
-    def __call__(self, words: str, done: int, total: int, *, fresh: bool) -> None:
-        """Say that `done` of `total` results are there, and whether the last was computed or found stored."""
+OnWork: TypeAlias = Callable[[str, int, int], None]
+"""Hears what was done, and how many of how many results are there."""
 
 
 def run_reproduction(
@@ -80,19 +77,19 @@ def run_reproduction(
     ]
     done, total = 0, sum(len(job.files) for job in jobs) + plan.compare
 
-    def told(words: str, *, fresh: bool) -> None:
+    def told(words: str) -> None:
         nonlocal done
         done += 1
-        on_work(words, done, total, fresh=fresh)
+        on_work(words, done, total)
 
     finished = [job.run(told) for job in jobs]
     drawn: Unit = {}
     if plan.compare:
         make = partial(figures.draw, plan, jobs[0].photos, shown, workers=workers)
-        drawn, fresh = stored(cache / keys[0] / f"figures-{figures.version()}.json", make)
-        if not fresh and not all((shown / name).exists() for name in figures.names(drawn)):
-            drawn, fresh = make(), True
-        told("figures 2 and 4", fresh=fresh)
+        drawn = stored(cache / keys[0] / f"figures-{figures.version()}.json", make)
+        if not all((shown / name).exists() for name in figures.names(drawn)):
+            drawn = make()
+        told("figures 2 and 4")
     files = plan.files()
     return {
         "code": version,
@@ -146,7 +143,7 @@ class CaseJob:
             found |= {("rivals", name): folder / f"rival-{name}-{code}.json" for name in plan.rivals}
         return found
 
-    def run(self, told: Callable[..., None]) -> Unit:
+    def run(self, told: Callable[[str], None]) -> Unit:
         """Compute what is missing, and return all of it."""
         case, complete = self.case, all(path.exists() for path in self.files.values())
         makers: dict[str, Callable[[str], Unit]] = {}
@@ -164,9 +161,9 @@ class CaseJob:
             }
         units: dict[str, dict[str, Unit]] = {part: {} for part in _SEVERAL}
         for (part, name), path in self.files.items():
-            unit, fresh = stored(path, partial(makers[part], name)) if makers else (read(path), False)
+            unit = stored(path, partial(makers[part], name)) if makers else read(path)
             units.setdefault(part, {})[name] = unit
-            told(f"{case.title}: {part} {name}".rstrip(), fresh=fresh)
+            told(f"{case.title}: {part} {name}".rstrip())
         return {
             "name": case.name,
             "title": case.title,

@@ -173,7 +173,7 @@ class Calibration:
         Take photos that seem to be of another lens as well.
     pool : Executor, optional
         Estimates the cells of all photos, where they are estimated here; without one each photo starts and
-        ends `workers` processes of its own.
+        ends processes of its own.
 
     Raises
     ------
@@ -189,11 +189,10 @@ class Calibration:
         begin: ModelSettings | None = None,
         any_lens: bool = False,
         pool: Executor | None = None,
-        workers: int | None = None,
     ) -> None:
         self._store, self._config = store, config
         self._begin = begin or ModelSettings(mode=config.preset.mode)
-        self._any_lens, self._pool, self._workers = any_lens, pool, workers
+        self._any_lens, self._pool = any_lens, pool
         config.of_lens(self.known).check()
 
     @property
@@ -264,7 +263,6 @@ class Calibration:
             key=key,
             admit=lambda metadata: identities.append(self._admitted(metadata)),
             executor=self._pool,
-            workers=self._workers,
             siblings=siblings,
             on_event=on_event,
         )
@@ -336,11 +334,10 @@ def joined(
     samples: Sequence[PsfSample],
     *,
     replace: bool = False,
-    model_settings: ModelSettings | None = None,
 ) -> LensModel:
     """Add measured samples to a model, or begin one with them."""
     if model is None:
-        return LensModel.fit(samples, model_settings or ModelSettings())
+        return LensModel.fit(samples)
     if not replace:
         return model.added(samples)
     kept = [old for old in model.samples if is_measured(old) or not any(_alike(old, new) for new in samples)]

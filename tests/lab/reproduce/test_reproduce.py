@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from lab.images import EVERY, as_shown, blocks, fidelity, to_srgb
 from lab.reproduce import job, measure
-from lab.reproduce.bars import bars, held, missed
+from lab.reproduce.bars import bars, held
 from lab.reproduce.cases import (
     FIRST_SEED,
     SOFT_SEED,
@@ -453,13 +453,6 @@ def test_files_of_other_kinds_are_judged_by_what_raw_ones_gain() -> None:
     assert met == {"TIFF: gain in PSNR over that of raw": False, "JPEG: gain in PSNR over that of raw": True}
 
 
-def test_each_missed_bar_is_named_with_what_is_asked() -> None:
-    made = after((0.20, 33.0), (0.15, 33.5))
-    lines = missed(made)
-    assert len(lines) == held(bars(made))["missed"] > 0
-    assert all("is asked" in line and "third order, n = " in line for line in lines)
-
-
 def traced_too(made: dict[str, Any]) -> dict[str, Any]:
     """Make the last lens a ray-traced one."""
     made["cases"][-1] |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
@@ -474,8 +467,6 @@ def test_families_are_judged_and_shown_apart(tmp_path: Path) -> None:
     text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
     assert "| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |" in text
     assert "| third order | Lens &lt;0&gt; | drawn, seed 1000 | unseen |" in text
-    assert "### Third order" in text
-    assert "### Ray-traced" in text
 
 
 def with_paper(made: dict[str, Any]) -> dict[str, Any]:
@@ -509,9 +500,6 @@ def test_the_papers_own_way_is_a_row_of_each_table(tmp_path: Path) -> None:
     assert "| the paper's own way, n = 1 | 140 |" in text
     assert "| the paper's own way, n = 1 | 0.600 |" in text
     assert "| the paper's own way, n = 1 | 31.50 |" in text
-    assert "corrected blindly, the paper's own way, n = 1" in text
-    assert "### Deconvolution: Richardson-Lucy" in text
-    assert not re.search(r"[Mm]ethod paper", text)
 
 
 def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> None:
@@ -522,8 +510,6 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert sources
     assert all(source.startswith("pictures/") for source in sources)
     assert "Lens &lt;0&gt;" in text
-    assert "<td>default, n = 1</td>" in text
-    assert "developed on 1 of them" in text
     text = markdown.read_text(encoding="utf-8")
     assert "| default, n = 1 | 160 |" in text
     assert "| schuler, n = 1 | 130 |" in text
@@ -706,8 +692,8 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def reproduced(folder: Path, learner: Nothing, chosen: Reproduction) -> dict[str, Any]:
     announced: list[tuple[int, int]] = []
 
-    def on_work(words: str, done: int, total: int, *, fresh: bool) -> None:
-        del words, fresh
+    def on_work(words: str, done: int, total: int) -> None:
+        del words
         announced.append((done, total))
 
     def opened(way: Preset, workers: int) -> Nothing:
@@ -795,8 +781,8 @@ def test_damaged_result_is_reported(tmp_path: Path, quick_photos: list[str]) -> 
         reproduced(tmp_path, Nothing(), chosen)
 
 
-def unheard(words: str, done: int, total: int, *, fresh: bool) -> None:
-    del words, done, total, fresh
+def unheard(words: str, done: int, total: int) -> None:
+    del words, done, total
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import resource
 import shutil
 import struct
 import subprocess
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import Planes
+from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.dng import write_bayer_dng
 
 _LIMIT_S: Final = 1800  # seconds that a program may take (chosen): one that hangs must end
@@ -47,15 +50,11 @@ class Peer:
 
     def write_input(self, encoded: NDArray[np.float32], path: Path) -> None:
         """Write a picture `(height, width, 3)`, 0 to 1, as this program takes it."""
-        numbers = np.round(np.clip(encoded, 0.0, 1.0) * _FULL).astype(np.uint16)
+        numbers = light_numbers(encoded)
         if not self.raw:
             tifffile.imwrite(path, numbers, photometric="rgb")
             return
-        rows, cols = numbers.shape[0] // 2 * 2, numbers.shape[1] // 2 * 2
-        mosaic = np.ascontiguousarray(numbers[:rows, :cols, 1])
-        mosaic[::2, ::2] = numbers[:rows:2, :cols:2, 0]
-        mosaic[1::2, 1::2] = numbers[1:rows:2, 1:cols:2, 2]
-        write_bayer_dng(path, mosaic, black=0, white=_FULL)
+        write_raw(np.moveaxis(numbers, -1, 0), path)
 
     def run(self, source: Path, folder: Path, setting: float) -> tuple[Path, float]:
         """Run the program on a file.
@@ -93,6 +92,28 @@ class Peer:
         """CPU seconds of the sharpening alone: a run with it less one without."""
         with_it = self.run(source, folder, self.usual)[1]
         return with_it - self.run(source, folder, 0.0)[1]
+
+
+def write_raw(numbers: NDArray[np.uint16], path: Path) -> None:
+    """Write a DNG whose sensor saw a picture `(3, height, width)`, of whose colours each pixel keeps one."""
+    rows, cols = numbers.shape[1] // 2 * 2, numbers.shape[2] // 2 * 2
+    mosaic = np.ascontiguousarray(numbers[1, :rows, :cols])
+    mosaic[::2, ::2] = numbers[0, :rows:2, :cols:2]
+    mosaic[1::2, 1::2] = numbers[2, 1:rows:2, 1:cols:2]
+    write_bayer_dng(path, mosaic, black=0, white=_FULL)
+
+
+def as_raw(planes: Planes) -> LinearPhoto:
+    """Develop linear light `(3, height, width)` as if a sensor with a mosaic had seen it."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "photo.dng"
+        write_raw(light_numbers(planes), path)
+        return develop(path)
+
+
+def light_numbers(planes: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Light of 0 to 1 in numbers of 16 bits."""
+    return np.round(np.clip(planes, 0.0, 1.0) * np.float32(_FULL)).astype(np.uint16)
 
 
 def _gmic(source: Path, target: Path, folder: Path, setting: float) -> list[str]:

@@ -188,6 +188,9 @@ def correct(
     peers: Annotated[
         bool, typer.Option("--peers", help="Time G'MIC, RawTherapee and darktable too, where installed.")
     ] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Make a RAW photo of a picture: each pixel keeps one colour.")
+    ] = False,
     roi: Annotated[
         str | None, typer.Option(metavar="T,L,H,W", help="Only this part, in the cells of the whole photo.")
     ] = None,
@@ -207,13 +210,15 @@ def correct(
 
         lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
 
+        lensmodel bench correct --photo large.jpg --raw --methods fast,standard --peers
+
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
     from lab.correction.correction_benchmark import (  # noqa: PLC0415 - see the top of the module
         correct_table,
         run_correct_benchmark,
     )
-    from lab.peers import PEERS  # noqa: PLC0415 - same
+    from lab.peers import PEERS, as_raw  # noqa: PLC0415 - same
     from lensmodel.photo import develop  # noqa: PLC0415 - same
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
@@ -222,11 +227,14 @@ def correct(
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")
     window = _window(roi)
-    planes = develop(photo or demo_data_path("lake.jpg")).planes
+    developed = develop(photo or demo_data_path("lake.jpg"))
+    if raw and developed.cfa is None:
+        developed = as_raw(developed.planes)
     with as_usage(), shown.progress() as bars:
         task = bars.add_task("methods", total=None)
         result = run_correct_benchmark(
-            planes,
+            developed.planes,
+            cfa=developed.cfa,
             methods=_names(methods),
             workers=workers,
             repeats=repeats,

@@ -23,7 +23,16 @@ from lab.peers import Peer
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, gaussian
-from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel, Planes, StepHook, ignore_step
+from lensmodel.core.types import (
+    BayerPattern,
+    Channel,
+    FieldPosition,
+    Kernel,
+    NoiseModel,
+    Planes,
+    StepHook,
+    ignore_step,
+)
 from lensmodel.correction import Deconvolver, Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
@@ -52,6 +61,7 @@ def run_correct_benchmark(
     photo: Planes,
     *,
     field: PsfField | None = None,
+    cfa: BayerPattern | None = None,
     methods: Sequence[str] = ("fast", "standard", "paper"),
     workers: int = 1,
     repeats: int = 1,
@@ -68,6 +78,8 @@ def run_correct_benchmark(
         Linear light; may be memory-mapped.
     field : PsfField or None
         The lens; None takes `SoftCorners`.
+    cfa : BayerPattern or None
+        The mosaic of a RAW photo.
     methods : sequence of str
         Names in `methods.compared`.
     workers : int
@@ -87,7 +99,7 @@ def run_correct_benchmark(
     Returns
     -------
     dict
-        `machine`, `megapixels`, `methods` (CPU and wall seconds, CPU seconds per megapixel and
+        `machine`, `megapixels`, `raw`, `methods` (CPU and wall seconds, CPU seconds per megapixel and
         channel, CPU time with the threads of `beside` over that with `workers`, largest memory of the
         process so far in MiB), `kernel` (CPU seconds per megapixel and iteration of our tile kernel, of
         scikit-image and of the bare transforms) and `peers` (CPU seconds of each program's sharpening
@@ -114,12 +126,14 @@ def run_correct_benchmark(
     for done, method in enumerate(methods, start=1):
         chosen = compared.create(method)
         # Compiling and first-use tables stay out of the figures.
-        correct_planes(small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=chosen)
+        correct_planes(
+            small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=chosen, cfa=cfa
+        )
         counts = [workers] if beside is None else [workers, beside]
 
         def run(threads: int, solver: Deconvolver = chosen) -> tuple[float, float]:
             wall, cpu = time.perf_counter(), time.process_time()
-            correct_planes(photo, lens, frame, noise=noise, method=solver, workers=threads, roi=roi)
+            correct_planes(photo, lens, frame, noise=noise, method=solver, cfa=cfa, workers=threads, roi=roi)
             return time.process_time() - cpu, time.perf_counter() - wall
 
         runs = np.array([[run(count) for count in counts] for _ in range(repeats)])
@@ -142,6 +156,7 @@ def run_correct_benchmark(
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "megapixels": megapixels,
+        "raw": cfa is not None,
         "workers": workers,
         "beside": beside,
         "methods": results,
@@ -153,7 +168,8 @@ def run_correct_benchmark(
 def correct_table(report: Mapping[str, Any]) -> str:
     """Tables of a report of `run_correct_benchmark`, in Markdown."""
     lines = [
-        f"{report['megapixels']:.2f} megapixels, workers {report['workers']}; {report['machine']}",
+        f"{report['megapixels']:.2f} megapixels{', RAW' if report['raw'] else ''}, "
+        f"workers {report['workers']}; {report['machine']}",
         "",
         "| method | wall s | CPU s | CPU s per megapixel and channel | memory so far MiB |",
         "|---|---|---|---|---|",

@@ -1,9 +1,10 @@
-"""Peak memory from file to file; prints the figures of docs/lab/performance.md.
+"""Time and peak memory from file to file; prints the figures of docs/lab/performance.md.
 
-    python -m lab.correction.memory [--kind tif] [--megapixels 100] [--method fast]
+    python -m lab.correction.memory [--kind tif] [--megapixels 100] [--photo FILE] [--method fast]
 
-Makes a file of smooth light with noise, develops it, corrects it with the lens of `lensmodel bench
-correct` and writes a 16-bit TIFF, as `lensmodel correct` does. 100 megapixels need 2 GiB of disk.
+Makes a file of smooth light with noise, or a RAW photo of the picture FILE, develops it, corrects it with the
+lens of `lensmodel bench correct` and writes a 16-bit TIFF, as `lensmodel correct` does. 100 megapixels need
+2 GiB of disk.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import tifffile
 from scipy import ndimage
 
 from lab.correction.correction_benchmark import SoftCorners
+from lab.peers import light_numbers, write_raw
 from lensmodel.correction import correct_planes
 from lensmodel.photo import develop, write_image
 from lensmodel.photo.dng import write_bayer_dng
@@ -47,20 +49,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kind", choices=["tif", "dng"], default="tif")
     parser.add_argument("--megapixels", type=float, default=100.0)
+    parser.add_argument("--photo", type=Path, metavar="FILE", help="a picture to make a RAW photo of")
     parser.add_argument("--method", default="fast")
+    parser.add_argument("--workers", type=int, default=1, metavar="N")
     wanted = parser.parse_args()
     start = time.perf_counter()
 
     def tell(part: str) -> None:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{part}: peak {peak:.0f} MiB after {time.perf_counter() - start:.0f} s", flush=True)
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        cpu, wall = used.ru_utime + used.ru_stime, time.perf_counter() - start
+        print(f"{part}: peak {used.ru_maxrss / 1024:.0f} MiB, {cpu:.1f} CPU s, {wall:.1f} s", flush=True)
 
     with tempfile.TemporaryDirectory() as name:
-        source = Path(name) / f"in.{wanted.kind}"
+        source = Path(name) / f"in.{'dng' if wanted.photo else wanted.kind}"
         # In a process of its own, so that its memory does not count here.
         pid = os.fork()
         if pid == 0:
-            write_photo(source, wanted.megapixels)
+            if wanted.photo:
+                write_raw(light_numbers(develop(wanted.photo).planes), source)
+            else:
+                write_photo(source, wanted.megapixels)
             os._exit(0)
         os.waitpid(pid, 0)
         tell("start")
@@ -75,6 +83,7 @@ def main() -> None:
             noise=photo.sensor_noise or photo.noise,
             clip=photo.clip,
             cfa=photo.cfa,
+            workers=wanted.workers,
         )
         tell("corrected")
         encoding = photo.encoding

@@ -8,7 +8,6 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
@@ -50,9 +49,9 @@ SIDE: Final = 8  # pixels of a block: that of a JPEG (ITU-T T.81)
 _WEIGHTS: Final = np.array([1, 2, 3, 4, 5, 4, 3, 2, 1], dtype=np.float32)
 """Weights of the blocks around one, along rows and columns: a window that fades out (chosen). A wrong kernel
 is wrong all around; patches of different sharpness would show, and fewer pixels say less."""
-_GROWN, _SOFTNESS = 5, 1.0
-"""Side of the square over which the least share kept spreads, and standard deviation of the Gaussian that
-smooths it then, pixels (chosen: nothing of a faulty pixel comes back, and no edge shows)."""
+_FOOT: Final = np.array([0.16, 0.5, 0.84, 1, 1, 1, 0.84, 0.5, 0.16], dtype=np.float32)
+"""Share of what is held back of a pixel that is held back of those beside it, along rows and columns (chosen:
+nothing of a faulty pixel comes back, and no edge shows)."""
 
 HELD: Final = 0.1
 """Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth is only
@@ -185,30 +184,26 @@ def audit_tile(
     shape = (y.shape[1], y.shape[2])
     inner = inner or (slice(0, shape[0]), slice(0, shape[1]))
     noise = np.array([[n.shot, n.read] for n in evidence.noise], dtype=np.float32)
-    spikes = np.zeros(shape, dtype=np.float32)
     powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
     clip = np.asarray(np.minimum(evidence.clip, 1e9), dtype=np.float32)
-    if not _spikes(y, x, noise, clip, _point_gains(evidence), spikes):
-        spikes = np.zeros(_blocks(shape), dtype=np.float32)
+    keep = np.ones(shape, dtype=np.float32)
+    part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
+    held, worst, row, col = _spikes(y, x, noise, clip, _point_gains(evidence), part, _FOOT, keep)
+    found = Finding(ISOLATED, held / keep[inner].size, worst / _STANDS_OUT, (row - part[0], col - part[2]))
     _powers(y, x, noise, clip, powers)
     wide = around(powers)
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
-    beyond = wide[:2].max(axis=0) / known
-    severities = {ISOLATED: spikes, SPECTRUM: np.sqrt(beyond)}
+    severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
     if evidence.blurs is not None:
         severities[REBLUR] = _misfit(y, x, evidence)
-    keep, findings = np.ones(shape, dtype=np.float32), []
+    findings = [found]
     for check, severity in severities.items():
         share = np.clip(
             np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
         )
-        by_block = severity.shape != shape
         if share.min() < 1.0:
-            np.minimum(keep, to_pixels(share, shape) if by_block else share, out=keep)
-        findings.append(_finding(check, severity, share, inner, by_block=by_block))
-    if keep.min() < 1.0:
-        grown = ndimage.minimum_filter(keep, _GROWN, mode="nearest")
-        keep = np.clip(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), 0.0, 1.0)
+            _lower(keep, share)
+        findings.append(_finding(check, severity, share, inner))
     keep = keep[inner]
     return TileAudit(keep, tuple(findings), float(1.0 - keep.mean(dtype=np.float64)))
 
@@ -232,20 +227,22 @@ def held_back(
     before, after = original[part], corrected[part]
     if audit.keep.min(initial=1.0) == 1.0:
         return after, audit
-    return np.asarray(before + audit.keep * (after - before), dtype=np.float32), audit
+    mixed = after - before
+    mixed *= audit.keep
+    mixed += before
+    return mixed, audit
 
 
-def _finding(check: str, severity: Real, share: Real, inner: Window, *, by_block: bool) -> Finding:
-    """Sum up one check in the inner part, before it is smoothed."""
-    step = SIDE if by_block else 1
+def _finding(check: str, severity: Real, share: Real, inner: Window) -> Finding:
+    """Sum up one check in the blocks of the inner part."""
     part = tuple(
-        slice((s.start or 0) // step, max(-(-(s.stop if s.stop is not None else n * step) // step), 1))
+        slice((s.start or 0) // SIDE, max(-(-(s.stop if s.stop is not None else n * SIDE) // SIDE), 1))
         for s, n in zip(inner, severity.shape, strict=True)
     )
     values = severity[part]
     row, col = np.unravel_index(int(values.argmax()), values.shape)
     at = [
-        max((int(k) + p.start) * step + step // 2 - (s.start or 0), 0)
+        max((int(k) + p.start) * SIDE + SIDE // 2 - (s.start or 0), 0)
         for k, p, s in zip((row, col), part, inner, strict=True)
     ]
     held = float(1.0 - share[part].mean(dtype=np.float64))
@@ -315,13 +312,25 @@ def _powers(y: Real, x: Real, noise: Real, clip: Real, powers: Real) -> None:
 
 
 @jit
-def _spikes(y: Real, x: Real, noise: Real, clip: Real, gains: Real, spikes: Real) -> bool:
-    """How far a pixel of a colour stands out, where that may be more than noise; whether one does."""
-    rows, cols = spikes.shape
-    zero = np.float32(0.0)
+def _spikes(  # noqa: C901 - one pass over the tile, row by row
+    y: Real,
+    x: Real,
+    noise: Real,
+    clip: Real,
+    gains: Real,
+    part: tuple[int, int, int, int],
+    foot: Real,
+    keep: Real,
+) -> tuple[float, float, int, int]:
+    """Lower `keep` around pixels that stand out of a colour.
+
+    Returns the sum of what is held back of such pixels in `part`, the worst figure there, and its pixel.
+    """
+    rows, cols = keep.shape
+    zero, one, limit, most = np.float32(0.0), np.float32(1.0), np.float32(_STANDS_OUT), np.float32(_SPIKE)
     shown, out = np.empty((rows, cols), np.float32), np.zeros(cols, np.float32)
-    least = np.float32((_SPIKE * _STANDS_OUT) ** 2)
-    found = False
+    least, wide = (most * limit) ** 2, foot.size // 2
+    held, worst, at, beside = 0.0, 0.0, part[0], part[2]
     for c in range(3):
         shot, read = noise[c, 0], noise[c, 1]
         for i in range(rows):
@@ -341,13 +350,21 @@ def _spikes(y: Real, x: Real, noise: Real, clip: Real, gains: Real, spikes: Real
                 continue
             for j in range(1, cols - 1):
                 variance = max(shot * max(y[c, i, j], zero) + read, np.float32(1e-12))
-                if out[j] * out[j] > least * variance:
-                    window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
-                    bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
-                    figure = out[j] / (gains[c] * bump + np.float32(_SPIKE) * np.sqrt(variance))
-                    spikes[i, j] = max(spikes[i, j], figure)
-                    found = True
-    return found
+                if out[j] * out[j] <= least * variance:
+                    continue
+                window = y[c, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
+                bump = abs(y[c, i, j] - window.sum() / np.float32(window.size))
+                figure = out[j] / (gains[c] * bump + most * np.sqrt(variance))
+                share = min(max(figure / limit - one, zero), one)
+                if part[0] <= i < part[1] and part[2] <= j < part[3]:
+                    held += share
+                    if figure > worst:
+                        worst, at, beside = figure, i, j
+                for k in range(max(i - wide, 0), min(i + wide + 1, rows) if share > zero else 0):
+                    for l in range(max(j - wide, 0), min(j + wide + 1, cols)):
+                        left = one - share * foot[k - i + wide] * foot[l - j + wide]
+                        keep[k, l] = min(keep[k, l], left)
+    return held, worst, at, beside
 
 
 def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
@@ -422,28 +439,23 @@ def around(totals: Real) -> Real:
     return out
 
 
-def to_pixels(figures: Real, shape: tuple[int, int]) -> Plane:
-    """Bilinear interpolation of figures of blocks; beyond the middles of the outer ones it is constant."""
-    out = np.empty(shape, dtype=np.float32)
-    _interpolate(figures, out)
-    return out
-
-
 @jit
-def _interpolate(figures: Real, out: Real) -> None:
-    """See `to_pixels`; a product of matrices would do it, on threads that stand in each other's way."""
-    rows, cols = figures.shape
+def _lower(keep: Real, shares: Real) -> None:
+    """Lower `keep` to the shares of blocks, interpolated between their middles, in place."""
+    rows, cols = shares.shape
     line = np.empty(cols, np.float32)
-    for i in range(out.shape[0]):
+    for i in range(keep.shape[0]):
         at = min(max((i - 3.5) / 8.0, 0.0), rows - 1.0)
         a = min(int(at), max(rows - 2, 0))
         t, b = np.float32(at - a), min(a + 1, rows - 1)
         for j in range(cols):
-            line[j] = figures[a, j] + t * (figures[b, j] - figures[a, j])
-        for j in range(out.shape[1]):
+            line[j] = shares[a, j] + t * (shares[b, j] - shares[a, j])
+        for j in range(keep.shape[1]):
             at = min(max((j - 3.5) / 8.0, 0.0), cols - 1.0)
             a = min(int(at), max(cols - 2, 0))
-            out[i, j] = line[a] + np.float32(at - a) * (line[min(a + 1, cols - 1)] - line[a])
+            keep[i, j] = min(
+                keep[i, j], line[a] + np.float32(at - a) * (line[min(a + 1, cols - 1)] - line[a])
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from lensmodel.core.types import (
 )
 from lensmodel.correction.audit import Evidence, TileAudit, held_back
 from lensmodel.correction.blur import Drift, UniformBlur
-from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
+from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
 from lensmodel.correction.limit import Bounds, limited
 from lensmodel.correction.posterior import PsfPosterior
@@ -142,7 +142,8 @@ class _CellTile:
         reach = max(blur.reach for blur in blurs)
         halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
         top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
-        tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
+        part = job.planes[:, top : cell.bottom + halo, left : cell.right + halo]
+        tile = np.ascontiguousarray(part, dtype=np.float32)
         surrounded = (
             min(cell.top - halo, cell.left - halo) >= 0
             and cell.bottom + halo <= job.frame.height
@@ -170,7 +171,7 @@ class _CellTile:
     @property
     def cell_pixels(self) -> Planes:
         """The cell without its halo."""
-        return self.photo[self.inner]
+        return np.ascontiguousarray(self.photo[self.inner])
 
 
 def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
@@ -207,14 +208,15 @@ def _within(
     if job.unguarded:
         return RestoredCell(job.weakened(tile.cell_pixels, solution.planes[tile.inner]), expected, None)
     restored, audit = _checked(job, tile, bounds, blurs, solution)
-    if not expected.worth(tile.cell_pixels, restored) and bounds.denoise == 0.0:
-        # so little passed limit and audit that the rest would smooth the photo, not sharpen it
-        return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), audit, left=True)
-    expected = expected.changed(
-        tile.cell_pixels, solution.planes[tile.inner], restored, mosaic=job.cfa is not None
+    photo, least = tile.cell_pixels, WORTH_DB if bounds.denoise == 0.0 else 0.0
+    changed = expected.changed(
+        photo, solution.planes[tile.inner], restored, mosaic=job.cfa is not None, least=least
     )
-    expected = expected.weakened(job.strength * (2.0 - job.strength))
-    return RestoredCell(job.weakened(tile.cell_pixels, restored), expected, audit)
+    if changed is None:
+        # so little passed limit and audit that the rest would smooth the photo, not sharpen it
+        return RestoredCell(photo, replace(expected, after=expected.before), audit, left=True)
+    changed = changed.weakened(job.strength * (2.0 - job.strength))
+    return RestoredCell(job.weakened(photo, restored), changed, audit)
 
 
 def _checked(
@@ -237,7 +239,10 @@ def _checked(
     restored = limited(photo, restored, blurs, sensors, errors, bounds.halo)
     if not job.audited:
         return restored[tile.inner], None
-    evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
+    known = (
+        None if isinstance(job.method, CoarseMethod) else blurs
+    )  # Wiener's filter leaves no more than noise
+    evidence = Evidence(job.noise, job.clip, known, errors, [sensor.measured for sensor in sensors])
     restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
     return restored, verdict.without_map()
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
@@ -20,8 +17,9 @@ from lensmodel.core.types import ZONES, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.wiener import frequency_counts, frequency_squared
+from lensmodel.correction.methods.wiener import frequency_counts
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
+from lensmodel.correction.scene_power import ring_power, scene_power
 from lensmodel.correction.tiles.lattice import Cell
 
 WORTH_DB: Final = 0.1
@@ -30,18 +28,9 @@ WORTH_DB: Final = 0.1
 _UNKNOWN: Final = 1.0
 """Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""
 
-_SHARES: Final = (1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
+_SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1], dtype=np.float32)
 """Shares of a kernel to try; finer steps change the expected error by less than a hundredth."""
 
-_EDGES: Final = (0.05, 0.08, 0.12, 0.17, 0.24)
-_MIDDLES: Final = np.sqrt(np.array(_EDGES[1:]) * _EDGES[:-1])
-"""Rings of frequencies to which a scene's power is fitted, cycles/pixel: above them demosaicing has a part in
-it (chosen)."""
-
-_SLOPES: Final = (2.0, 5.0)
-"""Least and greatest slope a: of sharp photographs of detail, and of what is out of focus (chosen)."""
-
-_BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 _GRID: Final = GRID
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
@@ -64,26 +53,24 @@ class CellForecast:
         """Expected gain in decibels."""
         return _decibels(self.before, self.after)
 
-    def changed(self, photo: Planes, solution: Planes, result: Planes, *, mosaic: bool) -> CellForecast:
+    def changed(
+        self, photo: Planes, solution: Planes, result: Planes, *, mosaic: bool, least: float = WORTH_DB
+    ) -> CellForecast | None:
         """The forecast of a cell whose `solution` became `result` after limit and audit.
 
         The error of a posterior mean is orthogonal to it, so the error falls by the mean square of the
         change: by as large a share of what is forecast as is left of the solution's. A mosaic determines less
-        than full planes do, for which the forecast is made: there the change itself counts.
+        than full planes do, for which the forecast is made: there the change itself counts. None where the
+        change is so small that the error cannot have fallen by `least` decibels.
         """
+        scale = _GRID[0] * _GRID[1] / photo[0].size
+        change = scale * _squared_distance(photo, result)
+        if change < (1.0 - 10.0 ** (-0.1 * least)) * self.before:
+            return None
         if mosaic:
-            fall = min(self._change(photo, result) / self.before, _MOST)
-            return replace(self, after=(1.0 - fall) * self.before)
-        made = _squared_distance(photo, solution)
-        return self.weakened(min(_squared_distance(photo, result) / made, 1.0) if made > 0.0 else 0.0)
-
-    def worth(self, photo: Planes, result: Planes) -> bool:
-        """Whether the change of a cell is so large that the error may have fallen by a gain that is seen."""
-        return self._change(photo, result) >= (1.0 - 10.0 ** (-0.1 * WORTH_DB)) * self.before
-
-    def _change(self, photo: Planes, result: Planes) -> float:
-        """Mean square of a change, in the unit of the errors."""
-        return _squared_distance(photo, result) / photo[0].size * _GRID[0] * _GRID[1]
+            return replace(self, after=(1.0 - min(change / self.before, _MOST)) * self.before)
+        made = scale * _squared_distance(photo, solution)
+        return self.weakened(min(change / made, 1.0) if made > 0.0 else 0.0)
 
     def weakened(self, share: float) -> CellForecast:
         """The forecast where only this share of the error that was to fall does."""
@@ -154,7 +141,7 @@ def plan(
     before = after = 0.0
     shares: list[float] = []
     times = frequency_counts(_GRID)
-    measured = _ring_power(tile)
+    measured = ring_power(tile).mean(axis=1)
     for c, (posterior, offset, sensor) in enumerate(zip(posteriors, offsets, sensors, strict=True)):
         point = UniformBlur(delta(1), offset).spectrum(_GRID)
         K = (
@@ -162,14 +149,12 @@ def plan(
             if posterior.kernel.shape[0] > WIDEST
             else UniformBlur(posterior.kernel, offset).spectrum(_GRID)
         )
-        power, D = np.maximum(K.real**2 + K.imag**2, _LEAST), posterior.variance
-        n = float(sensor.noise.variance(tile[c, ::_EVERY, ::_EVERY]).mean())
-        S = scene_power(measured[c], power + D, n)
-        before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
-        remaining = np.empty(len(_SHARES))
-        _remaining(K, point, S, D, times, n, np.array(_SHARES), returned, remaining)
+        D, n = posterior.variance, float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
+        S = scene_power(measured[c], K.real**2 + K.imag**2 + D, n)
+        remaining = np.empty(_SHARES.size)
+        before += _remaining(K, point, S, D, times, np.float32(n), _SHARES, np.float32(returned), remaining)
         best = int(np.argmin(remaining))
-        shares.append(_SHARES[best])
+        shares.append(float(_SHARES[best]))
         after += float(remaining[best])
     error = float(np.mean([posterior.error for posterior in posteriors]))
     return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
@@ -179,96 +164,40 @@ def plan(
 def _remaining(
     K: NDArray[np.complex64],
     point: NDArray[np.complex64],
-    S: NDArray[np.float64],
+    S: NDArray[np.float32],
     D: NDArray[np.float32],
     times: NDArray[np.float32],
-    noise: float,
-    shares: NDArray[np.float64],
-    returned: float,
+    noise: np.float32,
+    shares: NDArray[np.float32],
+    returned: np.float32,
     out: NDArray[np.float64],
-) -> None:
-    """Expected squared error that each share of a kernel leaves; see `plan`."""
+) -> float:
+    """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`."""
+    one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
+    for i in range(K.shape[0]):
+        part = np.float32(0.0)
+        for j in range(K.shape[1]):
+            a, b = one - K[i, j].real, K[i, j].imag
+            part += times[i, j] * (S[i, j] * (a * a + b * b + D[i, j]) + noise)
+        before += part
     for number in range(shares.size):
-        share, total = shares[number], 0.0
+        share, total = shares[number], np.float64(0.0)
         for i in range(K.shape[0]):
+            part = np.float32(0.0)
             for j in range(K.shape[1]):
-                k, s = complex(K[i, j]), S[i, j]
-                mixed = share * k + (1.0 - share) * complex(point[i, j])
-                W = mixed.conjugate() * s / max(s * (mixed.real**2 + mixed.imag**2) + noise, _LEAST)
-                G = W + returned * (1.0 - mixed * W)
-                missed = 1.0 - G * k
-                kept = G.real**2 + G.imag**2
-                error = s * (missed.real**2 + missed.imag**2 + kept * D[i, j]) + kept * noise
-                total += times[i, j] * error
+                a, b, s = K[i, j].real, K[i, j].imag, S[i, j]
+                p = share * a + (one - share) * point[i, j].real
+                q = share * b + (one - share) * point[i, j].imag
+                power = p * p + q * q
+                weight = s / max(s * power + noise, least)
+                re, im = p * weight + returned * (one - power * weight), -q * weight
+                missed, turned = one - re * a + im * b, re * b + im * a
+                kept = re * re + im * im
+                error = s * (missed * missed + turned * turned + kept * D[i, j]) + kept * noise
+                part += times[i, j] * error
+            total += part
         out[number] = total
-
-
-def scene_power(
-    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
-) -> NDArray[np.float64]:
-    """Power of the scene behind a blur, S = c |f|^-a, on the `rfft2` grid of `GRID`.
-
-    Scaled so that white noise has its variance as power. c and a are fitted to rings of the photo's own
-    spectrum that blur and demosaicing leave intact: a soft scene, or one without detail, has nothing that a
-    correction could restore.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (rings,)
-        Mean power of a part of the photo in each ring.
-    transferred : ndarray, shape (64, 33)
-        Expected |H|² of its blur.
-    noise : float
-        Variance of its noise.
-    """
-    transmitted = _rings() @ transferred.ravel().astype(np.float64)
-    power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)
-    x, y = np.log(_MIDDLES), np.log(power)
-    # rings with more noise than scene say little about the slope
-    weight = 1.0 / (0.05 + (noise / np.maximum(measured, 1e-12)) ** 2)
-    weight /= weight.sum()
-    mean_x, mean_y = weight @ x, weight @ y
-    slope = float(weight @ ((x - mean_x) * (y - mean_y)) / (weight @ (x - mean_x) ** 2))
-    slope = min(max(-slope, _SLOPES[0]), _SLOPES[1])
-    return np.asarray(math.exp(mean_y + slope * mean_x) * np.exp(-0.5 * slope * _log_squared()))
-
-
-def _ring_power(planes: Planes) -> NDArray[np.float64]:
-    """Mean power of each plane in each ring, `(planes, rings)`; 1 for white noise of variance 1."""
-    missing = [max(g - n, 0) for g, n in zip(_GRID, planes.shape[1:], strict=True)]
-    if any(missing):
-        planes = np.pad(planes, [(0, 0), *((0, m) for m in missing)], "reflect")
-    rows, cols = (
-        np.linspace(0, n - g, min(max(n // g, 1), _BLOCKS)).astype(int)
-        for n, g in zip(planes.shape[1:], _GRID, strict=True)
-    )
-    blocks = np.stack([planes[:, t : t + _GRID[0], l : l + _GRID[1]] for t in rows for l in cols], axis=1)
-    blocks = (blocks - blocks.mean(axis=(2, 3), keepdims=True)) * _window()
-    spectra = fft.rfft2(blocks)
-    power = (spectra.real**2 + spectra.imag**2).mean(axis=1, dtype=np.float64) / (_GRID[0] * _GRID[1])
-    return np.asarray(power.reshape(len(planes), -1) @ _rings().T)
-
-
-@lru_cache(maxsize=1)
-def _window() -> NDArray[np.float32]:
-    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in _GRID))
-    return np.asarray(window / np.sqrt(np.mean(window**2)), dtype=np.float32)
-
-
-@lru_cache(maxsize=1)
-def _log_squared() -> NDArray[np.float64]:
-    """Logarithm of |f|² on the grid; the mean has no power."""
-    squared = frequency_squared(_GRID).astype(np.float64)
-    squared[0, 0] = np.inf
-    return np.log(squared)
-
-
-@lru_cache(maxsize=1)
-def _rings() -> NDArray[np.float64]:
-    """Weights of each ring's frequencies, by how often the whole spectrum holds them; their sum is 1."""
-    modulus, times = np.sqrt(frequency_squared(_GRID)), frequency_counts(_GRID)
-    rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
-    return np.array([(ring / ring.sum()).ravel() for ring in rings])
+    return before
 
 
 def zone_reports(
@@ -294,15 +223,22 @@ def zone_reports(
     return reports
 
 
-@jit
 def _squared_distance(a: Planes, b: Planes) -> float:
-    total = 0.0
+    # strides that a compiler does not know cost more than a copy
+    return _sum_of_squares(np.ascontiguousarray(a), np.ascontiguousarray(b))
+
+
+@jit
+def _sum_of_squares(a: Planes, b: Planes) -> float:
+    total = np.float64(0.0)
     for c in range(a.shape[0]):
         for i in range(a.shape[1]):
+            part = np.float32(0.0)
             for j in range(a.shape[2]):
                 step = a[c, i, j] - b[c, i, j]
-                total += step * step
-    return total
+                part += step * step
+            total += part
+    return float(total)
 
 
 def _decibels(before: float, after: float) -> float:

@@ -204,7 +204,7 @@ def correct_planes(
         cfa,
         bounds or Bounds(),
         # Kernels do not change within cells that are larger than usual.
-        solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
+        solver.cell_factor if isinstance(solver, CoarseMethod) else 1,
         audited,
         unguarded,
         stored,
@@ -307,9 +307,7 @@ def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
     bottom = min(cell.bottom, window.top + window.height)
     right = min(cell.right, window.left + window.width)
     rows, cols = slice(top - cell.top, bottom - cell.top), slice(left - cell.left, right - cell.left)
-    target = (
-        slice(None),
-        slice(top - window.top, bottom - window.top),
-        slice(left - window.left, right - window.left),
-    )
-    add(np.asarray(out[target]), cell.rise[rows], cell.run[cols], restored[:, rows, cols])
+    at, part = (top - window.top, left - window.left), (top - cell.top, left - cell.left)
+    # strides that a compiler does not know cost more than a copy
+    planes = np.ascontiguousarray(restored)
+    add(np.asarray(out), at, cell.rise[rows], cell.run[cols], planes, part)

@@ -35,6 +35,17 @@ def test_peer_sharpens_a_picture_and_leaves_it_without_its_setting(peer: Peer, t
     assert np.abs(sharp - plain).mean() > 1e-4
 
 
+def test_a_picture_made_a_raw_photo_keeps_one_colour_of_each_pixel_and_its_light() -> None:
+    planes = np.full((3, 64, 80), 0.2, dtype=np.float32)
+    planes[1, :, 40:] = 0.5
+
+    seen = peers.as_raw(planes)
+
+    assert seen.cfa is not None
+    np.testing.assert_allclose(seen.planes[:, :, 20], planes[:, :, 20], rtol=0.02)
+    np.testing.assert_allclose(seen.planes[:, 8:-8, 60], planes[:, 8:-8, 60], rtol=0.02)
+
+
 def test_missing_program_is_named() -> None:
     peer = Peer("nobody's", "no-such-program", lambda *_: [], 1.0)
 

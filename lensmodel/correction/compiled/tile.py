@@ -99,11 +99,10 @@ def block_means(  # noqa: C901 - one pass over memory
 
 
 @jit
-def add(out: Real, rise: Real, run: Real, planes: Real) -> None:
-    """Add planes times the product of a weight for each row and one for each column."""
-    channels, height, width = planes.shape
-    for c in range(channels):
-        for i in range(height):
-            weight = rise[i]
-            for j in range(width):
-                out[c, i, j] += weight * run[j] * planes[c, i, j]
+def add(out: Real, at: tuple[int, int], rise: Real, run: Real, planes: Real, part: tuple[int, int]) -> None:
+    """Add planes from pixel `part` on, times a weight for each row and each column, to `out` from `at` on."""
+    for c in range(planes.shape[0]):
+        for i in range(rise.size):
+            weight, line, into = rise[i], planes[c, part[0] + i], out[c, at[0] + i]
+            for j in range(run.size):
+                into[at[1] + j] += weight * run[j] * line[part[1] + j]

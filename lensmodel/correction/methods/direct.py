@@ -1,78 +1,78 @@
-"""One pass: a linear filter for all colours together, gentle where the picture is calm."""
+"""One pass: a linear filter of each colour."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.jit import jit
 from lensmodel.core.types import Plane, Planes, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator, UniformBlur
 from lensmodel.correction.clipped import Lights
-from lensmodel.correction.compiled.one_pass import one_pass
+from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
+from lensmodel.correction.compiled.filters import smooth
 from lensmodel.correction.compiled.tile import fill
-from lensmodel.correction.deconvolver import Deconvolver, Restored, Sensor, Solution, restore_planes, uniform
-from lensmodel.correction.methods.sparse_gradient import SparseGradient
-from lensmodel.correction.methods.wiener import frequency_squared, prior
+from lensmodel.correction.deconvolver import Restored, Sensor, Solution, uniform
+from lensmodel.correction.methods.wiener import frequency_squared
+from lensmodel.correction.posterior import GRID
+from lensmodel.correction.scene_power import ring_power, scene_law
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.local_statistics import (
-    BLOCK,
-    BlockMeans,
-    signal_variance,
-    smoothed,
-    spread_blocks,
-)
 from lensmodel.correction.tiles.transfers import transfers
 
-_FINE: Final = 1.0 / 16.0  # cycles per pixel: a window of 13 pixels sees frequencies above this
-_LEAST_COLOUR: Final = 0.02
-"""Least variance of chroma over that of luma in a scene (chosen: with none, a scene that looks grey in its
-noise would lose every colour; with much more, noise would pass for colour)."""
+_FLOOR: Final = np.float32(1e-3)
+"""Added to |K|²: the square of what a transfer function is expected to be off by within a cell (chosen:
+without it strong frequencies of the scene come back as coloured ripples)."""
 
-
-def _steps() -> Deconvolver:
-    """Half the steps of "standard", each a larger one."""
-    return SparseGradient(steps=4, coupling=4.0, growth=6.0)
+_SURE: Final = np.float32(2.0)
+"""Times what a change costs in noise up to which none is made (chosen: less leaves grain in shadows)."""
+_CAREFUL: Final = 3.0
+"""Times its noise that a cell is filtered for (chosen: of 1, 3 and 8 the most that costs no gain)."""
+_EVERY: Final = 4  # of the rows and columns suffices for a mean
+_BLOCK: Final = 4  # pixels over which a change is compared with its noise: coarser than detail (chosen)
+_AROUND: Final = np.array([1.0, 4.0, 4.0, 4.0, 1.0], dtype=np.float32)
+"""Weights of the blocks around one, along rows and columns: a window of about 16 pixels (chosen: it holds
+enough pixels for a variance, and little of the next object)."""
 
 
 @dataclass(frozen=True, slots=True)
 class DirectFilter:
-    r"""Linear minimum-mean-square-error filter of three colours, for two contrasts of the scene.
+    r"""Wiener's filter of each colour, with a part of the grain that it takes [1]_.
 
-    The scene is natural in luma and in chroma, S_l = l |f|^-2.2 and S_c = c |f|^-2.2, so that each of its
-    colours informs the others. With channels scaled to equal light, noise n_i and 1 a vector of ones::
+    With S = c |f|^-a the power of the scene in the very cell (`scene_power.scene_law`) and n its noise::
 
-        M = diag( (|K_i|² + floor) / n_i + 1 / S_c ) + g 1 1',    g = ( 1 / S_l - 1 / S_c ) / 3
-        X = M^-1 ( conj(K_i) Y_i / n_i )
+        X = G Y,    G = W + t ( 1 - K W ),    W = conj(K) S / ( |K|² S + n )
 
-    solved by the Sherman-Morrison formula. It is solved for a busy scene and for a calm one, and
-    each pixel mixes the two by the logarithm of the contrast around it. Mosaics, where two colours of three
-    must be filled in, are restored in a few half-quadratic steps instead.
+    A cell has calm places beside busy ones. The share w of the change x - y with the least expected error is
+    1 - n mean( |G|² - Re G ) / mean (x - y)², by means over all frequencies and around each place, if the
+    scene changes as it should; twice that cost in noise is reckoned with::
+
+        result = y + w ( x - y ),    w within 0..1
+
+    Of a mosaic, what demosaicing made of it is filtered.
 
     Parameters
     ----------
-    busy, calm : float
-        The two contrasts: shares of the mean variance in windows of the tile.
-    floor : float
-        Added to |K_i|² in M: the square of what a transfer function is expected to be off by within a
-        cell. Without it strong frequencies of the scene come back as coloured ripples.
+    texture : float
+        t.
     light_steps : int
         Steps that estimate the light of clipped pixels.
     outside_steps : int
         Steps that estimate the light from beyond the frame.
+
+    References
+    ----------
+    .. [1] N. Wiener, "Extrapolation, interpolation, and smoothing of stationary time series", 1949.
     """
 
-    busy: float = 0.25
-    calm: float = 0.0015
-    floor: float = 1e-3
+    texture: float = 0.87
     light_steps: int = 15
     outside_steps: int = 10
-    mosaic: Deconvolver = field(default_factory=_steps)
 
     cell_factor = 2
     """Cells may be larger: a filter that is quick has no use for kernels that are exact everywhere."""
@@ -82,7 +82,7 @@ class DirectFilter:
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
         kernel = uniform(blur, "fast")
-        restored = self.deconvolve_planes(np.stack([blurred] * 3), [kernel] * 3, [sensor] * 3)
+        restored = self.deconvolve_planes(blurred[None], [kernel], [sensor])
         on_step(1, 1)
         return Restored(restored.planes[0], steps=1)
 
@@ -90,62 +90,128 @@ class DirectFilter:
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Solution:
         """Restore the colours together; see `ColourDeconvolver`."""
-        if any(sensor.measured is not None for sensor in sensors):
-            return restore_planes(self.mosaic, blurred, blurs, sensors)
         lights = Lights.of(blurred, blurs, sensors, self.light_steps)
-        photo, blurred = blurred, blurred if lights is None else lights.rest
-        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
+        photo, blurred = blurred, np.ascontiguousarray(blurred if lights is None else lights.rest)
         canvas = Canvas.around(blurred, blurs, sensors)
-        contrast, colour, noise = _contrasts(BlockMeans.of(blurred, light), light, sensors)
-        mean = float(contrast.mean())
-        low, high = np.log(self.calm), np.log(self.busy)
-        share = np.clip((np.log(contrast / mean) - low) / (high - low), 0.0, 1.0)
-        busy = spread_blocks(share.astype(np.float32), canvas)
-        K, _ = transfers(blurs, canvas.shape, 1.0, drifting=False)
-        levels = np.array(
-            [[3.0 * mean * f, max(colour, _LEAST_COLOUR * 3.0 * mean) * f] for f in (self.busy, self.calm)]
-        )
-        y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
+        x = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
         rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
-        fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
+        unit = np.ones(len(blurred), dtype=np.float32)
+        fill(blurred, unit, canvas.margin, rows, cols, x)
+        K, _ = transfers(blurs, canvas.shape, 1.0, drifting=False)
         if not all(sensor.surrounded for sensor in sensors):
-            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.outside_steps)
-        x = np.empty_like(y)
-        floor = np.float32(self.floor)
-        one_pass(x, y, K, noise, prior(canvas.shape)[0], _fine(canvas.shape), levels, busy, floor)
-        restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
+            fill_outside(x, blurred, unit, K, blurs, sensors, canvas, self.outside_steps)
+        part = blurred[:, ::_EVERY, ::_EVERY]
+        noise = np.array([s.noise.variance(p).mean() for s, p in zip(sensors, part, strict=True)])
+        # of the usual part of the cell, not of its lamps
+        usual = np.exp(np.log(np.maximum(ring_power(blurred), 1e-12)).mean(axis=1))
+        laws = np.array(
+            [
+                scene_law(power, np.abs(blur.spectrum(GRID)) ** 2, n)
+                for power, blur, n in zip(usual, blurs, noise, strict=True)
+            ]
+        )
+        slope = round(2.0 * laws[:, 1].mean()) / 2.0  # few enough to keep their powers
+        over = (_CAREFUL * np.maximum(noise, 1e-12) / laws[:, 0]).astype(np.float32)
+        amplified = np.empty(len(x), dtype=np.float32)
+        _filter(x, K, over, _rise(canvas.shape, slope), np.float32(self.texture), amplified)
+        models = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
+        restored = np.empty_like(blurred)
+        _where_it_stands_out(blurred, x, canvas.margin, models * amplified[:, None], restored)
         return Solution(restored if lights is None else lights.put_back(photo, restored))
 
 
-def _contrasts(
-    blocks: BlockMeans, light: NDArray[np.float32], sensors: Sequence[Sensor]
-) -> tuple[NDArray[np.float32], float, NDArray[np.float32]]:
-    """Variance of luma around each block, of chroma in all, and of the noise of each colour.
+@jit
+def _filter(
+    x: Real,
+    K: Complex,
+    over: Real,
+    rise: Real,
+    texture: Number,
+    amplified: Real,
+) -> None:
+    """Filter planes in place; `over` times `rise` is n / S, and `amplified` receives mean( |G|² - Re G )."""
+    height, half = rise.shape
+    X = np.empty((height, half), np.complex64)
+    xx = X.view(np.float32)
+    for c in range(x.shape[0]):
+        k = K[c].view(np.float32)
+        to_spectrum(x[c], X)
+        mean = X[0, 0]
+        amplified[c] = ZERO
+        for i in range(height):
+            changed = ZERO
+            for j in range(half):
+                re, im = 2 * j, 2 * j + 1
+                a, b = k[i, re], k[i, im]
+                ratio = over[c] * rise[i, j]
+                power = a * a + b * b + _FLOOR
+                scale = ONE / (power + ratio)
+                gain, turn = (a + texture * ratio) * scale, -b * scale
+                changed += gain * gain + turn * turn - gain
+                p, q = xx[i, re], xx[i, im]
+                xx[i, re], xx[i, im] = gain * p - turn * q, gain * q + turn * p
+            amplified[c] += changed / np.float32(height * half)
+        X[0, 0] = mean
+        to_plane(X, x[c])
 
-    Chroma is read off the blocks: what is finer is noise.
-    """
-    var = np.stack(
-        [
-            s.noise.variance(smoothed(b * bright)) / bright**2
-            for s, b, bright in zip(sensors, blocks.planes, light, strict=True)
-        ]
-    ).astype(np.float32)
-    noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-    contrast = signal_variance(blocks, var.sum(axis=0) / np.float32(9.0))
-    r, g, b = blocks.planes
-    chroma = 0.0
-    for plane, part in (
-        ((r - b) / np.float32(np.sqrt(2)), (noise[0] + noise[2]) / 2),
-        ((2 * g - r - b) / np.float32(np.sqrt(6)), (noise[0] + 4 * noise[1] + noise[2]) / 6),
-    ):
-        detail = float((smoothed(plane * plane) - smoothed(plane) ** 2).mean())
-        chroma += max(detail - float(part) / BLOCK**2, 0.0) / 2.0
-    return contrast, chroma, noise
+
+@jit
+def _where_it_stands_out(  # noqa: C901, PLR0912 - blocks, then pixels
+    y: Real, x: Real, margin: int, noise: Real, out: Real
+) -> None:
+    """Mix planes and their filtered ones on a canvas by what the change costs in `noise`."""
+    channels, rows, cols = y.shape
+    high, wide = -(-rows // _BLOCK), -(-cols // _BLOCK)
+    zero, one, part = np.float32(0.0), np.float32(1.0), np.float32(1.0 / channels)
+    change, light = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    power, expected = np.zeros((high, wide), np.float32), np.zeros((high, wide), np.float32)
+    for i in range(rows):
+        change[:] = zero
+        light[:] = zero
+        for c in range(channels):
+            before, after = y[c, i], x[c, margin + i, margin : margin + cols]
+            shot, read = noise[c, 0] * part * part, noise[c, 1] * part * part
+            for j in range(cols):
+                change[j] += part * (after[j] - before[j])
+                light[j] += shot * max(before[j], zero) + read
+        for b in range(wide):
+            square, total = zero, zero
+            for j in range(_BLOCK * b, min(_BLOCK * b + _BLOCK, cols)):
+                square += change[j] * change[j]
+                total += light[j]
+            power[i // _BLOCK, b] += square
+            expected[i // _BLOCK, b] += total
+    share, wider = np.empty((high, wide), np.float32), np.empty((high, wide), np.float32)
+    smooth(power, _AROUND, wider, False)
+    smooth(expected, _AROUND, share, False)
+    for i in range(high):
+        for j in range(wide):
+            cost = _SURE * share[i, j] / max(wider[i, j], np.float32(1e-20))
+            share[i, j] = min(max(one - cost, zero), one)
+    line, kept = np.empty(wide + 1, np.float32), np.empty(_BLOCK * (wide + 1), np.float32)
+    half, step = _BLOCK // 2, np.float32(1.0 / _BLOCK)
+    for i in range(rows):
+        above = min(max((i - half) // _BLOCK, 0), high - 1)
+        below = min(above + 1, high - 1)
+        t = min(max((np.float32(i - half - _BLOCK * above) + np.float32(0.5)) * step, zero), one)
+        for b in range(wide):
+            line[b] = share[above, b] + t * (share[below, b] - share[above, b])
+        line[wide] = line[wide - 1]
+        for k in range(half):
+            kept[k] = line[0]
+        for b in range(wide):
+            for k in range(_BLOCK):
+                at = (np.float32(k) + np.float32(0.5)) * step
+                kept[half + _BLOCK * b + k] = line[b] + at * (line[b + 1] - line[b])
+        for c in range(channels):
+            before, after, into = y[c, i], x[c, margin + i, margin : margin + cols], out[c, i]
+            for j in range(cols):
+                into[j] = before[j] + kept[j] * (after[j] - before[j])
 
 
-@lru_cache(maxsize=8)
-def _fine(shape: tuple[int, int]) -> NDArray[np.float32]:
-    """The prior's power where a local window sees it, zero elsewhere."""
-    prior_power = prior(shape)[1] * (frequency_squared(shape) > _FINE**2)
-    prior_power.setflags(write=False)
-    return np.ascontiguousarray(prior_power, dtype=np.float32)
+@lru_cache(maxsize=16)
+def _rise(shape: tuple[int, int], slope: float) -> NDArray[np.float32]:
+    """|f|^a, one over the power of a scene."""
+    rise = np.ascontiguousarray(frequency_squared(shape) ** np.float32(0.5 * slope), dtype=np.float32)
+    rise.setflags(write=False)
+    return rise

@@ -27,8 +27,10 @@ def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFi
 def test_benchmark_of_a_window_counts_its_pixels_only() -> None:
     photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
 
-    report = run_correct_benchmark(photo, methods=("fast",), roi=(0, 0, 100, 110))
+    report = run_correct_benchmark(photo, methods=("fast",), roi=(0, 0, 100, 110), cfa=((0, 1), (1, 2)))
 
+    assert report["raw"]
+    assert "RAW" in correct_table(report)
     assert report["megapixels"] == pytest.approx(0.011)
     with pytest.raises(InvalidInputError, match="does not lie"):
         run_correct_benchmark(photo, methods=("fast",), roi=(150, 0, 100, 110))

@@ -1,0 +1,127 @@
+"""Power of the scene at each frequency, fitted to a part of the photo."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.jit import jit
+from lensmodel.core.types import Planes
+from lensmodel.correction.compiled.common import to_spectrum
+from lensmodel.correction.methods.wiener import frequency_counts, frequency_squared
+from lensmodel.correction.posterior import GRID
+
+_EDGES: Final = (0.05, 0.08, 0.12, 0.17, 0.24)
+_MIDDLES: Final = np.sqrt(np.array(_EDGES[1:]) * _EDGES[:-1])
+"""Rings of frequencies to which a scene's power is fitted, cycles/pixel: above them demosaicing has a part in
+it (chosen)."""
+
+_SLOPES: Final = (2.0, 5.0)
+"""Least and greatest slope a: of sharp photographs of detail, and of what is out of focus (chosen)."""
+
+_BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
+
+
+def scene_power(
+    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
+) -> NDArray[np.float32]:
+    """Power of the scene behind a blur on the `rfft2` grid of `GRID`, S = c |f|^-a by `scene_law`."""
+    level, slope = scene_law(measured, transferred, noise)
+    return np.asarray(level * np.exp(np.float32(-0.5 * slope) * _log_squared()), dtype=np.float32)
+
+
+def scene_law(
+    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
+) -> tuple[float, float]:
+    """Power of the scene behind a blur, S = c |f|^-a, as c and a.
+
+    Scaled so that white noise has its variance as power. c and a are fitted to rings of the photo's own
+    spectrum that blur and demosaicing leave intact: a soft scene, or one without detail, has nothing that a
+    correction could restore.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (rings,)
+        Mean power of a part of the photo in each ring, of `ring_power`.
+    transferred : ndarray, shape (64, 33)
+        Expected |H|² of its blur.
+    noise : float
+        Variance of its noise.
+    """
+    transmitted = _rings() @ transferred.ravel().astype(np.float64)
+    power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)
+    x, y = np.log(_MIDDLES), np.log(power)
+    # rings with more noise than scene say little about the slope
+    weight = 1.0 / (0.05 + (noise / np.maximum(measured, 1e-12)) ** 2)
+    weight /= weight.sum()
+    mean_x, mean_y = weight @ x, weight @ y
+    slope = float(weight @ ((x - mean_x) * (y - mean_y)) / (weight @ (x - mean_x) ** 2))
+    slope = min(max(-slope, _SLOPES[0]), _SLOPES[1])
+    return math.exp(mean_y + slope * mean_x), slope
+
+
+def ring_power(planes: Planes) -> NDArray[np.float64]:
+    """Power of each plane in each ring, `(planes, blocks, rings)`; 1 for white noise of variance 1."""
+    missing = [max(g - n, 0) for g, n in zip(GRID, planes.shape[1:], strict=True)]
+    if any(missing):
+        planes = np.pad(planes, [(0, 0), *((0, m) for m in missing)], "reflect")
+    rows, cols = (
+        np.linspace(0, n - g, min(max(n // g, 1), _BLOCKS)).astype(int)
+        for n, g in zip(planes.shape[1:], GRID, strict=True)
+    )
+    power = np.empty((len(planes), len(rows) * len(cols), GRID[0], GRID[1] // 2 + 1), dtype=np.float32)
+    _block_power(planes, rows, cols, _window(), power)
+    rings = power.reshape(*power.shape[:2], -1) @ _rings().T.astype(np.float32)
+    return np.asarray(rings / (GRID[0] * GRID[1]), dtype=np.float64)
+
+
+@jit
+def _block_power(
+    planes: Planes,
+    rows: NDArray[np.intp],
+    cols: NDArray[np.intp],
+    window: NDArray[np.float32],
+    power: NDArray[np.float32],
+) -> None:
+    """Power of windowed blocks of planes, less their means."""
+    height, width = window.shape
+    block, spectrum = np.empty((height, width), np.float32), np.empty((height, width // 2 + 1), np.complex64)
+    for c in range(planes.shape[0]):
+        for k, top in enumerate(rows):
+            for l, left in enumerate(cols):
+                into = power[c, k * len(cols) + l]
+                block[:] = planes[c, top : top + height, left : left + width]
+                block -= block.mean()
+                block *= window
+                to_spectrum(block, spectrum)
+                for i in range(height):
+                    for j in range(spectrum.shape[1]):
+                        value = spectrum[i, j]
+                        into[i, j] = value.real * value.real + value.imag * value.imag
+
+
+@lru_cache(maxsize=1)
+def _window() -> NDArray[np.float32]:
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in GRID))
+    return np.asarray(window / np.sqrt(np.mean(window**2)), dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _log_squared() -> NDArray[np.float32]:
+    """Logarithm of |f|² on the grid; the mean has no power."""
+    squared = frequency_squared(GRID)
+    squared[0, 0] = np.inf
+    return np.log(squared)
+
+
+@lru_cache(maxsize=1)
+def _rings() -> NDArray[np.float64]:
+    """Weights of each ring's frequencies, by how often the whole spectrum holds them; their sum is 1."""
+    modulus, times = np.sqrt(frequency_squared(GRID)), frequency_counts(GRID)
+    rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
+    return np.array([(ring / ring.sum()).ravel() for ring in rings])

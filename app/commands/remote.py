@@ -12,7 +12,7 @@ import typer
 from rich.progress import Progress, TaskID
 
 from lensmodel.api import FORMATS
-from lensmodel.cli import correction, files
+from lensmodel.cli import files, outputs
 from lensmodel.cli.console import Display, gain_words
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
@@ -30,7 +30,7 @@ def run(
     url: str,
     lens: str,
     output: str | None,
-    options: correction.CorrectionOptions,
+    options: outputs.CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
@@ -46,14 +46,14 @@ def run(
     lens : str
         "auto": learn from these photos too; else the id of a lens of the service.
     output, options, display, as_json
-        As of `correction.run`.
+        As of `lensmodel.cli.correct`.
     """
     import httpx2  # noqa: PLC0415 - an extra: the commands on files do without it
 
     from app.client import Client  # noqa: PLC0415 - same
 
-    targets, twice = correction.targets_of(files.photos(names), output, options.file_format)
-    results = correction.clashes(twice, display)
+    targets, twice = outputs.targets_of(files.photos(names), output, options.file_format)
+    results = outputs.clashes(twice, display)
     try:
         with Client(url) as client, display.progress() as bars:
             work = _Remote(client, lens, options, display)
@@ -83,7 +83,7 @@ class _Remote:
     """The requests to the service, photo by photo."""
 
     def __init__(
-        self, client: Client, lens: str, options: correction.CorrectionOptions, display: Display
+        self, client: Client, lens: str, options: outputs.CorrectionOptions, display: Display
     ) -> None:
         self._client, self._options, self._display = client, options, display
         self._lens = None if lens == AUTO else lens

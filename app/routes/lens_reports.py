@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from dataclasses import replace
 from typing import Annotated, Any, Final, Literal
 from urllib.parse import quote
 
@@ -18,11 +19,15 @@ from app.store.lenses import report_key
 from app.store.tables import LensRow
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.names import camera_name
 from lensmodel.core.types import Channel
-from lensmodel.report import Comparison, LensReport, Side, compare
+from lensmodel.report import Comparison, LensReport, Side, compare, provenance
 from lensmodel.report.tables import to_csv
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
+
+MOST: Final = 1000
+"""Photos whose names a report looks at, at most: it lists some, and says how many more there are."""
 
 Form = Literal["json", "csv", "pdf"]
 MEDIA_TYPES: Final[dict[Form, str]] = {
@@ -91,7 +96,13 @@ def read_report(
         second_test = test if second_lens is lens else stored_report(call, second_lens)
         body = _compared(test, second_test, aperture, against_aperture, channel, form)
     else:
-        body = _written(test, form)
+        photos = call.store.photos.page(call.owner, before=None, limit=MOST, lens_id=lens_id, state="counted")
+        details = provenance(
+            lens.serial,
+            [camera_name(photo.camera_maker, photo.camera_model) for photo in photos],
+            [photo.filename for photo in photos],
+        )
+        body = _written(replace(test, details=details), form)
     return Response(body, media_type=MEDIA_TYPES[form], headers=headers)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, get_args
@@ -9,7 +11,7 @@ from typing import Annotated, get_args
 import typer
 
 from lensmodel.blind import estimators
-from lensmodel.cli import correction, folder
+from lensmodel.cli import files, folder, outputs
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import (
@@ -25,9 +27,12 @@ from lensmodel.cli.options import (
     choice,
     rare,
 )
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.types import LensSettings
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.patches import selectors
 from lensmodel.photo import OutputFormat
+from lensmodel.workflow.lens import Lens
 
 LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting", "Writing", "Running"
 """Panels of the options that --help-all adds."""
@@ -79,91 +84,69 @@ def correct(
     profiles: Annotated[
         Path | None,
         rare(
-            typer.Option(
-                metavar="DIR", help="Folder of the lens profiles. Default: a folder `lenses` in the output."
-            ),
             LEARNING,
+            metavar="DIR",
+            help="Folder of the lens profiles. Default: a folder `lenses` in the output.",
         ),
     ] = None,
     learn_from: Annotated[
         int,
-        rare(
-            typer.Option(min=1, metavar="N", help="Learn from at most this many photos of each group."),
-            LEARNING,
-        ),
+        rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group."),
     ] = folder.LEARN_FROM,
     estimator: Annotated[
-        str, rare(typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}."), LEARNING)
+        str, rare(LEARNING, metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}.")
     ] = "default",
     selector: Annotated[
         str,
-        rare(
-            typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}."),
-            LEARNING,
-        ),
+        rare(LEARNING, metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}."),
     ] = "r-map",
-    any_lens: Annotated[bool, rare(ANY_LENS, LEARNING)] = False,
+    any_lens: Annotated[bool, rare(LEARNING, ANY_LENS)] = False,
     method: Annotated[
         str | None,
         rare(
-            typer.Option(
-                metavar="NAME",
-                help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
-            ),
             CORRECTING,
+            metavar="NAME",
+            help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
         ),
     ] = None,
     halo: Annotated[
         float | None,
         rare(
-            typer.Option(
-                metavar="SHARE",
-                help="How far results may go beyond the photo's own range beside edges, as a share of that "
-                "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
-            ),
             CORRECTING,
+            metavar="SHARE",
+            help="How far results may go beyond the photo's own range beside edges, as a share of that "
+            "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
         ),
     ] = None,
     texture: Annotated[
         float,
         rare(
-            typer.Option(
-                min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."
-            ),
-            CORRECTING,
+            CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."
         ),
     ] = 1.0,
     denoise: Annotated[
         float,
         rare(
-            typer.Option(
-                min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."
-            ),
-            CORRECTING,
+            CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."
         ),
     ] = 0.0,
     keep_location: Annotated[
         bool,
         rare(
-            typer.Option(
-                "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
-            ),
-            WRITING,
+            WRITING, "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
         ),
     ] = False,
     server: Annotated[
         str | None,
         rare(
-            typer.Option(
-                metavar="URL",
-                help="Have a service do the work on another machine; its key is read from LENS_API_KEY.",
-            ),
             RUNNING,
+            metavar="URL",
+            help="Have a service do the work on another machine; its key is read from LENS_API_KEY.",
         ),
     ] = None,
-    workers: Annotated[int | None, rare(WORKERS, RUNNING)] = None,
-    json_output: Annotated[bool, rare(JSON, RUNNING)] = False,
-    quiet: Annotated[bool, rare(QUIET, RUNNING)] = False,
+    workers: Annotated[int | None, rare(RUNNING, WORKERS)] = None,
+    json_output: Annotated[bool, rare(RUNNING, JSON)] = False,
+    quiet: Annotated[bool, rare(RUNNING, QUIET)] = False,
     verbose: Verbose = 0,
     help_all: HelpAll = False,
 ) -> None:
@@ -194,7 +177,7 @@ def correct(
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")
-    options = correction.CorrectionOptions(
+    options = outputs.CorrectionOptions(
         aperture,
         method,
         strength,
@@ -217,9 +200,59 @@ def correct(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
         )
     if profile is not None:
-        correction.run(photos, profile, output, options, shown, as_json=json_output)
+        _run(photos, profile, output, options, shown, as_json=json_output)
         return
     if lens != "auto":
         raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
     learning = folder.Learning(profiles, learn_from, estimator, selector)
     folder.run(photos, output, options, learning, shown, as_json=json_output)
+
+
+def _run(
+    names: Sequence[str],
+    source: Path,
+    output: str | None,
+    options: outputs.CorrectionOptions,
+    display: Display,
+    *,
+    as_json: bool,
+) -> None:
+    """Correct photos, one after the other."""
+    targets, twice = outputs.targets_of(files.photos(names), output, options.file_format)
+    with files.as_usage():
+        if options.method is not None:
+            deconvolvers.create(options.method)
+        settings = LensSettings(aperture=options.aperture)
+    lens = Lens(files.profile_at(source))
+    results = outputs.clashes(twice, display)
+    with display.progress() as bars:
+        task = bars.add_task("", total=len(targets))
+        for number, (target, path) in enumerate(targets.items()):
+            bars.update(task, description=path.name)
+            try:
+                result = outputs.correct_one(
+                    path,
+                    target,
+                    lens,
+                    settings,
+                    options,
+                    display,
+                    partial(outputs.show_share, bars, task, number),
+                    siblings=targets.values(),
+                )
+            except (LensModelError, OSError) as error:
+                result = files.failed(error)
+                display.error(f"{path}: {result['reason']}")
+            if result["state"] == "kept":
+                display.note(f"{target} is there already and was left alone; --force replaces it")
+            elif result["state"] == "corrected" and not as_json:
+                display.result(str(target))
+            if result["state"] == "corrected":
+                for line in outputs.remarks(result):
+                    display.note(f"{path.name}, {line}")
+            results.append({"photo": str(path), "output": str(target), **result})
+            bars.update(task, completed=number + 1)
+    if as_json:
+        display.document({"profile": str(source), "results": results})
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)

@@ -22,7 +22,7 @@ from rich.progress import Progress, TaskID
 
 from lensmodel import blind, patches
 from lensmodel import correction as corrections
-from lensmodel.cli import calibrate, correction, files
+from lensmodel.cli import calibrate, files, outputs
 from lensmodel.cli.console import Display, aligned, gain_words
 from lensmodel.core import processes
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
@@ -79,7 +79,7 @@ class GroupResult:
 def run(
     names: Sequence[str],
     output: str | None,
-    options: correction.CorrectionOptions,
+    options: outputs.CorrectionOptions,
     learning: Learning,
     display: Display,
     *,
@@ -87,7 +87,7 @@ def run(
 ) -> None:
     """Learn the lens of every group of photos and correct them all."""
     paths = files.photos(names)
-    targets, twice = correction.targets_of(paths, output, options.file_format)
+    targets, twice = outputs.targets_of(paths, output, options.file_format)
     with files.as_usage():
         blind.estimators.create(learning.estimator)
         patches.selectors.create(learning.selector)
@@ -97,7 +97,7 @@ def run(
     base = next(iter({**targets, **twice})).parent
     options = replace(options, least_gain_db=SEEN_DB)
     shots, failed = _read(list(targets.values()), display)
-    results = [*correction.clashes(twice, display), *failed]
+    results = [*outputs.clashes(twice, display), *failed]
     lens_groups = groups(shots)
     by_path = {path: target for target, path in targets.items()}
     with processes.pool(None, options.workers) as pool, display.progress() as bars:
@@ -132,7 +132,7 @@ class _Folder:
         self,
         output: Path,
         profiles: Path,
-        options: correction.CorrectionOptions,
+        options: outputs.CorrectionOptions,
         learning: Learning,
         display: Display,
         pool: Executor,
@@ -171,8 +171,10 @@ class _Folder:
         refused = [self._refused.get(shot.path) for shot in group.shots]
         if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
             reasons = set(map(str, refused))
-            why = reasons.pop() if len(reasons) == 1 else "no photo shows enough to learn its blur from"
-            self._display.note(f"{group.lens}, {group.focal}: {why}")
+            why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
+            self._display.note(
+                f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from{why}"
+            )
         self._learned[group.name, group.focal] = counted
 
     def _calibration(self, target: Path) -> calibrating.Calibration:
@@ -237,7 +239,7 @@ class _Folder:
             for shot in group.shots:
                 bars.update(task, description=f"2 of 2, correcting {shot.path.name}")
                 target = targets[shot.path]
-                share = partial(correction.show_share, bars, task, number)
+                share = partial(outputs.show_share, bars, task, number)
                 result = self._correct_shot(shot, group, target, lens, share)
                 states[result["state"]] += 1
                 left[result.get("reason", "")] += 1
@@ -280,7 +282,7 @@ class _Folder:
             return {"state": "left", "reason": known}
         settings = LensSettings(aperture=self._options.aperture)
         try:
-            result = correction.correct_one(
+            result = outputs.correct_one(
                 shot.path, target, lens, settings, self._options, self._display, on_step, group.paths
             )
         except (LensModelError, OSError) as error:
@@ -304,7 +306,7 @@ class _Folder:
         else:
             if not as_json:
                 self._display.detail(f"{target}: {gain_words(result['expected_gain_db'])} expected")
-            for line in correction.remarks(result):
+            for line in outputs.remarks(result):
                 self._display.detail(f"{path.name}, {line}")
 
 

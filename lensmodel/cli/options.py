@@ -58,9 +58,10 @@ def aperture_option(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` re
     return typer.Option("--aperture", "-a", metavar="N", parser=f_number, help=words)
 
 
-def rare(option: Any, panel: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
-    """Return an option that only --help-all shows, in a panel."""
-    changed = copy.copy(option)
+def rare(panel: str, *option: Any, **given: Any) -> Any:  # noqa: ANN401 - what `typer.Option` takes and returns
+    """Return an option that only --help-all shows, in a panel: a shared one, or one of its own."""
+    shared = option and not isinstance(option[0], str)
+    changed = copy.copy(option[0]) if shared else typer.Option(*option, **given)
     changed.hidden, changed.rich_help_panel = True, panel
     return changed
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -30,7 +28,7 @@ from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile
+from lensmodel.model import LensModel
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
@@ -38,7 +36,9 @@ from lensmodel.report import (
     compare,
     export,
     exporters,
+    filled_aspect,
     lens_report,
+    provenance,
     psf_grid,
     widest,
 )
@@ -47,12 +47,14 @@ from lensmodel.workflow.correcting import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
 Aspect = Annotated[
-    float, typer.Option(min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture.")
+    float | None,
+    typer.Option(
+        min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture; default: as its photos."
+    ),
 ]
 
 FORMS: Final = (".html", ".pdf", ".png", ".csv", ".json")
 COMPARED: Final = "comparison.pdf"
-_NAMED: Final = 8  # photos that the page names (chosen: two lines)
 
 
 def report(
@@ -68,7 +70,7 @@ def report(
         ),
     ] = None,
     aperture: Aperture = None,
-    aspect: Aspect = 1.5,
+    aspect: Aspect = None,
     against: Annotated[
         Path | None,
         typer.Option(
@@ -115,7 +117,7 @@ def report(
     if photo and output is None:
         raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
-    with shown.busy("asking the lens at 200 places"):
+    with shown.busy("computing its PSFs at 200 places"):
         found = measured(profile, aperture, aspect, photo or [], whole=output is not None)
     if output is not None:
         with shown.busy("drawing"):
@@ -133,7 +135,7 @@ def report(
 
 
 def measured(
-    profile: Path, aperture: float | None, aspect: float, photos: Sequence[Path], *, whole: bool
+    profile: Path, aperture: float | None, aspect: float | None, photos: Sequence[Path], *, whole: bool
 ) -> LensReport:
     """Report on the lens of a profile: whole, in all colours, or only what the screen shows."""
     known = files.profile_at(profile)
@@ -146,31 +148,17 @@ def measured(
             apertures=asked,
             lateral=[lateral_of(develop(path)) for path in photos],
             channels=("g", "r", "b") if whole else ("g",),
-            details=details_of(known),
+            details=provenance(
+                known.lens.get("serial"),
+                [camera_name(camera.maker, camera.model) for camera in known.cameras],
+                list(known.photos.values()),
+            ),
         )
 
 
 def name_of(lens: Mapping[str, str]) -> str:
     """What to call a lens: its label, or maker and model without saying the maker twice."""
     return lens.get("label") or full_name(lens.get("maker"), lens.get("model"))
-
-
-def details_of(known: LensProfile) -> dict[str, str]:
-    """What else stands on the page: copy, cameras, photos, the day, the program; and a caveat for JPEG."""
-    names = sorted(known.photos.values())
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    cameras = (camera_name(c.maker, c.model) for c in known.cameras)
-    jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in names)
-    details = {
-        "Serial number": str(known.lens.get("serial") or ""),
-        "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
-        "Photos": ", ".join(names[:_NAMED]) + more,
-        "Caution": f"{jpegs} of the photos are JPEG files: a camera's sharpening makes a lens look sharper"
-        if jpegs
-        else "",
-        "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
-    }
-    return {name: words for name, words in details.items() if words}
 
 
 def _targets(output: Path | None) -> tuple[Path, ...]:
@@ -227,7 +215,7 @@ def export_psfs(
     r: Annotated[float | None, RADIUS] = None,
     phi: Annotated[float | None, ANGLE] = None,
     size: Size = 31,
-    aspect: Aspect = 1.5,
+    aspect: Aspect = None,
     json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -252,7 +240,7 @@ def export_psfs(
         raise UsageError("--phi needs --r: together they name a single place")
     with files.as_usage():
         place = None if r is None else FieldPosition(r, phi or 0.0)
-    with shown.busy("asking the lens"):
+    with shown.busy("computing its PSFs"):
         model = files.profile_at(profile).model
         psfs = psf_grid(
             model,
@@ -260,7 +248,7 @@ def export_psfs(
             rows=rows,
             cols=cols,
             size=size,
-            aspect=aspect,
+            aspect=aspect or filled_aspect(model),
             at=place,
         )
     export(output, psfs, written)

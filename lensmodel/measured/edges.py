@@ -126,7 +126,7 @@ def chart_edges(photo: LinearPhoto) -> tuple[FoundEdge, ...]:
     edges = find_edges(photo.planes[1], noise=photo.noise[1], clip=photo.clip[1])
     if not edges:
         raise NotEnoughEvidenceError(
-            "no chart is seen; photograph dark squares on bright paper or a checkerboard, turned by 5 "
+            "no chart was found; photograph dark squares on bright paper or a checkerboard, turned by 5 "
             "degrees, evenly lit, with 64 pixels or more of flat ground beside each edge"
         )
     return edges

@@ -8,8 +8,10 @@ may be is what the model expects of the kernel at its place (`predicted_error`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
 from statistics import median
 from typing import Final, Literal, TypeAlias
 
@@ -38,6 +40,7 @@ from lensmodel.report.places import (
     corner_places,
     direction_in_words,
     grid,
+    half_sides,
     place_in_words,
     ring,
     side_places,
@@ -73,6 +76,8 @@ _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
 """MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and
 a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
 
+_ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
+_FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
 _ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
 _ZONE_WORDS: Final[dict[Zone, str]] = {
     "center": "in the centre",
@@ -80,6 +85,7 @@ _ZONE_WORDS: Final[dict[Zone, str]] = {
     "corner": "in the corners",
 }
 
+_NAMED: Final = 8  # photos that a report names (chosen: two lines)
 _WELL_KNOWN: Final = 0.1
 """Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)."""
 
@@ -270,8 +276,8 @@ class LensReport:
             return "The lens is well known by now; another photo would add little."
         at = f", at {tested.at}" if tested.at else ""
         return (
-            f"Next, a photo of something with fine detail at {least.place}{at}: its blur is expected to be "
-            f"wrong by {least.predicted_error:.0%}, more than elsewhere."
+            f"A photo with fine detail at {least.place}{at} would help most: the blur there is expected to "
+            f"be wrong by {least.predicted_error:.0%}, more than elsewhere."
         )
 
     @property
@@ -285,11 +291,28 @@ class LensReport:
         return (*lines, self.advice)
 
 
+def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
+    """Say on which copy and photos a report rests, when and by what it was written; a caveat for JPEG."""
+    names = sorted(photos)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in names)
+    details = {
+        "Serial number": serial or "",
+        "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
+        "Photos": ", ".join(names[:_NAMED]) + more,
+        "Caution": f"{jpegs} of the photos are JPEG files: a camera's sharpening makes a lens look sharper"
+        if jpegs
+        else "",
+        "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
+    }
+    return {name: words for name, words in details.items() if words}
+
+
 def lens_report(
     model: LensModel,
     name: str,
     *,
-    aspect: float = DEFAULT_ASPECT,
+    aspect: float | None = None,
     height_px: int | None = None,
     lateral: Sequence[LateralColour] = (),
     channels: Sequence[Channel] = ("g", "r", "b"),
@@ -306,8 +329,8 @@ def lens_report(
     model : LensModel
     name : str
         Of the lens.
-    aspect : float
-        Width over height of its photos.
+    aspect : float, optional
+        Width over height of its photos; by default that of common sensors which its samples fill best.
     height_px : int, optional
         Height of its photos in pixels; by default what the samples say.
     lateral : sequence of LateralColour
@@ -332,6 +355,7 @@ def lens_report(
     if not 3 <= size <= 255 or size % 2 == 0:
         raise InvalidInputError(f"size must be odd and lie in 3..255, got {size}")
     pitch = _shared(s.pixel_pitch_um for s in model.samples)
+    aspect = filled_aspect(model) if aspect is None else aspect
     cols = max(3, round(rows * aspect))
     numbers = list(apertures) if apertures is not None else _chosen(model)
     wanted = [LensSettings(aperture=n) for n in numbers] or [widest(model)]
@@ -510,6 +534,16 @@ def _best(tested: Sequence[ApertureReport]) -> float | None:
 def _shared(values: object) -> float | None:
     known = set(values)  # type: ignore[call-overload]
     return next(iter(known)) if len(known) == 1 else None
+
+
+def filled_aspect(model: LensModel) -> float:
+    """Aspect of common sensors whose sides the samples reach alike; 3:2 where they leave its sides free."""
+    reached = np.abs([s.position.xy for s in model.samples]).max(axis=0, initial=0.0)
+    shares = {aspect: reached / half_sides(aspect) for aspect in _ASPECTS}
+    inside = {
+        aspect: share for aspect, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED
+    }
+    return min(inside, key=lambda a: abs(float(np.diff(inside[a])[0])), default=DEFAULT_ASPECT)
 
 
 def _height(model: LensModel, aspect: float) -> int | None:

@@ -143,8 +143,6 @@ NOT_RUN = {
 
 QUICK = {
     "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
-    "psf my-24mm.lensprofile --r 0.9 --channel b --output corner.npy",
-    "check scan.tif scan-sharpened.tif --profile my-24mm.lensprofile --map faults.png",
     "export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json",
     "config --json",
     "doctor --deep --json",

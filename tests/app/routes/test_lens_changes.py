@@ -194,6 +194,10 @@ def test_a_report_comes_in_each_form(client: TestClient, reported: str, form: st
 
     assert answer.status_code == 200, answer.text
     assert answer.content.startswith(begins)
+    if form == "json":
+        details = answer.json()["details"]
+        assert details["Photos"].endswith(".dng")
+        assert details["Written"].startswith("20")
     assert client.get(address, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
     compared = client.get(address, params={"against": reported, "aperture": 1.4})
     assert compared.status_code == 200

@@ -17,12 +17,13 @@ from PIL import Image
 
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
-from lensmodel.report import LensReport, SensorGeometry, Side, compare, lens_report
+from lensmodel.report import LensReport, SensorGeometry, Side, compare, filled_aspect, lens_report
 from lensmodel.report.html import to_html
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
 from lensmodel.report.plots import charts, comparison_page, overview, pages, to_pdf, to_png
@@ -275,6 +276,23 @@ def test_lateral_colour_is_the_median_of_the_photos_that_show_it() -> None:
     assert found.lateral.red[-1] == pytest.approx(0.4)
     assert found.lateral.blue[-1] == 0.0
     assert charts(found, None)[-1].title == "Lateral colour"
+
+
+@pytest.mark.parametrize(("height", "width"), [(2000, 2000), (2128, 2832), (2848, 4272), (2160, 3840)])
+@pytest.mark.parametrize("margin", [40, 96])
+def test_the_shape_of_a_picture_is_that_which_its_samples_fill(height: int, width: int, margin: int) -> None:
+    frame = Frame(height, width)
+    rows = np.linspace(margin, height - 1 - margin, 6)
+    cols = np.linspace(margin, width - 1 - margin, 8)
+    filled = [
+        PsfSample(gaussian(5, np.eye(2)), frame.position(float(row), float(col)), LensSettings(), photo="a")
+        for row in rows
+        for col in cols
+    ]
+
+    assert filled_aspect(LensModel.fit(filled, QUICK)) == pytest.approx(width / height, rel=0.01)
+    middle = [sample for sample in filled if sample.position.r < 0.6]
+    assert filled_aspect(LensModel.fit(middle, QUICK)) == 1.5  # nothing tells
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1.5, 16 / 9, 2 / 3])

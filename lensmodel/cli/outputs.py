@@ -1,24 +1,21 @@
-"""`lensmodel correct`."""
+"""Corrected files: what they are called, and how one is made, whichever way the command goes."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import typer
 from rich.progress import Progress, TaskID
 
 import lensmodel
 from lensmodel import correction
 from lensmodel.api import FORMATS
-from lensmodel.cli import files
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
@@ -54,56 +51,6 @@ class CorrectionOptions:
     force: bool
     least_gain_db: float | None = None
     keep_location: bool = False
-
-
-def run(
-    names: Sequence[str],
-    source: Path,
-    output: str | None,
-    options: CorrectionOptions,
-    display: Display,
-    *,
-    as_json: bool,
-) -> None:
-    """Correct photos, one after the other."""
-    targets, twice = targets_of(files.photos(names), output, options.file_format)
-    with files.as_usage():
-        if options.method is not None:
-            correction.deconvolvers.create(options.method)
-        settings = LensSettings(aperture=options.aperture)
-    lens = Lens(files.profile_at(source))
-    results = clashes(twice, display)
-    with display.progress() as bars:
-        task = bars.add_task("", total=len(targets))
-        for number, (target, path) in enumerate(targets.items()):
-            bars.update(task, description=path.name)
-            try:
-                result = correct_one(
-                    path,
-                    target,
-                    lens,
-                    settings,
-                    options,
-                    display,
-                    partial(show_share, bars, task, number),
-                    siblings=targets.values(),
-                )
-            except (LensModelError, OSError) as error:
-                result = files.failed(error)
-                display.error(f"{path}: {result['reason']}")
-            if result["state"] == "kept":
-                display.note(f"{target} is there already and was left alone; --force replaces it")
-            elif result["state"] == "corrected" and not as_json:
-                display.result(str(target))
-            if result["state"] == "corrected":
-                for line in remarks(result):
-                    display.note(f"{path.name}, {line}")
-            results.append({"photo": str(path), "output": str(target), **result})
-            bars.update(task, completed=number + 1)
-    if as_json:
-        display.document({"profile": str(source), "results": results})
-    if any(result["state"] == "failed" for result in results):
-        raise typer.Exit(1)
 
 
 def targets_of(

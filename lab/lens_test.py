@@ -1,12 +1,12 @@
 """The lens test against the truth: T and S of a traced lens by its chart, and by its report from photos.
 
-    LENSMODEL_TEST_DATA=... python -m lab.lens_test GRID.npz [--photos 3]
+    LENSMODEL_TEST_DATA=... python -m lab.lens_test GRID.npz
 
 A chart of dark squares that lean is photographed through a lens whose kernels are known. Nothing of what is
 tested takes part in making it: squares are drawn by their exact areas in pixels, the pixel's own box is
-taken out again, and the truth is the transfer function of the lens's own kernel at each place. With
-`--photos` the lens is also learned from so many photos as `lab.blind_gain` takes them, and the zones of its
-report are printed beside the truth.
+taken out again, and the truth is the transfer function of the lens's own kernel at each place. The lens is
+also learned from three photos as `lab.blind_gain` takes them, and the figures
+of its report stand below those of the chart.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from lensmodel import calibrate
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.measured.edges import SlantedEdges
-from lensmodel.measured.measurer import MeasuredPsf
 from lensmodel.photo import develop
 from lensmodel.quality import tangential_sagittal_mtf50
 from lensmodel.report import lens_report
@@ -132,31 +131,57 @@ def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: 
     return float(frequencies[below[0]]) if below.size else 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """T and S at a place, MTF50 in cycles/pixel, and whether a report calls them a guess."""
+
+    place: FieldPosition
+    tangential: float
+    sagittal: float
+    guessed: bool = False
+
+
 def main() -> None:
-    """Photograph the chart through a traced lens, measure it, and print T and S beside the truth."""
+    """Print T and S of a traced lens by zone: by its chart, by photos, and as they are."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
         "grid", type=Path, help="of a traced lens, as `python -m lab.population grid` writes it"
     )
-    parser.add_argument("--photos", type=int, default=0, help="from which the lens is learned too")
+    parser.add_argument("--photos", type=int, default=3, help="from which the lens is learned too; 0: none")
+    parser.add_argument("--places", action="store_true", help="print each square of the chart")
     asked = parser.parse_args()
     lens = GridLens.read(asked.grid)
-    camera = SimulatedCamera(height=2000, width=3000, pitch_um=lens.grid.pitch_um)
-    scene, squares = squares_chart(camera.frame)
+    pitch_um = lens.grid.pitch_um
+    ways = {"chart": by_chart(lens, pitch_um)}
+    if asked.photos:
+        ways[f"{asked.photos} photos"] = by_photos(lens, asked.photos, pitch_um)
+    print(
+        f"{lens.model}, MTF50 in cycles/pixel: median of a zone, its truth, how far off half the places are"
+    )
+    for zone in ZONES:
+        for way, found in ways.items():
+            if own := [one for one in found if zone_of(one.place.r) == zone]:
+                print(f"{zone:7}{way:>9}  {_line(lens, own, pitch_um)}")
+    if asked.places:
+        for one in sorted(ways["chart"], key=lambda one: one.place.r):
+            where = f"r {one.place.r:.2f} phi {math.degrees(one.place.phi):4.0f}"
+            print(f"{where}: {_line(lens, [one], pitch_um)}")
+
+
+def by_chart(lens: GridLens, pitch_um: float) -> list[Sharpness]:
+    """Photograph the chart through the lens, and measure it."""
+    camera = SimulatedCamera(height=2000, width=3000, pitch_um=pitch_um)
+    scene, _ = squares_chart(camera.frame)
     shot = photograph(scene, lens, LensSettings(aperture=lens.widest()), camera, np.random.default_rng(0))
     with tempfile.TemporaryDirectory() as folder:
         write_photo(Path(folder) / "chart.dng", shot)
         photo = develop(Path(folder) / "chart.dng")
     psfs = SlantedEdges().measure([photo], size=31, channels=("g",))
-    print(f"{lens.model}: {len(psfs)} places of {len(squares)} squares")
-    print("\n".join(_table(lens, psfs, camera.pitch_um)))
-    if asked.photos:
-        print(f"\nreport from {asked.photos} photos:")
-        print("\n".join(_report_by_zone(lens, asked.photos, camera.pitch_um)))
+    return [Sharpness(p.position, *tangential_sagittal_mtf50(p.kernel, p.position.phi)) for p in psfs]
 
 
-def _report_by_zone(lens: GridLens, photos: int, pitch_um: float) -> list[str]:
-    """Learn the lens from photos; a line for each zone: median T and S of the report and of the truth."""
+def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:
+    """Learn the lens from photos, and read its report."""
     known = KnownLens("", lens, 2000, replace(CAMERA, pitch_um=pitch_um))
     with tempfile.TemporaryDirectory() as folder:
         shots = [Path(folder) / f"{number}.dng" for number in range(photos)]
@@ -164,40 +189,22 @@ def _report_by_zone(lens: GridLens, photos: int, pitch_um: float) -> list[str]:
             known.shot(number, path)
         model = calibrate(shots, aperture=known.settings.aperture).model
     found = lens_report(model, "", channels=("g",)).tested[0]
-    lines = []
-    for zone in ZONES:
-        at = [k for k, place in enumerate(found.positions) if zone_of(place.r) == zone]
-        said, true = [], []
-        for k in at:
-            place = found.positions[k]
-            said.append((min(found.tangential[k], 0.5), min(found.sagittal[k], 0.5)))
-            turns = (0.0, math.pi / 2)
-            true.append([min(true_mtf50(lens, place, place.phi + t, pitch_um), 0.5) for t in turns])
-        (t, s), (true_t, true_s) = np.median(said, axis=0), np.median(true, axis=0)
-        unknown = sum(found.unknown[k] for k in at) / len(at)
-        lines.append(
-            f"{zone}: T {t:.3f} truth {true_t:.3f} ({t / true_t - 1.0:+.0%}), "
-            f"S {s:.3f} truth {true_s:.3f} ({s / true_s - 1.0:+.0%}), hatched {unknown:.0%}"
-        )
-    return lines
+    rows = zip(found.positions, found.tangential, found.sagittal, found.unknown, strict=True)
+    return [Sharpness(*row) for row in rows]
 
 
-def _table(lens: CameraLens, psfs: Sequence[MeasuredPsf], pitch_um: float) -> list[str]:
-    """A line for each place, by radius, and how far from the truth half and nine in ten of them are."""
-    lines, errors = [], []
-    for psf in sorted(psfs, key=lambda psf: psf.position.r):
-        place = psf.position
-        seen = [min(value, 0.5) for value in tangential_sagittal_mtf50(psf.kernel, place.phi)]
-        true = [min(true_mtf50(lens, place, place.phi + turn, pitch_um), 0.5) for turn in (0.0, math.pi / 2)]
-        errors.append(np.abs(np.divide(seen, true) - 1.0))
-        lines.append(
-            f"r {place.r:.2f} phi {math.degrees(place.phi):4.0f}: "
-            f"T {seen[0]:.3f} truth {true[0]:.3f}, S {seen[1]:.3f} truth {true[1]:.3f}"
-        )
-    for share in (0.5, 0.9):
-        t, s = np.quantile(errors, share, axis=0)
-        lines.append(f"{share:.0%} of the places are within {t:.0%} (T) and {s:.0%} (S)")
-    return lines
+def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:
+    """Medians of T and S, those of the truth at the same places, and the median error of a place."""
+    words = []
+    for name, turn in (("T", 0.0), ("S", math.pi / 2)):
+        figures = [one.sagittal if turn else one.tangential for one in found]
+        true = [min(true_mtf50(lens, one.place, one.place.phi + turn, pitch_um), 0.5) for one in found]
+        seen = np.minimum(figures, 0.5)
+        median, truth = np.median(seen), np.median(true)
+        off = np.median(np.abs(seen / true - 1.0))
+        words.append(f"{name} {median:.3f} truth {truth:.3f} ({median / truth - 1.0:+.0%}, places {off:.0%})")
+    guessed = sum(one.guessed for one in found) / len(found)
+    return ", ".join([*words, *([f"hatched {guessed:.0%}"] if guessed else [])])
 
 
 if __name__ == "__main__":

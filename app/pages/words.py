@@ -153,7 +153,7 @@ def file_words(correction: CorrectionOut) -> str:
     name = FILES.get(correction.output["format"], correction.output["format"])
     if correction.output["format"] == "dng":
         return f"{name}: open it in your RAW developer, and leave its own sharpening off."
-    return f"{name}; it says in its metadata what was done, and with which lens."
+    return f"{name}. Its metadata say what was done, and with which lens."
 
 
 def waiting_words(groups: Sequence[WaitingGroup]) -> str:
@@ -227,8 +227,8 @@ def event_words(event: CalibrationOut) -> str:
 def model_words(lens: LensOut) -> str:
     """Say what the model of a lens is where it is not the usual one."""
     return {
-        "paper": 'Its model is "paper", the method of the paper that this program grew from, to compare '
-        "with: its kernels and its correction alone, without what guards photos from errors."
+        "paper": 'Its model is "paper", for comparison: the kernels and the correction of the paper that '
+        "this program follows, without the safeguards."
     }.get(lens.psf_model, "")
 
 

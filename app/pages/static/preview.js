@@ -5,8 +5,10 @@ import { ask, byId, send } from "./common.js";
 
 const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
 const PAUSE_MS = 250;
-const SOON = [800, 600]; // pixels of what is seen first: about a second of work
+const SOON = [448, 336]; // pixels of what is seen first: about a second of work, half of it the same for any size
 const WORKING = "Working out what a correction does here …";
+const SLOW = "Still working. The first preview after an installation takes a minute or two.";
+const SLOW_MS = 8000;
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
   const value = code / 255;
   return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
@@ -148,13 +150,16 @@ function middle({ x, y, width, height }) {
 
 // Wait for the end of a correction; its report.
 async function settled(id, signal, say) {
-  for (let tag = ""; ; ) {
+  const began = performance.now();
+  for (let [tag, state, error] = ["", "queued", null]; ; ) {
     const response = await fetch(`/v1/jobs/${id}?wait=20`, { signal, headers: tag ? { "If-None-Match": tag } : {} });
-    if (response.status === 304) continue;
-    tag = response.headers.get("ETag") ?? "";
-    const { state, error } = await response.json();
+    if (response.status !== 304) {
+      tag = response.headers.get("ETag") ?? "";
+      ({ state, error } = await response.json());
+    }
     if (state === "succeeded") return (await (await ask(`/v1/corrections/${id}`, { signal })).json()).report;
     if (!["queued", "running"].includes(state)) throw new Error(error?.detail ?? "the preview was stopped");
-    say(state === "queued" ? "Waiting for other work to finish …" : WORKING);
+    if (state === "queued") say("Waiting for other work to finish …");
+    else say(performance.now() - began > SLOW_MS ? SLOW : WORKING);
   }
 }

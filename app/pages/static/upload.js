@@ -1,4 +1,4 @@
-// Photos chosen or dropped are sent two at a time; those that were not taken are listed with the reason.
+// Photos chosen or dropped are sent two at a time; those that were not accepted are listed with the reason.
 
 import { byId, failure } from "./common.js";
 
@@ -70,7 +70,7 @@ export function setUpUpload() {
     show();
     if (!idle) return; // those that are sending go on with these
     await Promise.all(Array.from({ length: AT_ONCE }, work));
-    announce.textContent = `${done - turnedAway} of ${all} photos sent${turnedAway ? `, ${turnedAway} not taken` : ""}.`;
+    announce.textContent = `${done - turnedAway} of ${all} photos sent${turnedAway ? `, ${turnedAway} not accepted` : ""}.`;
   };
   input.addEventListener("change", () => {
     const files = [...input.files];

@@ -238,7 +238,7 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     page.evaluate(DROP, ["holiday.nef", base64.b64encode(b"not a photo" * 50).decode()])
     refusal = page.locator("#uploads li")
     expect(refusal.locator(".error")).to_contain_text("Not a photo file.")
-    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 not taken.")
+    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 not accepted.")
     refusal.get_by_role("button", name="Dismiss").click()
     expect(refusal).to_have_count(0)
 
@@ -248,13 +248,13 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
 
 def test_a_tester_begins_with_a_lens_without_photos(page: Page, service: Service) -> None:
     page.goto("/")
-    page.get_by_text("Add a lens by its profile").click()
+    page.get_by_text("Add a lens from a profile").click()
     page.get_by_role("button", name="Add", exact=True).click()
     expect(page.locator("#add-lens .alert")).to_have_text("Give a name, or choose a profile.")
     page.get_by_label("Name", exact=True).fill("Lens on the bench")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/lenses/*")
-    page.get_by_role("link", name="Measure it by a test photo").click()
+    page.get_by_role("link", name="Measure it with a test photo").click()
 
     expect(page.locator("h1")).to_contain_text("Lens on the bench")
     page.get_by_text("Send a test photo").click()
@@ -694,7 +694,7 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_role("button", name="Delete lens").click()
     page.get_by_role("button", name="Delete the lens").click()
     page.wait_for_url("**/")
-    page.get_by_text("Add a lens by its profile").click()
+    page.get_by_text("Add a lens from a profile").click()
     page.get_by_label("A file that ends in").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/lenses/*")

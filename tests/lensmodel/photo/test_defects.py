@@ -11,7 +11,9 @@ import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel import photo, simulate
+from lab.images import gains, to_srgb
+from lensmodel import calibrate, correct, photo, simulate
+from lensmodel.core.types import LensSettings, Zone
 from lensmodel.photo.defects import Neighbours, defects_of, suspects
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
@@ -166,6 +168,44 @@ def test_defects_of_xtrans_are_replaced_too(tmp_path: Path) -> None:
     assert 0.9 * 110 <= int(told.remarks[0].split()[0]) <= 110
     damage = np.sqrt(np.mean((told.planes - clean.planes) ** 2))
     assert damage < 0.3 * UNSEEN
+
+
+@pytest.mark.slow
+def test_defects_of_xtrans_cost_the_whole_chain_nothing(tmp_path: Path) -> None:
+    camera = simulate.SimulatedCamera(height=480, width=720, full_well_electrons=20_000.0)
+    lens = simulate.draw_lens(1001)
+    settings = LensSettings(aperture=lens.widest())
+    filters = colours_of(XTRANS, (480, 720)).astype(np.intp)[None]
+    balance = np.reshape(camera.white_balance, (3, 1, 1))
+    shots = [
+        simulate.photograph(simulate.demo_scene(scene)[:, 40:584, 100:884], lens, settings, camera, None)
+        for scene in ("city", "tea-gardens", "colosseum")
+    ]
+    truth = np.moveaxis(to_srgb(shots[-1].sharp * balance), 0, -1)
+    gained: dict[int, dict[Zone, float]] = {}
+    for count in (0, 16, 160):  # as none, 60 and 600 of 1.3 million
+        paths = []
+        for number, shot in enumerate(shots):
+            light = np.maximum(np.take_along_axis(shot.clean, filters, axis=0)[0], 0.0)
+            rng = np.random.default_rng(number)
+            light = light + np.sqrt(camera.noise.variance(light)) * rng.standard_normal(light.shape)
+            seen = np.clip(CAMERA.black + RANGE * light, 0, CAMERA.white).astype(np.uint16)
+            hot = np.random.default_rng(0).permutation(seen.size)[:count]
+            paths.append(write_xtrans(tmp_path / f"{count}-{number}.dng", defective(seen, hot)))
+        known = calibrate(paths[:2], aperture=settings.aperture, workers=1)
+        developed = photo.develop(paths[2], siblings=paths)
+        corrected = correct(developed, known, aperture=settings.aperture, workers=1)
+        before, after = (
+            np.moveaxis(to_srgb(planes * balance), 0, -1) for planes in (developed.planes, corrected.planes)
+        )
+        found = gains(before, after, truth)
+        assert found is not None
+        gained[count] = found.zones
+
+    for zone, clean in gained[0].items():
+        assert clean > 0.3
+        assert gained[16][zone] > clean - 0.1
+        assert gained[160][zone] > clean - 0.3
 
 
 @pytest.mark.parametrize("sigma_px", [0.5, 0.7, 1.0])

@@ -18,13 +18,22 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import compact, positive
 from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.devices import chosen
+from lensmodel.correction.limit_on_device import (
+    COLOURLESS,
+    EDGE_SHARE,
+    HUE_REACH,
+    LEVEL,
+    LINE_SHARE,
+    PURER,
+    REACH,
+    TINY,
+    held_on_device,
+)
 
 Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_REACH: Final = 2
-"""Radius in pixels of the window whose light bounds a pixel (chosen: within one pixel only the blur of a thin
-line is seen and not its surroundings; further away lies another object)."""
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
 )
@@ -45,24 +54,10 @@ _EDGE, _UNSURE = 0.06, 0.1
 which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
 _EXACT: Final = 0.02
 """Least error of a kernel that is reckoned with: none is known better over a whole tile (chosen)."""
-_LEVEL: Final = 0.1
-"""Share of the range within which pixels belong to the level beside an edge (chosen: far more than noise)."""
-_LINE_SHARE, _EDGE_SHARE = 0.12, 0.25
-"""Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
-is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
 _FREE: Final = 1e6  # stands for no bound where infinity would make differences undefined
 _DARKEST: Final = 0.5
 """Share of the darkest light nearby that remains where the kernel is unsure (chosen: one stop)."""
-_HUE_REACH: Final = 1
-"""Blocks of 2 x 2 pixels around that of a pixel whose colours it may have: as far as lateral colour moves
-them."""
-_PURER: Final = 0.03
-"""By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
-out get purer, and three times this shows in a light grey)."""
 _AXES: Final = 3  # differences of two colours' shares of the light: six half planes of a hull
-_COLOURLESS: Final = 0.05
-"""Share of the brightest light nearby that is added as grey: what is far darker shows no colour beside it
-(chosen)."""
 _SIGMAS: Final = 3.0
 """Standard deviations of the noise in the dark that are added as grey as well (chosen: below, noise decides
 which colour is the largest)."""
@@ -171,12 +166,19 @@ def limited(
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
     shares = (np.float32(hidden), np.float32(sure), np.float32(edge))
     most = np.empty(shape, dtype=np.float32)
-    _hold_light(photo, held, free, wide, shares, darkest, most)
-    _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6))
+    device = chosen()
+    if device is not None and number.size == 0:
+        colourless = _SIGMAS * dark + 1e-6
+        held = held_on_device(
+            device, photo, held, free, wide, (hidden, sure, edge), float(darkest), colourless
+        )
+    else:
+        _hold_light(photo, held, free, wide, shares, darkest, most)
+        _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6))
     if halo is not None and halo < _FREE:
         low, high = np.empty_like(photo), np.empty_like(photo)
         for c in range(len(photo)):
-            extremes(photo[c], photo[c], _REACH, low[c], high[c])
+            extremes(photo[c], photo[c], REACH, low[c], high[c])
         room = np.float32(halo) * (high - low)
         np.clip(held, low - room, high + room, out=held)
     return held
@@ -263,7 +265,7 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
     all_of_it = np.float32((2 * wide + 1) ** 2)
     for i in range(rows):
         for j in range(cols):
-            room = np.float32(_LEVEL) * (top[i, j] - bottom[i, j])
+            room = np.float32(LEVEL) * (top[i, j] - bottom[i, j])
             low[j], high[j] = bottom[i, j] + room, top[i, j] - room
         dark[:] = 0
         bright[:] = 0
@@ -274,8 +276,8 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
                     dark[j] += np.int32(value <= low[j])
                     bright[j] += np.int32(value >= high[j])
         scale, start = (
-            np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it,
-            np.float32(_LINE_SHARE) * all_of_it,
+            np.float32(1.0 / (EDGE_SHARE - LINE_SHARE)) / all_of_it,
+            np.float32(LINE_SHARE) * all_of_it,
         )
         for j in range(cols):
             below[i, j] = min(max((np.float32(dark[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
@@ -298,7 +300,7 @@ def _hold_light(
     """
     rows, cols = most.shape
     zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
-    tiny = np.float32(1e-5)
+    tiny = np.float32(TINY)
     hidden, sure, edge = shares
     floor = np.sqrt(darkest)
     light, seen = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
@@ -307,7 +309,7 @@ def _hold_light(
             light[i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
             seen[i, j] = np.sqrt(max(light[i, j], zero))
     least = np.empty((rows, cols), np.float32)
-    extremes(seen, seen, _REACH, least, most)
+    extremes(seen, seen, REACH, least, most)
     blocks = ((rows + 1) // 2, (cols + 1) // 2)
     bottoms, tops = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
     belows, aboves = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
@@ -423,7 +425,7 @@ def _hues(y: Real, floors: Real, number: Real, lows: Real, highs: Real) -> None:
                 if number.size == 0 or number[i, j] <= np.float32(1.0):
                     low[j // 2], high[j // 2] = min(low[j // 2], line[j]), max(high[j // 2], line[j])
     for k in range(_AXES):
-        extremes(least[k], most[k], _HUE_REACH, lows[k], highs[k])
+        extremes(least[k], most[k], HUE_REACH, lows[k], highs[k])
 
 
 @jit
@@ -433,7 +435,7 @@ def _hold_colour(y: Real, x: Real, most: Real, number: Real, clip: Real, dark: N
     `most` is the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
-    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(_PURER)
+    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(PURER)
     tiny, third = np.float32(1e-6), np.float32(1.0 / 3.0)
     lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
     blocks = ((rows + 1) // 2, (cols + 1) // 2)
@@ -441,7 +443,7 @@ def _hold_colour(y: Real, x: Real, most: Real, number: Real, clip: Real, dark: N
     extremes(most, most, 1, unused, floors)
     for i in range(rows):
         for j in range(cols):
-            floors[i, j] = max(dark, np.float32(3.0 * _COLOURLESS) * floors[i, j] * floors[i, j])
+            floors[i, j] = max(dark, np.float32(3.0 * COLOURLESS) * floors[i, j] * floors[i, j])
     lows, highs = np.empty((_AXES, *blocks), np.float32), np.empty((_AXES, *blocks), np.float32)
     _hues(y, floors, number, lows, highs)
     own, here = np.empty((3, cols), np.float32), np.empty((_AXES, cols), np.float32)

@@ -18,6 +18,8 @@ from lensmodel.correction.compiled.grain import spread_grain
 from lensmodel.correction.compiled.half_quadratic import half_quadratic
 from lensmodel.correction.compiled.tile import fill
 from lensmodel.correction.deconvolver import Restored, Sensor, Solution, uniform
+from lensmodel.correction.devices import chosen
+from lensmodel.correction.methods.half_quadratic_on_device import half_quadratic_on_device
 from lensmodel.correction.methods.shrinkage import Shrinkage
 from lensmodel.correction.methods.wiener import prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
@@ -161,7 +163,7 @@ class SparseGradient:
         light: NDArray[np.float32],
         canvas: Canvas,
         glow: Planes | None,
-    ) -> _SparseProblem:
+    ) -> SparseProblem:
         blocks = BlockMeans.of(blurred, light)
         recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light)
         var = np.stack(
@@ -207,7 +209,7 @@ class SparseGradient:
             at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
             return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
 
-        return _SparseProblem(
+        return SparseProblem(
             y=y,
             variance=variance,
             known=known,
@@ -246,7 +248,7 @@ black would be smoothed away; with more, shadows keep noise that lighter places 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SparseProblem:
+class SparseProblem:
     """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
 
     y: Planes
@@ -305,8 +307,11 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _solved(p: _SparseProblem) -> tuple[Planes, Planes]:
+def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
     """The planes on the canvas, and what they do not explain of the data."""
+    device = chosen()
+    if device is not None:
+        return half_quadratic_on_device(device, p)
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
     x, left = np.empty_like(p.y), np.empty_like(p.y)
     half_quadratic(

@@ -22,9 +22,7 @@ from lensmodel.patches import Patch, select
 from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 
 Half: TypeAlias = Literal["dev", "test", "all"]
-Choice: TypeAlias = Literal["r-map", "good-regions"]
 HALVES: Final = ("dev", "test", "all")
-CHOICES: Final = ("r-map", "good-regions")
 
 DATA: Final = Path(__file__).parent / "data"
 WHITE: Final = 0.9
@@ -42,8 +40,6 @@ class BlindCase:
     noise: float  # standard deviation as a share of full range
     patch: int  # side of a window in pixels
     seed: int  # for the noise
-    # selector of `lensmodel.patches`, which sees the blurred and noisy photograph only
-    choice: Choice = "r-map"
     # which window of the photograph: 0 is the best one that the selector finds, 1 the next beside it
     window: int = 0
 
@@ -122,7 +118,6 @@ def make_cases(
     patch: int,
     seed: int,
     limit: int | None,
-    choice: Choice = "r-map",
     scenes: int | None = None,
 ) -> tuple[BlindCase, ...]:
     """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
@@ -141,7 +136,7 @@ def make_cases(
     order = np.random.default_rng(seed).permutation(len(pairs))
     chosen = order if limit is None else _spread(pairs, order, limit)
     return tuple(
-        BlindCase(own[i % len(own)], n, noise, patch, seed, choice, window=i // len(own))
+        BlindCase(own[i % len(own)], n, noise, patch, seed, window=i // len(own))
         for i, n in (pairs[int(at)] for at in np.sort(chosen))
     )
 
@@ -185,7 +180,7 @@ def observe(case: BlindCase, kernel: Kernel) -> Observation:
     plane = (blurred + rng.normal(0.0, case.noise, blurred.shape)).astype(np.float32)
     noise, (height, width) = NoiseModel.white(case.noise), plane.shape
     try:
-        found = select(plane, noise, Frame(height, width), size=size, selector=case.choice)
+        found = select(plane, noise, Frame(height, width), size=size)
     except NoUsablePatchesError:
         row, col = (height - size) // 2, (width - size) // 2
     else:

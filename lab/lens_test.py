@@ -59,26 +59,10 @@ def squares_chart(
     dark: float = 0.12,
     bright: float = 0.7,
 ) -> tuple[Planes, tuple[Square, ...]]:
-    """Draw rows x cols dark squares on bright paper, the whole page turned by `lean_deg`.
+    """Draw rows x cols dark squares on bright paper, the whole page turned by `lean_deg` counter-clockwise.
 
-    Parameters
-    ----------
-    frame : Frame
-    rows, cols : int
-    lean_deg : float
-        Counter-clockwise.
-    fill : float
-        Side of a square over the distance of two.
-    dark, bright : float
-        Linear light.
-
-    Returns
-    -------
-    scene : Planes, shape (3, H + 2 MARGIN, W + 2 MARGIN)
-        Its spectrum is that of an ideal chart as far as pixels can show it: the box of the pixels in which
-        areas were counted is divided out.
-    squares : tuple of Square
-        In coordinates of the frame.
+    `fill` is the side of a square over the distance of two. The spectrum of the scene is that of an ideal
+    chart as far as pixels can show it: the box of the pixels in which areas were counted is divided out.
     """
     spacing = min(frame.height / rows, frame.width / cols) * 0.97
     half = fill * spacing / 2.0

@@ -42,13 +42,7 @@ class Judged:
 
 
 def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
-    """Measure the stars of a photo, learn its lens from it blindly, and compare cell by cell.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If it shows too few stars, or too little to learn from.
-    """
+    """Measure the stars of a photo, learn its lens from it blindly, and compare cell by cell."""
     stars = Points().measure([develop(path)], size=SIZE, channels=("g",))
     samples = sampling.samples_of_photo(path, sampling.Config(settings), workers=1)
     model, green = LensModel.fit(samples), settings.with_channel("g")

@@ -57,15 +57,7 @@ class Peer:
         write_raw(np.moveaxis(numbers, -1, 0), path)
 
     def run(self, source: Path, folder: Path, setting: float) -> tuple[Path, float]:
-        """Run the program on a file.
-
-        Returns
-        -------
-        Path
-            Its picture.
-        float
-            CPU seconds of the process, files included.
-        """
+        """Run the program on a file; return its picture, and the CPU seconds of the process."""
         if not self.installed:
             raise InvalidInputError(f"{self.program} is not installed; install it to compare with it")
         target = folder / f"{self.program}-out.tif"

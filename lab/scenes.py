@@ -321,18 +321,11 @@ def dead_leaves(
     largest: float = 150.0,
     oversampling: int = 3,
 ) -> Planes:
-    """Discs that cover one another, radii with density ~ r^-3: natural statistics, sharp edges.
+    """Discs that cover one another, radii with density ~ r^-3: natural statistics, sharp edges, 0.02..0.95.
 
-    Area-sampled: drawn `oversampling` times larger, then averaged over the pixels.
-
-    Returns
-    -------
-    Planes, shape (3, height, width), values 0.02..0.95
-
-    References
-    ----------
-    .. [1] A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", International
-       Journal of Computer Vision 41, 2001.
+    Area-sampled: drawn `oversampling` times larger, then averaged over the pixels. Source: A. B. Lee, D.
+    Mumford, J. Huang, "Occlusion models for natural images", International Journal of Computer Vision 41,
+    2001.
     """
     if not 0.0 < smallest < largest or oversampling < 1:
         raise InvalidInputError(f"radii must satisfy 0 < smallest < largest, got {smallest}, {largest}")

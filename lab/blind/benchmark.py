@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from lab.blind.judges import Judge, judges, squared_error
 from lab.blind.methods import BlindMethod, compared
-from lab.cases import CHOICES, HALVES, BlindCase, Choice, Half, list_photos, load_psfs, make_cases, observe
+from lab.cases import HALVES, BlindCase, Half, list_photos, load_psfs, make_cases, observe
 from lab.page import table
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
@@ -60,15 +60,11 @@ class BlindBenchmark:
     kernel_size: int = 31
     judge: str = "hyper-laplacian"  # non-blind deconvolution: "hyper-laplacian" or "epll"
     seed: int = 0  # for noise and the choice of cases
-    selection: Choice = "r-map"  # selector that chooses the windows in the blurred photograph
     scenes: int | None = None  # so many windows of the photographs in turn; None means one of each
 
     def __post_init__(self) -> None:
         checks = {
             f"half must be one of {', '.join(HALVES)}, got {self.half!r}": self.half in HALVES,
-            f"selection must be one of {', '.join(CHOICES)}, got {self.selection!r}": (
-                self.selection in CHOICES
-            ),
             f"patch must be a multiple of 4 of at least 128, got {self.patch}": self.patch >= 128
             and self.patch % 4 == 0,
             f"kernel size must be odd and at least 5, got {self.kernel_size}": self.kernel_size >= 5
@@ -226,7 +222,7 @@ class ResultStore:
             (case.psf_number, case.noise, case.patch, "gaussian", case.seed),
             (name, getattr(method, "version", 0), described, self._settings.kernel_size),
             repr(self._judge),
-            case.choice,
+            "r-map",  # of the windows: part of the keys of stored cases
             *((case.window,) if case.window else ()),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
@@ -268,7 +264,6 @@ def run_blind_benchmark(
             patch=settings.patch,
             seed=settings.seed,
             limit=settings.cases,
-            choice=settings.selection,
             scenes=settings.scenes,
         )
     ]

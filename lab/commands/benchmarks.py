@@ -68,7 +68,6 @@ def blind(
     ] = None,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
-    selection: Annotated[str, typer.Option(help="Who chooses the patches: r-map or good-regions.")] = "r-map",
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
@@ -115,7 +114,6 @@ def blind(
             patch=patch,
             judge=judge,
             seed=seed,
-            selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
             scenes=scenes,
         )
     with as_usage(), shown.progress() as bars:

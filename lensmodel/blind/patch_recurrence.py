@@ -132,13 +132,8 @@ def _matches(
 def blend(y: Image, kernel: NDArray[np.float64], z: Image, beta: float) -> tuple[Image, Image]:
     """Image step: x = argmin |y - k * x|² + beta |x - z|², by Fourier on a mirrored frame.
 
-    X = (conj(K) Y + beta Z) / (|K|² + beta)
-
-    Returns
-    -------
-    x : ndarray, shape (H, W)
-    filter : ndarray, shape (n, n)
-        Impulse response of conj(K) / (|K|² + beta), by which the noise of y enters x; origin at [0, 0].
+    X = (conj(K) Y + beta Z) / (|K|² + beta); also the impulse response of conj(K) / (|K|² + beta), by which
+    the noise of y enters x, origin at [0, 0].
     """
     pad = kernel.shape[0]
     rows, cols = (int(fft.next_fast_len(n + 2 * pad, real=True)) for n in y.shape)
@@ -159,19 +154,10 @@ def window_products(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sums of products of windows of x with one another and with y, means taken off.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n + side - 1, m + side - 1)
-        About zero mean: sums are of single precision.
-    y : ndarray, shape (n, m)
-    side : int
+    With offsets a and b in reading order; x should be about zero mean, sums are of single precision::
 
-    Returns
-    -------
-    gram : ndarray, shape (side², side²)
-        sum_p (x(p + a) - mean)(x(p + b) - mean), offsets a and b in reading order.
-    cross : ndarray, shape (side²,)
-        sum_p (x(p + a) - mean)(y(p) - mean).
+        gram(a, b) = sum_p (x(p + a) - mean)(x(p + b) - mean)
+        cross(a)   = sum_p (x(p + a) - mean)(y(p) - mean)
     """
     n, m = y.shape
     values = x.astype(np.float32)
@@ -336,28 +322,12 @@ Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], float]
 def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]) -> Part:
     """Normal equations of y = k * x over the interior, the noise that x took from y taken off.
 
-    With h the filter by which y entered x, s the noise of y and N interior pixels::
+    With h the filter by which y entered x (origin at [0, 0]), s the noise of y and N interior pixels::
 
         A(u, v) = sum_p x(p - u) x(p - v) - N s² sum_i h(i) h(i + u - v)
         b(u)    = sum_p y(p) x(p - u)     - N s² h(-u)
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (H, W)
-        Latent and observed, zero mean.
-    side : int
-        Odd side of the kernel.
-    noise : float
-        s.
-    response : ndarray, shape (n, n)
-        h, origin at [0, 0], n at least 2 side.
-
-    Returns
-    -------
-    A : ndarray, shape (side², side²)
-    b : ndarray, shape (side²,)
-    taken : float
-        The largest eigenvalue of what was taken off A is no larger: N s² max |H|², as of a circulant matrix.
+    Returns A, b, and N s² max |H|², which the largest eigenvalue of what was taken off A does not exceed.
     """
     half = side // 2
     margin = _BORDER

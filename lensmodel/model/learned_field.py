@@ -103,13 +103,7 @@ class Patches:
 
 
 class LearnedField:
-    """Encoded patches, ready to be attended to: a value, which `added` keeps.
-
-    Parameters
-    ----------
-    network : FieldNetwork
-    patches : Patches
-    """
+    """Encoded patches, ready to be attended to: a value, which `added` keeps."""
 
     def __init__(self, network: FieldNetwork, patches: Patches) -> None:
         self.network, self.patches = network, patches

@@ -76,20 +76,9 @@ def sums(
 ) -> None:
     """Add weighted sums of splines, read through affine maps, to `out` (answers, size, size).
 
-    Parameters
-    ----------
-    rows : ndarray, shape (n, side^2)
-        Coefficients of all samples.
-    radii : ndarray, shape (n,)
-        From `splines.light_radius`.
-    chosen, weights : ndarray, shape (m,)
-        Samples that are read, one answer after the other; weights include the determinants of the maps.
-    maps : ndarray, shape (m, 2, 2)
-        From (row, col) offsets of the answer in pixels to those of the sample in steps of its grid.
-    starts : ndarray of int, shape (answers + 1,)
-        Where each answer begins among the m.
-    shifts : ndarray, shape (answers, 2)
-        Pixels by which each answer is moved.
+    `chosen` (m,) are the samples that are read, one answer after the other from `starts` on, with their
+    `weights`, which include the determinants of the `maps` (m, 2, 2), from (row, col) offsets of the answer
+    in pixels to those of the sample in steps of its grid; each answer is moved by its `shifts` in pixels.
     """
     side, size = round(math.sqrt(rows.shape[1])), out.shape[1]
     half, middle = side // 2, size // 2

@@ -133,18 +133,10 @@ def _model() -> TreeEnsemble:
 class GoodRegionsSelector:
     """Predicts from the window's features how similar an estimated kernel will be to the truth.
 
-    With S the normalised cross-correlation of an estimated and the true kernel at the best shift
-    (the kernel similarity of [1]_), the ensemble predicts ln(1 - S); the score is S.
-
-    Notes
-    -----
-    In the spirit of Hu and Yang, with differences: windows instead of pixels under a conditional
-    random field, lens blur instead of camera shake, boosted trees on the statistics that the
-    r-map selector also uses.
-
-    References
-    ----------
-    .. [1] Z. Hu and M.-H. Yang, "Good regions to deblur", ECCV 2012.
+    With S the normalised cross-correlation of an estimated and the true kernel at the best shift, the
+    ensemble predicts ln(1 - S); the score is S. In the spirit of Z. Hu and M.-H. Yang, "Good regions to
+    deblur", ECCV 2012, with differences: windows instead of pixels under a conditional random field, lens
+    blur instead of camera shake, boosted trees on the statistics that the r-map selector also uses.
     """
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:

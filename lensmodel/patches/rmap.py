@@ -52,37 +52,19 @@ def r_of_gradients(along_rows: Plane, along_cols: Plane, size: Plane, window: in
 
 
 def r_map(plane: Plane, window: int = FLAT_WINDOW) -> Plane:
-    """Map how useful the edges around each pixel are for kernel estimation.
+    """Map how useful the edges around each pixel are for kernel estimation, 0..1.
 
     With N_h(x) the `window` x `window` neighbourhood of x::
 
         r(x) = | sum_N grad B | / ( sum_N |grad B| + 0.5 (h/25)^2 )
 
-    The numerator is the modulus of a vector sum: the two flanks of a bar narrower than the
-    blur cancel, so that r is small on fine texture, which misleads estimation from edges, and
-    large at long isolated steps. The constant holds down flat regions.
+    The numerator is the modulus of a vector sum: the two flanks of a bar narrower than the blur cancel, so
+    that r is small on fine texture, which misleads estimation from edges, and large at long isolated steps.
+    The constant holds down flat regions.
 
-    Parameters
-    ----------
-    plane : Plane, shape (H, W)
-        Linear light, 0..1.
-    window : int
-        Odd side h in pixels, about the kernel size.
-
-    Returns
-    -------
-    Plane, shape (H, W)
-        Values in 0..1.
-
-    Notes
-    -----
-    Two departures: the plane is smoothed by a Gaussian of 1 px first, and the constant scales
-    with the window's area, because the sums do.
-
-    References
-    ----------
-    .. [1] L. Xu and J. Jia, "Two-phase kernel estimation for robust motion deblurring",
-       ECCV 2010, eq. (2).
+    Source: L. Xu and J. Jia, "Two-phase kernel estimation for robust motion deblurring", ECCV 2010, eq. (2),
+    with two departures: the plane is smoothed by a Gaussian of 1 px first, and the constant scales with the
+    window's area, because the sums do.
     """
     if window < 3 or window % 2 == 0:
         raise InvalidInputError(f"the window of the r-map must be odd and at least 3, got {window}")

@@ -127,48 +127,11 @@ def select(
     coarse_noise: NoiseModel | None = None,
     on_step: StepHook = ignore_step,
 ) -> Selection:
-    """Choose patches that tell about the PSF, spread over the field.
+    """Choose at most `count` patches of a plane that tell about the PSF, spread over the field.
 
-    Parameters
-    ----------
-    plane : Plane, shape (H, W)
-        One colour plane of linear light; may be memory-mapped, it is read in strips.
-    noise : NoiseModel
-        Of that plane.
-    frame : Frame
-        The sensor frame; the plane covers all of it.
-    clip : float
-        Level at which the plane saturates.
-    count : int
-        How many patches at most.
-    size : int
-        Side in pixels; rounded down to a multiple of 4, and smaller where the frame's shorter
-        side is less than four patches.
-    selector : str or Selector
-        Name in `selectors`, or an object of one's own.
-    jpeg : bool
-        Whether the photo was a JPEG file; scores are then scaled by 0.3.
-    coarse_noise : NoiseModel, optional
-        Noise power of that plane between 0.1 and 0.4 cycles/pixel, where it is more than `noise`, as
-        that of demosaiced and denoised pixels is. A patch must stand above it.
-    on_step : StepHook
-        Progress.
-
-    Returns
-    -------
-    Selection
-        The same for the same input, always.
-
-    Raises
-    ------
-    NoUsablePatchesError
-        If no window is usable; the text names the commonest reason and a remedy.
-    InvalidInputError
-        If the plane does not cover the frame, or `count` or `size` is out of range.
-
-    Notes
-    -----
-    About 0.3 s a megapixel and 250 MB whatever the size of the plane.
+    They are of `size` pixels a side, rounded down to a multiple of 4, and smaller where the shorter side of
+    the frame is less than four of them. `coarse_noise` is the noise between 0.1 and 0.4 cycles/pixel where
+    it is more than `noise`, as that of demosaiced and denoised pixels is: a patch must stand above it.
     """
     if plane.shape != (frame.height, frame.width):
         raise InvalidInputError(f"the plane is {plane.shape}, the frame {frame.height} x {frame.width}")

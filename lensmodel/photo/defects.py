@@ -66,12 +66,7 @@ class Suspects:
 class Neighbours:
     """Which pixels of a mosaic are the nearest of the same colour, and which touch.
 
-    Parameters
-    ----------
-    colours : ndarray of uint8, shape (height, width)
-        0 red, 1 and 3 green, 2 blue.
-    period : int
-        Pixels after which they repeat: 2 or 6.
+    `colours` are 0 red, 1 and 3 green, 2 blue, and repeat after `period` pixels, 2 or 6.
     """
 
     def __init__(self, colours: NDArray[np.uint8], period: int) -> None:

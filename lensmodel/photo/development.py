@@ -52,24 +52,7 @@ _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
 
 
 def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
-    """Read kind, size and metadata from the header, and refuse what cannot be developed.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file; its name does not matter, its content decides.
-    limits : Limits, optional
-        How large it may be.
-
-    Raises
-    ------
-    NotAnImageError, UnsupportedFormatError
-        If it is no photo, or none that we read.
-    TruncatedImageError, RawDecodeError
-        If the header already shows that it ends early or is damaged.
-    ImageTooLargeError, DecompressionBombError
-        If it is larger than the limits allow, or claims to be out of all proportion.
-    """
+    """Read kind, size and metadata from the header, and refuse what cannot be developed."""
     path, limits = Path(path), limits or Limits()
     with opened_header(path, limits) as header:
         if header.kind not in {"raw", "dng"}:

@@ -40,39 +40,17 @@ _HIGH_PASS: Final = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
 def estimate_noise(
     plane: Plane, clip: float = 1.0, step: float = 0.0, codes: NDArray[np.floating] | None = None
 ) -> NoiseModel:
-    """Fit var(y) = shot * y + read to the flat places of a plane.
+    """Fit var(y) = shot * y + read to the flat places of a plane of linear light whose noise is white.
 
-    Blocks are sorted by level; of each level the blocks with the least texture count. Texture
-    is judged on the low-passed plane and noise on the high-passed one, so that the choice does
-    not favour blocks whose noise happens to be small. The variance of a level is a robust one of
-    all its high-passed pixels together, and no less than what rounding to the file's numbers makes.
+    Blocks are sorted by level; of each level the blocks with the least texture count, those near `clip` or
+    black not. Texture is judged on the low-passed plane and noise on the high-passed one, so that the choice
+    does not favour blocks whose noise happens to be small. The variance of a level is a robust one of all
+    its high-passed pixels together, and no less than what rounding makes: by the smallest step between the
+    file's numbers near black, or by the light of each of its `codes`, where they are as few as those of 8
+    bits.
 
-    Parameters
-    ----------
-    plane : ndarray of float32, shape (height, width)
-        Linear light.
-    clip : float
-        Level of saturation; blocks that come near it, or touch black, do not count.
-    step : float
-        Smallest step between the file's numbers near black, in linear light. Rounding alone
-        makes a variance of step^2 / 12, and no less is reported.
-    codes : ndarray, optional
-        Linear light of each of the file's numbers, ascending, where they are so few that their steps
-        are of the noise's size: those of 8 bits.
-
-    Returns
-    -------
-    NoiseModel
-        Both terms not negative; only the rounding where nothing else can be measured.
-
-    Notes
-    -----
-    The noise must be white. That of a demosaiced or scaled plane is not: see `develop`.
-
-    References
-    ----------
-    A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise
-    modeling and fitting for single-image raw-data", IEEE TIP 17, 2008.
+    Source: A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise modeling
+    and fitting for single-image raw-data", IEEE TIP 17, 2008.
     """
     levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip)
     if codes is not None and len(levels):

@@ -337,17 +337,5 @@ def upright(pixels: Pixels, orientation: int) -> Pixels:
 
 
 def shown(planes: Planes, encoding: Encoding) -> NDArray[np.uint8]:
-    """Encode planes for a screen: 8-bit sRGB `(row, col, 3)`, white-balanced, in sensor orientation.
-
-    Parameters
-    ----------
-    planes : Planes, shape (3, H, W), float32
-        Linear light in sensor colours.
-    encoding : Encoding
-        White balance and colour matrix of the photo.
-
-    Returns
-    -------
-    ndarray of uint8, shape (H, W, 3)
-    """
+    """Encode planes for a screen: 8-bit sRGB `(row, col, 3)`, white-balanced, in sensor orientation."""
     return np.asarray(_encoded(planes, _target(encoding, "srgb"), 255), dtype=np.uint8)

@@ -85,18 +85,8 @@ def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float
 def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     """Measure one slanted edge, near-vertical or near-horizontal, either side bright.
 
-    Parameters
-    ----------
-    plane : ndarray, shape (H, W)
-        Linear light; one straight edge and flat ground on both sides. 80 x 60 pixels or more are
-        recommended; the edge should lean 2 to 10 degrees, or more as long as it stays clear of 45.
-
-    Raises
-    ------
-    InvalidInputError
-        If the crop is too small, not finite, or not two-dimensional.
-    NotEnoughEvidenceError
-        If no edge stands out of the noise, or it leans so little that the profile has holes.
+    80 x 60 pixels or more are recommended; the edge should lean 2 to 10 degrees, or more as long as it stays
+    clear of 45.
     """
     crop = np.asarray(plane, dtype=np.float64)
     if crop.ndim != 2 or min(crop.shape) < _MIN_SIDE or not np.isfinite(crop).all():

@@ -94,20 +94,9 @@ def find_edges(
 ) -> tuple[FoundEdge, ...]:
     """Find straight slanted edges with flat ground on both sides, as charts have them.
 
-    Parameters
-    ----------
-    plane : ndarray, shape (H, W)
-        Linear light, finite; may be memory-mapped. It is read once, a strip at a time.
-    noise : NoiseModel
-        Of the plane: so much the grounds may scatter.
-    clip : float
-        From this level on light is not measured.
-
-    Returns
-    -------
-    tuple of FoundEdge
-        Each edge once, by the largest box in its middle that holds nothing else. None where there are fewer
-        than four, or none across the others: such a photo shows no chart.
+    Each is given once, by the largest box in its middle that holds nothing else; none where there are fewer
+    than four, or none across the others: such a photo shows no chart. The plane may be memory-mapped, it is
+    read once, a strip at a time.
     """
     if min(plane.shape) < SIDES[-1]:
         return ()

@@ -159,26 +159,11 @@ class PhotoVerdict:
 
 
 class Calibration:
-    """A lens that learns from one photo after the other.
+    """A lens that learns from one photo after the other, kept in a store.
 
-    Parameters
-    ----------
-    store : LensStore
-        Keeps the lens after each photo.
-    config : Config
-        How each is estimated.
-    begin : ModelSettings, optional
-        Choices of the regression of a new lens; a known one keeps its own.
-    any_lens : bool
-        Take photos that seem to be of another lens as well.
-    pool : Executor, optional
-        Estimates the cells of all photos, where they are estimated here; without one each photo starts and
-        ends processes of its own.
-
-    Raises
-    ------
-    UnknownMethodError, InvalidInputError
-        If the config asks for what there is not.
+    `begin` are the choices of the regression of a new lens; a known one keeps its own. `pool` estimates the
+    cells of all photos, where they are estimated here; without one each photo starts and ends processes of
+    its own.
     """
 
     def __init__(

@@ -77,10 +77,8 @@ class LocationTraces:
 def find_location(buffer: Buffer) -> LocationTraces:
     """Find what a photo file says of the place where it was taken.
 
-    Notes
-    -----
-    One pass over the file for each of three words, at the speed of memory. Not found: names of places in
-    IPTC blocks and maker notes, and anything inside compressed blocks other than those of PNG.
+    Not found: names of places in IPTC blocks and maker notes, and anything inside compressed blocks other
+    than those of PNG.
     """
     spans: list[Overwrite] = []
     complete = True

@@ -314,8 +314,6 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
         BlindBenchmark(kernel_size=30)
     with pytest.raises(InvalidInputError, match="noise"):
         BlindBenchmark(noise=(0.0,))
-    with pytest.raises(InvalidInputError, match="selection"):
-        BlindBenchmark(selection="best")
     with pytest.raises(UnknownMethodError, match="fake"):
         run_blind_benchmark(BlindBenchmark(methods=("best",)), methods=registry(fake=Fake()))
     with pytest.raises(InvalidInputError, match="no PNG"):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lensmodel.photo.endings import ENDINGS
+from lensmodel.photo.values import ENDINGS
 
 FORMATS = Path(__file__).parents[1] / "docs" / "formats.md"
 

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from app.pages import words
-from lensmodel.photo.endings import ENDINGS
+from lensmodel.photo.values import ENDINGS
 
 HEADERS: Final = {
     "Content-Security-Policy": (

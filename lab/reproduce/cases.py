@@ -30,8 +30,6 @@ PROTOCOL: Final = 7
 METHODS: Final = ("standard", "paper")
 """Non-blind methods; here `paper` is the deconvolution alone, Richardson-Lucy, with our own PSFs."""
 
-RIVALS: Final = ("schuler",)
-
 FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""
 
@@ -154,9 +152,8 @@ class Reproduction:
     scenes: Path | None = None
     size: Size = "default"  # how it was planned, for the page
     # whether all that a lens is compared with is run too: Richardson-Lucy with our PSFs, the paper's own way
-    # from end to end, a general profile, a printed target, blind rivals, Figs. 2 and 4
+    # from end to end, a general profile, a printed target, a blind rival, Figs. 2 and 4
     compare: bool = False
-    rivals: tuple[str, ...] = RIVALS  # blind methods of others, names in `lab.rivals`; each sees one photo
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -171,9 +168,9 @@ class Reproduction:
 def fingerprint() -> str:
     """Hash of the code and data that figures depend on: all that is behind the work on one case.
 
-    Rivals have a hash of their own; plans and pages leave stored results as they are.
+    The rival has a hash of its own; plans and pages leave stored results as they are.
     """
-    return version_of("lab.reproduce.job", without=("lab.rivals", "lensmodel.report"))
+    return version_of("lab.reproduce.job", without=("lab.schuler", "lensmodel.report"))
 
 
 def photos_of(case: Case, plan: Reproduction) -> str:

@@ -8,7 +8,7 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
     <key>/paper-<n>.json              the same the paper's own way from end to end
     <key>/measured.json               with PSFs measured on a target
     <key>/general.json                with a general profile of the lens model
-    <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
+    <key>/rival-<version>.json        corrected with the PSFs of a rival (`lab.schuler`), from the first photo
 
 They hold figures only, some ten kilobytes a lens. Photos lie in `photos` of the output folder, pictures in
 `pictures`.
@@ -33,7 +33,7 @@ from lab.reproduce.cases import Case, Reproduction, fingerprint, key_of, photos_
 from lab.reproduce.fields import PointField, Remembered, general_field, general_words, measured_field
 from lab.reproduce.learners import Answer, Learner, LibraryLearner, Roi, corrected_with, paper_way
 from lab.reproduce.shots import Container, Shots, in_container, take
-from lab.rivals import rivals
+from lab.schuler import Schuler
 from lab.stored import Unit, read, stored, version_of
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
@@ -48,8 +48,8 @@ CONTROL: Final = "standard"
 PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")
 """Kinds of files that each lens is learned from and corrected in too, one photo of each."""
 
-_SEVERAL: Final = ("learned", "paths", "paper", "rivals")
-_ALONE: Final = ("truth", "measured", "general")
+_SEVERAL: Final = ("learned", "paths", "paper")
+_ALONE: Final = ("truth", "measured", "general", "rival")
 NewLearner: TypeAlias = Callable[[Preset, int], Learner]
 """From the way of learning and a number of processes."""
 
@@ -96,7 +96,6 @@ def run_reproduction(
         "plan": {
             "size": plan.size,
             "methods": list(plan.methods),
-            "rivals": {name: rivals.create(name).source for name in plan.rivals} if plan.compare else {},
             "own_scenes": plan.scenes is None,
             "paper_kernel": paper_way(plan.cases[0]).kernel_size if plan.compare else None,
         },
@@ -107,9 +106,9 @@ def run_reproduction(
     }
 
 
-def rivals_version() -> str:
-    """Hash of the rivals' code and basis: they are no part of what a case's key depends on."""
-    return version_of("lab.rivals")[:8]
+def rival_version() -> str:
+    """Hash of the rival's code and basis: they are no part of what a case's key depends on."""
+    return version_of("lab.schuler")[:8]
 
 
 @dataclass(frozen=True)
@@ -139,8 +138,7 @@ class CaseJob:
         if plan.compare:
             found |= {("paper", n): folder / f"paper-{n}.json" for n in counts}
             found |= {(part, ""): folder / f"{part}.json" for part in ("measured", "general")}
-            code = rivals_version()
-            found |= {("rivals", name): folder / f"rival-{name}-{code}.json" for name in plan.rivals}
+            found |= {("rival", ""): folder / f"rival-{rival_version()}.json"}
         return found
 
     def run(self, told: Callable[[str], None]) -> Unit:
@@ -157,7 +155,7 @@ class CaseJob:
                 "paper": partial(self._learned, self._learning(paper), shots, own_way=True),
                 "measured": lambda _: self._measured(shots),
                 "general": lambda _: self._by_field(general_field(case), 0.0, shots, "general"),
-                "rivals": lambda name: self._rival(name, shots),
+                "rival": lambda _: self._rival(shots),
             }
         units: dict[str, dict[str, Unit]] = {part: {} for part in _SEVERAL}
         for (part, name), path in self.files.items():
@@ -223,15 +221,15 @@ class CaseJob:
             return {"refused": str(error), "psf": None, "methods": {}, "pictures": {}}
         return self._by_field(field, time.monotonic() - began, shots, "measured")
 
-    def _rival(self, name: str, shots: Shots) -> Unit:
-        """What a rival makes of the first photo, corrected by our methods."""
+    def _rival(self, shots: Shots) -> Unit:
+        """What the rival makes of the first photo, corrected by our methods."""
         began = time.monotonic()
         try:
-            field = rivals.create(name).field([develop(shots.learn[0])])
+            field = Schuler().field([develop(shots.learn[0])])
         except LensModelError as error:
             unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
             return {**unit, "methods": dict.fromkeys(self.plan.methods, self._before)}
-        return self._by_field(field, time.monotonic() - began, shots, name)
+        return self._by_field(field, time.monotonic() - began, shots, "schuler")
 
     def _by_field(self, psfs: PsfField, seconds: float, shots: Shots, label: str) -> Unit:
         """Errors of a PSF field, and what corrections with it come to."""

@@ -77,10 +77,9 @@ def _conditions(result: Mapping[str, Any]) -> str:
     sizes = ", ".join(f"{w} x {h}" for w, h in frames)
     whose = "the library's own" if plan["own_scenes"] else "given from outside"
     unseen = f"methods were developed on {len(seen)} of them" if seen else "nothing was developed on them"
-    named = "".join(f" {name}: {source}." for name, source in plan["rivals"].items())
     return (
         f"Size {plan['size']}: {len(cases)} simulated lenses, wide open, at base ISO, in frames of {sizes}. "
-        f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}.{named} "
+        f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}. "
         f"How it is done, and what the figures mean: docs/lab/reproduction.md. Code {result['code']}."
     )
 
@@ -141,7 +140,7 @@ def _edge_cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
-    """Error of the PSF, ours and the rivals'."""
+    """Error of the PSF, ours and others'."""
     page.title(f"Error of the PSF, {label}")
     page.text(
         "Relative L2 against the truth after sub-pixel alignment, green; median of the zone, mean over "
@@ -342,10 +341,8 @@ def _before_after(page: Page, result: Mapping[str, Any]) -> None:
 
 def _pictures(case: Mapping[str, Any]) -> dict[str, str]:
     """Files of all pictures of a lens by label."""
-    units = [case["truth"], *(case[part] for part in ("general", "measured") if case.get(part))]
-    units += [
-        unit for part in ("learned", "paths", "paper", "rivals") for unit in case.get(part, {}).values()
-    ]
+    units = [case["truth"], *(case[part] for part in ("general", "measured", "rival") if case.get(part))]
+    units += [unit for part in ("learned", "paths", "paper") for unit in case.get(part, {}).values()]
     return {label: name for unit in units for label, name in unit["pictures"].items()}
 
 
@@ -359,8 +356,7 @@ def _labels(case: Mapping[str, Any], plan: Mapping[str, Any]) -> dict[str, str]:
     found = {"before": "as photographed", **each(f"n{n}", f"corrected blindly by default, n = {n}")}
     found |= {"tiff": "a 16-bit TIFF corrected, n = 1", "jpeg": "a JPEG corrected, n = 1"}
     found[f"way-paper-n{n}-paper"] = f"corrected blindly, {PAPER_WAY}, n = {n}"
-    for name, source in plan["rivals"].items():
-        found |= each(name, f"corrected with the PSFs of {source}")
+    found |= each("schuler", "corrected with the PSFs of Schuler et al. 2012 (a basis of lenses)")
     found |= each("general", f"corrected with a {GENERAL} (in place of a commercial one)")
     found |= each("measured", "corrected with PSFs measured with a target (non-blind)")
     return {**found, **each("true", "corrected with the true PSF"), "scene": "the scene itself"}

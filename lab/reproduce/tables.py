@@ -29,6 +29,7 @@ EDGE_FIGURES: Final = ("mtf50", "tangential_mtf50", "sagittal_mtf50", "mtf_max",
 BEFORE: Final = "without correction"
 DENOISED: Final = "denoised only"
 GENERAL: Final = "general profile of the lens model"
+RIVAL: Final = "Schuler et al. 2012, n = 1"
 PAPER_WAY: Final = "the paper's own way"
 MEASURED: Final = "measured with a target"
 TRUE: Final = "true PSF"
@@ -113,7 +114,7 @@ def _psf_of_others(result: Result) -> dict[str, dict[str, float | None]]:
 
 def others(case: Result) -> dict[str, Result]:
     """Units of a lens whose PSFs are not the default's, by the names of their states."""
-    found = {f"{name}, n = 1": unit for name, unit in case["rivals"].items()}
+    found = {RIVAL: case["rival"]} if case.get("rival") else {}
     if case.get("general"):
         found[GENERAL] = case["general"]
     for n, unit in sorted(case.get("paper", {}).items(), key=lambda item: int(item[0])):

@@ -22,7 +22,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.model import LensProfile, save_profile
 from lensmodel.patches import selectors
-from lensmodel.photo.endings import ENDINGS
+from lensmodel.photo.values import ENDINGS
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.calibrating import AHEAD
 from lensmodel.workflow.lens import Lens

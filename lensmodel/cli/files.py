@@ -12,7 +12,7 @@ from typing import Any, Final
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
-from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS
+from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
 
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
 """What phones add to the names of the files of one shot."""

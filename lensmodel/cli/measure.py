@@ -18,7 +18,7 @@ from lensmodel.core.types import LensSettings
 from lensmodel.measured.edges import chart_edges
 from lensmodel.model import save_profile
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
-from lensmodel.photo.endings import ENDINGS
+from lensmodel.photo.values import ENDINGS
 from lensmodel.workflow import measuring, sampling
 from lensmodel.workflow.calibrating import Identity, difference, grown, joined
 from lensmodel.workflow.lens import Lens

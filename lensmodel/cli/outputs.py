@@ -19,7 +19,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
-from lensmodel.photo.endings import CORRECTED
+from lensmodel.photo.values import CORRECTED
 from lensmodel.workflow.calibrating import Identity, difference
 from lensmodel.workflow.lens import Lens
 

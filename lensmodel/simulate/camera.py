@@ -159,7 +159,7 @@ def photograph(
     options: BlurOptions | None = None,
     on_step: StepHook = ignore_step,
 ) -> SimulatedPhoto:
-    """Take a photo: blur (`blurred`), exposure, colour response, noise, clipping, mosaic; noise only with `rng`."""
+    """Take a photo: blur (`blurred`), exposure, colour response, noise, clipping, mosaic."""
     if not (math.isfinite(exposure) and exposure > 0):
         raise InvalidInputError(f"exposure must be positive, got {exposure}")
     options = replace(options or BlurOptions(), pitch_um=camera.pitch_um)

@@ -19,7 +19,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.measured import is_measured
 from lensmodel.model import Camera, LensModel, LensProfile, ModelSettings
 from lensmodel.photo import PhotoMetadata
-from lensmodel.photo.endings import CORRECTED
+from lensmodel.photo.values import CORRECTED
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
     Config,

@@ -35,7 +35,7 @@ from lab.reproduce.job import run_reproduction
 from lab.reproduce.learners import Answer, Place, Roi, paper_way
 from lab.reproduce.page import collected, write_json, write_page
 from lab.reproduce.shots import Shots, in_container
-from lab.reproduce.tables import groups, kept, paths, shares, summary
+from lab.reproduce.tables import RIVAL, groups, kept, paths, shares, summary
 from lab.scenes import HARD_SCENES
 from lab.stored import ROOT, code_of, version_of
 from lab.traced import read_grid
@@ -261,8 +261,8 @@ def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages()
         "lensmodel/correction/methods/richardson_lucy.py",
     } <= names
     assert not names & {f"lab/reproduce/{name}.py" for name in ("bars", "page", "tables")}
-    rivals = {path.stem for path in code_of("lab.rivals")}
-    assert {"schuler", "gradients", "pyramid"} <= rivals
+    rival = {path.stem for path in code_of("lab.schuler")}
+    assert {"schuler", "gradients", "pyramid"} <= rival
 
 
 def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
@@ -331,12 +331,10 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
                 }
             },
             "paths": {},
-            "rivals": {
-                "schuler": {
-                    "pictures": {"schuler-paper": "schuler.png"},
-                    "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
-                    "methods": {"paper": state(130, 31.0)},
-                }
+            "rival": {
+                "pictures": {"schuler-paper": "schuler.png"},
+                "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
+                "methods": {"paper": state(130, 31.0)},
             },
         }
         for i, (mtf50, psnr) in enumerate(lenses)
@@ -346,7 +344,6 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
         "plan": {
             "size": "quick",
             "methods": ["paper"],
-            "rivals": {"schuler": "Schuler et al. 2012"},
             "own_scenes": True,
         },
         "scenes": ["city", "lake"],
@@ -371,11 +368,11 @@ def test_share_of_a_small_gain_is_left_out() -> None:
 def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
     found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
     rows = {row["state"]: row for row in found["mtf"]["paper"]}
-    assert list(rows) == ["without correction", "denoised only", "schuler, n = 1", "n = 1", "true PSF"]
+    assert list(rows) == ["without correction", "denoised only", RIVAL, "n = 1", "true PSF"]
     assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
     assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
     assert found["worse"]["paper"]["1"] == {"zones": 9, "worse": 6, "clearly_worse": 3}
-    assert found["psf_others"]["schuler, n = 1"]["corner"] == pytest.approx(0.5)
+    assert found["psf_others"][RIVAL]["corner"] == pytest.approx(0.5)
     assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
 
 
@@ -512,7 +509,7 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert "Lens &lt;0&gt;" in text
     text = markdown.read_text(encoding="utf-8")
     assert "| default, n = 1 | 160 |" in text
-    assert "| schuler, n = 1 | 130 |" in text
+    assert f"| {RIVAL} | 130 |" in text
     assert "MISSED" in text
 
 
@@ -686,6 +683,7 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(job.CaseJob, "_by_field", lambda *_: by_target(None, None))
     monkeypatch.setattr(job.figures, "draw", lambda *_, **__: {})
     monkeypatch.setattr(job.CaseJob, "_measured", by_target)
+    monkeypatch.setattr(job.CaseJob, "_rival", by_target)
     return taken
 
 
@@ -723,7 +721,7 @@ def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path, quick_phot
         opened.append((way.estimator, way.kernel_size))
         return Nothing()
 
-    chosen = plan(case(photos=(1, 2)), compare=True, rivals=())
+    chosen = plan(case(photos=(1, 2)), compare=True)
     made = run_reproduction(chosen, tmp_path, on_work=unheard, learner=open_one)
     assert set(made["cases"][0]["paper"]) == {"1", "2"}
     assert list(made["cases"][0]["paper"]["1"]["methods"]) == ["paper"]

@@ -1,4 +1,4 @@
-"""`lab.rivals`: recovery of fields that lie in the model class of each rival."""
+"""`lab.schuler`: recovery of a field that lies in its basis."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from lab.rivals import BasisField, RadialBasis, Schuler, load_basis, principal, rivals
-from lab.rivals.basis import save_basis
-from lab.rivals.schuler import PhotoWindow
 from lab.scenes import dead_leaves
+from lab.schuler import BasisField, PhotoWindow, RadialBasis, Schuler, load_basis, principal, save_basis
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import distance, gaussian
@@ -63,16 +61,6 @@ def small_basis() -> RadialBasis:
     return principal(np.array(lenses), RADII, 8)
 
 
-def test_every_rival_has_a_name_and_a_source() -> None:
-    for name in rivals:
-        made = rivals.create(name)
-        assert made.name == name
-        assert "20" in made.source
-
-
-# --- Schuler -----------------------------------------------------------------------------------
-
-
 def test_basis_holds_the_fields_that_it_was_made_of() -> None:
     lenses = np.array([radial(a, 0.5) for a in (0.0, 0.4, 0.9, 1.3)])
     basis = principal(lenses, RADII, 7)
@@ -115,7 +103,7 @@ def test_schuler_recovers_a_lens_within_its_basis(monkeypatch: pytest.MonkeyPatc
     def truth(place: FieldPosition) -> np.ndarray:
         return gaussian(SIDE, local(place, 0.5 + 0.35 * place.r, 0.5 + 1.45 * place.r))
 
-    monkeypatch.setattr("lab.rivals.schuler.windows_of", lambda _: windows(truth, leaves()))
+    monkeypatch.setattr("lab.schuler.windows_of", lambda _: windows(truth, leaves()))
     field = Schuler(basis=small_basis()).field(())
     mean = BasisField(small_basis(), {"g": np.zeros((8, 3))})
     found, naive = [], []
@@ -128,7 +116,7 @@ def test_schuler_recovers_a_lens_within_its_basis(monkeypatch: pytest.MonkeyPatc
 
 
 def test_schuler_refuses_too_few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lab.rivals.schuler.windows_of", lambda _: [])
+    monkeypatch.setattr("lab.schuler.windows_of", lambda _: [])
     with pytest.raises(NotEnoughEvidenceError, match="determine no field"):
         Schuler(basis=small_basis()).field(())
 

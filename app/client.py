@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, Self, TypeAlias, TypeVar
@@ -35,21 +35,14 @@ M = TypeVar("M", bound=BaseModel)
 Query: TypeAlias = Mapping[str, str | int | float | bool | None]
 
 DEFAULT_URL: Final = "http://127.0.0.1:8000"
-ANSWER_SECONDS: Final = 60.0
-"""Longest wait for a response (chosen): longer than a long poll."""
-
+ANSWER_SECONDS: Final = 60.0  # longest wait for a response (chosen): longer than a long poll
+# Attempts to connect (chosen): with the pauses of httpx, seven seconds bridge the restart of a service
 CONNECTS: Final = 5
-"""Attempts to connect (chosen): with the pauses of httpx, seven seconds bridge the restart of a service."""
-
-LONG_POLL_SECONDS: Final = 20
-"""Longest wait of one request for a job: as the service allows."""
-
+LONG_POLL_SECONDS: Final = 20  # longest wait of one request for a job: as the service allows
+# Pause between two requests for a job (chosen): a service may be set to answer at once
 PAUSE_SECONDS: Final = 0.1
-"""Pause between two requests for a job (chosen): a service may be set to answer at once."""
-
+# Pause of `wait` while the service is away or busy (chosen): it restarts in a few seconds
 AWAY_SECONDS: Final = 2.0
-"""Pause of `wait` while the service is away or busy (chosen): it restarts in a few seconds."""
-
 _AWAY: Final = frozenset({429, 502, 503, 504})
 
 
@@ -162,15 +155,6 @@ class Client:
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
         return self._send(s.PhotoOut, "PATCH", f"/v1/photos/{photo_id}", body)
 
-    def change_photos(self, /, photo_ids: Iterable[str], **changes: object) -> list[s.PhotoOut]:
-        """Name the lens of several photos at once, or correct their settings: fields of `PhotosChange`."""
-        body = s.PhotosChange.model_validate({"photo_ids": list(photo_ids), **changes})
-        return self._send(s.PhotoPage, "PATCH", "/v1/photos", body.model_dump(exclude_unset=True)).items
-
-    def patches(self, photo_id: str) -> list[s.PatchOut]:
-        """Return where a photo was learned from, and where not and why."""
-        return self._get(s.PatchPage, f"/v1/photos/{photo_id}/patches").items
-
     def delete_photo(self, photo_id: str) -> None:
         """Delete a photo with all that was made of it."""
         _require_success(self._http.delete(f"/v1/photos/{photo_id}"))
@@ -181,10 +165,6 @@ class Client:
         """Return one job."""
         return self._get(s.JobOut, f"/v1/jobs/{job_id}")
 
-    def jobs(self) -> list[s.JobOut]:
-        """Return the jobs of all photos and corrections, newest first."""
-        return list(self._pages(s.JobPage, "/v1/jobs"))
-
     def cancel(self, job_id: str) -> s.JobOut:
         """Cancel a job."""
         return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/cancel")
@@ -192,13 +172,6 @@ class Client:
     def retry(self, job_id: str) -> s.JobOut:
         """Start a failed or cancelled job anew."""
         return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/retry")
-
-    def retry_all(self, code: str = "outage") -> int:
-        """Start anew all jobs that failed with a code; return how many."""
-        again = 0
-        while retried := self._send(s.RetriedOut, "POST", f"/v1/jobs/retry?code={code}").retried:
-            again += retried
-        return again
 
     def wait(
         self,
@@ -292,10 +265,6 @@ class Client:
         """Return the history of a lens, oldest first."""
         return list(self._pages(s.CalibrationPage, f"/v1/lenses/{lens_id}/calibrations"))
 
-    def lateral_colour(self, lens_id: str) -> s.LateralOut:
-        """Return the lateral colour shift of a lens."""
-        return self._get(s.LateralOut, f"/v1/lenses/{lens_id}/lateral-colour")
-
     def psf(
         self,
         /,
@@ -342,17 +311,9 @@ class Client:
         asked = {"merge_into": into, "any_lens": any_lens}
         return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", asked)
 
-    def go_back(self, lens_id: str, version: int) -> s.LensOut:
-        """Leave out the photos that joined a lens after a version of `calibrations`."""
-        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"back_to": version})
-
     def save_profile(self, lens_id: str, path: str | Path) -> Path:
         """Save what was learned of a lens as a `.lensprofile`."""
         return self._save(f"/v1/lenses/{lens_id}/profile", Path(path))
-
-    def create_lens(self, label: str) -> s.LensOut:
-        """Create a lens, to add a profile to."""
-        return self._send(s.LensOut, "POST", "/v1/lenses", {"label": label})
 
     def add_profile(self, lens_id: str, path: str | Path, *, any_lens: bool = False) -> s.LensOut:
         """Let what a `.lensprofile` knows join a lens; the same file a second time changes nothing.
@@ -365,7 +326,10 @@ class Client:
         lens = _read(s.LensOut, answer)
         if answer.status_code != httpx2.codes.ACCEPTED:
             return lens
-        self.wait(answer.headers["Location"].rpartition("/")[2])  # a worker is still reading it
+        try:
+            self.wait(answer.headers["Location"].rpartition("/")[2])  # a worker is still reading it
+        except JobEndedError as ended:
+            raise (ServiceProblemError(ended.job.error) if ended.job.error else ended) from ended
         return self.lens(lens_id)
 
     def save_report(
@@ -398,19 +362,9 @@ class Client:
         kind = form or target.suffix.lower().removeprefix(".")
         return self._save(f"/v1/lenses/{lens_id}/report.{kind}", target, query)
 
-    # --- the account ------------------------------------------------------------------------------
-
-    def account(self) -> s.AccountOut:
-        """Return who asks, what he has and what he may have."""
-        return self._get(s.AccountOut, "/v1/account")
-
-    def export_account(self, path: str | Path) -> Path:
-        """Save all that the service keeps of this owner as a ZIP file."""
-        return self._save("/v1/account/export", Path(path))
-
-    def erase_account(self) -> None:
-        """Erase all that the service keeps of this owner, its keys too. There is no way back."""
-        _require_success(self._http.delete("/v1/account"))
+    def get(self, path: str, **query: str | float | bool | None) -> Any:  # noqa: ANN401 - JSON of any shape
+        """Return the JSON of any other address of the service, such as `/v1/account`."""
+        return _require_success(self._http.get(path, params=_present(query))).json()
 
     # --- requests ---------------------------------------------------------------------------------
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-INFINITY: Final = -1.0
-"""Stands for a focus distance of infinity; no distance is negative."""
+INFINITY: Final = -1.0  # stands for a focus distance of infinity; no distance is negative
 
 
 def written(focus_m: float | None) -> float | None:

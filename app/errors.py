@@ -2,40 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from lensmodel.core.errors import LensModelError
 
-if TYPE_CHECKING:
-    from app.schemas import FieldError
-
 
 class ServiceError(LensModelError):
-    """Something that the service itself refuses.
+    """Something that the service itself refuses: why and the remedy, its fixed code, headers of the answer.
 
-    Parameters
-    ----------
-    detail : str
-        The offending value and the remedy.
-    errors : sequence of FieldError
-        One entry for each offending field.
-    headers : mapping of str to str
-        For the answer.
+    `status` is that of the response where it is not the usual one of the code.
     """
 
     def __init__(
-        self, detail: str, *, errors: Sequence[FieldError] = (), headers: Mapping[str, str] | None = None
+        self,
+        detail: str,
+        *,
+        code: str | None = None,
+        status: int | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(detail)
-        self.errors = tuple(errors)
-        self.headers = dict(headers or {})
-
-
-class MalformedUploadError(ServiceError):
-    """The body has not the form of an upload."""
-
-    code = "malformed_upload"
+        self.code = code or type(self).code  # type: ignore[misc]  # of this one, where the class has several
+        self.status, self.headers = status, dict(headers or {})
 
 
 class InvalidParameterError(ServiceError):
@@ -44,46 +32,11 @@ class InvalidParameterError(ServiceError):
     code = "invalid_parameter"
 
 
-class UnknownPhotoError(ServiceError):
-    """No photo of that id, or somebody else's."""
+class UnknownError(ServiceError):
+    """No photo, lens, correction or job of that id, or somebody else's."""
 
-    code = "unknown_photo"
-
-
-class UnknownPictureError(ServiceError):
-    """No such part of a picture."""
-
-    code = "unknown_photo"
-
-
-class UnknownLensError(ServiceError):
-    """No lens of that id, or somebody else's."""
-
-    code = "unknown_lens"
-
-
-class UnknownCorrectionError(ServiceError):
-    """No correction of that id, or somebody else's."""
-
-    code = "unknown_correction"
-
-
-class UnknownJobError(ServiceError):
-    """No job of that id, or somebody else's."""
-
-    code = "unknown_job"
-
-
-class NotSignedInError(ServiceError):
-    """No valid key or session."""
-
-    code = "not_signed_in"
-
-
-class ForbiddenError(ServiceError):
-    """The key does not allow this."""
-
-    code = "forbidden"
+    def __init__(self, what: str, key: str) -> None:
+        super().__init__(f"there is no {what} {key[:60]}: it may be deleted", code=f"unknown_{what}")
 
 
 class NotReadyError(ServiceError):
@@ -98,30 +51,6 @@ class ConflictError(ServiceError):
     code = "conflict"
 
 
-class OtherLensError(ConflictError):
-    """It seems to be of another lens than the one that is named for it."""
-
-    code = "other_lens"
-
-
-class NotAcceptableError(ServiceError):
-    """None of the accepted formats is available."""
-
-    code = "not_acceptable"
-
-
-class TooLargeError(ServiceError):
-    """More bytes than an upload may have."""
-
-    code = "image_too_large"
-
-
-class SlowBodyError(ServiceError):
-    """A body that arrives too slowly or not at all."""
-
-    code = "too_slow"
-
-
 class BusyError(ServiceError):
     """Too much is in progress already."""
 
@@ -132,15 +61,3 @@ class QuotaError(ServiceError):
     """The owner has too much unfinished or stored already."""
 
     code = "quota_exceeded"
-
-
-class StorageFullError(ServiceError):
-    """No room for another photo."""
-
-    code = "quota_exceeded"
-
-
-class RangeError(ServiceError):
-    """A byte range beyond the end of the file."""
-
-    code = "invalid_parameter"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import cache
@@ -14,20 +15,10 @@ from app import pages
 from app.access import Gate
 from app.blobs.storage import Storage
 from app.http import errors
-from app.http.dependencies import Fresh, Places, Services, call_of
-from app.http.middleware import BodySize, OwnNames, RequestLog, SameSite
+from app.http.dependencies import Fresh, Services, call_of
+from app.http.middleware import Guard, RequestLog
 from app.http.model_cache import ModelCache
-from app.routes import (
-    account,
-    corrections,
-    health,
-    jobs,
-    lens_profiles,
-    lens_reports,
-    lenses,
-    photos,
-    psf,
-)
+from app.routes import account, corrections, health, jobs, lens_profiles, lens_reports, lenses, photos, psf
 from app.routes.common import problems
 from app.runtime.outage import missable
 from app.runtime.settings import Settings
@@ -35,11 +26,9 @@ from app.store import Store
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """Build the application; the database is opened when it starts and closed when it stops.
-
-    The schema is not changed here: the supervisor migrates before it starts the API, and until
-    then `/readyz` says what is missing.
-    """
+    """Build the application; the database is opened when it starts and closed when it stops."""
+    # The schema is not changed here: the supervisor migrates before it starts the API, and until then
+    # `/readyz` says what is missing
     chosen = Settings() if settings is None else settings
 
     @asynccontextmanager
@@ -54,7 +43,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             store,
             storage,
             cache,
-            Places(photos.MAX_UPLOADS),
+            asyncio.Semaphore(photos.MAX_UPLOADS),
             Gate(chosen, store.accounts),
             Fresh(health.FRESH_S),
         )
@@ -69,9 +58,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,  # it would load scripts from another site: the pages have their own
         redoc_url=None,
     )
-    app.add_middleware(BodySize, max_upload_mb=chosen.max_upload_mb)
-    app.add_middleware(SameSite, allowed=chosen.hosts)
-    app.add_middleware(OwnNames, allowed=chosen.hosts)
+    app.add_middleware(Guard, allowed=chosen.hosts, max_upload_mb=chosen.max_upload_mb)
     app.add_middleware(RequestLog)  # the last is the outermost
     errors.install(app)
     pages.install(app)
@@ -81,11 +68,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 @cache
 def _routes() -> tuple[BaseRoute, ...]:
-    """All routes, the same for each application of a process.
-
-    What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
-    most requests, and need not be done again for an application with other settings.
-    """
+    """All routes, the same for each application of a process."""
+    # What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
+    # most requests, and need not be done again for an application with other settings
     router = APIRouter()
     router.include_router(health.probes)
     router.include_router(account.sign_ins, prefix="/v1")
@@ -106,7 +91,7 @@ def _routes() -> tuple[BaseRoute, ...]:
             resource.router,
             prefix="/v1",
             dependencies=[Depends(call_of)],
-            responses=problems(401, 403, 429),
+            responses=problems(401, 403, 404, 409, 422, 429),
         )
     pages.include(router)
     return tuple(router.routes)

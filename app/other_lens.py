@@ -10,8 +10,7 @@ from lensmodel.core.names import name_key, serial_key
 
 REMEDY: Final = "choose its own lens, or send any_lens=true if it is the same"
 
-_SPAN: Final = 1.1
-"""Ratio of focal lengths up to which they are taken for one (chosen: files round them)."""
+_SPAN: Final = 1.1  # ratio of focal lengths up to which they are taken for one (chosen: files round them)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +25,9 @@ class Described:
 
 
 def difference(lens: Described, other: Described) -> str | None:
-    """Say what speaks against one lens, as a clause; None where nothing does.
-
-    What both name must agree. Where one of them names no model, the camera tells lenses apart: that of
-    a compact is part of it. Focal lengths far from all that the lens was seen at are of another one.
-    """
+    """Say what speaks against one lens, as a clause; None where nothing does."""
+    # What both name must agree. Where one of them names no model, the camera tells lenses apart: that of a
+    # compact is part of it. Focal lengths far from all that the lens was seen at are of another one.
     if lens.serial and other.serial and serial_key(lens.serial) != serial_key(other.serial):
         return f"its serial number is {other.serial}, that of the lens {lens.serial}"
     if lens.model and other.model and name_key(lens.model) != name_key(other.model):

@@ -9,10 +9,8 @@ from lensmodel.workflow.sampling import KERNEL_PATCHES, PRESETS, Preset
 
 
 def configured_preset(settings: Settings, name: str) -> Preset:
-    """Return estimator, kernel size, patches, model mode and correction method of a model.
-
-    The settings of the service choose the estimator of the model `default`, and the patches of both.
-    """
+    """Return estimator, kernel size, patches, model mode and correction method of a model."""
+    # The settings of the service choose the estimator of the model `default`, and the patches of both
     preset = PRESETS[name]
     if name == "default":
         own = settings.estimator != preset.estimator

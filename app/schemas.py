@@ -19,13 +19,11 @@ from pydantic import (
 from lensmodel.core.types import Channel
 
 V1: Final = "/v1"
+Links = dict[str, str | None]  # addresses by what is there
 T = TypeVar("T")
 
-MAX_PSF_SIZE = 255
-"""Side of a kernel in pixels at most (chosen): that of a profile."""
-
-MAX_VERSION: Final = 2**31 - 1
-"""The largest number of an INTEGER column of PostgreSQL."""
+MAX_PSF_SIZE = 255  # side of a kernel in pixels at most (chosen): that of a profile
+MAX_VERSION: Final = 2**31 - 1  # the largest number of an INTEGER column of PostgreSQL
 
 
 def blank_is_none(value: object) -> object:
@@ -45,25 +43,16 @@ def _odd(value: int) -> int:
     return value
 
 
+# How a lens is learned and its photos are corrected: names of `lensmodel.workflow.sampling`
 PsfModel = Literal["default", "paper"]
-"""How a lens is learned and its photos are corrected: names of `lensmodel.workflow.sampling`."""
-
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
-
 OptionalName = Annotated[Name | None, BeforeValidator(blank_is_none)]
-
 Id = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")]
-
 OptionalId = Annotated[Id | None, BeforeValidator(blank_is_none)]
-
-Aperture = Annotated[float, Field(ge=0.5, le=128, allow_inf_nan=False, description="f-number")]
-
-FocalLength = Annotated[float, Field(ge=0.1, le=20000, allow_inf_nan=False, description="mm")]
-
-FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, allow_inf_nan=False, description="m")]
-
-PixelPitch = Annotated[float, Field(gt=0.1, le=1000, allow_inf_nan=False, description="micrometres")]
-
+Aperture = Annotated[float, Field(ge=0.5, le=128, description="f-number")]
+FocalLength = Annotated[float, Field(ge=0.1, le=20000, description="mm")]
+FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, description="m")]
+PixelPitch = Annotated[float, Field(gt=0.1, le=1000, description="micrometres")]
 KernelSize = Annotated[
     int, Field(ge=3, le=MAX_PSF_SIZE, description="odd side in pixels"), AfterValidator(_odd)
 ]
@@ -85,7 +74,7 @@ class Page(Model, Generic[T]):
 class Question(BaseModel):
     """Common to what we are sent: a name that we do not know is an error, and not ignored."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=(), allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
@@ -141,27 +130,31 @@ class UploadFields(Question):
     """
 
     calibrate: bool = Field(default=True, description="false only stores the photo to correct it")
-    kind: Annotated[MeasurementKind | None, BeforeValidator(blank_is_none)] = Field(
+    kind: MeasurementKind | None = Field(
         default=None, description="what a photo made to measure the lens shows; nothing for ordinary photos"
     )
-    reference_id: OptionalId = Field(default=None, description="of a pair: the photo closed to about f/8")
-    model: Annotated[PsfModel | None, BeforeValidator(blank_is_none)] = Field(
+    reference_id: Id | None = Field(default=None, description="of a pair: the photo closed to about f/8")
+    model: PsfModel | None = Field(
         default=None,
         description="of a new lens: how it is learned, default or the paper's own way; a lens that is there "
         "must have it already",
     )
-    selector: OptionalName = Field(
-        default=None,
-        description="who chooses its patches, one of GET /v1/formats; r-map by default",
+    selector: Name | None = Field(
+        default=None, description="who chooses its patches, one of GET /v1/formats; r-map by default"
     )
-    lens_id: OptionalId = None
-    lens_serial: OptionalName = None
-    lens_model: OptionalName = None
-    lens_maker: OptionalName = None
-    aperture: Annotated[Aperture | None, BeforeValidator(blank_is_none)] = None
-    focal_length_mm: Annotated[FocalLength | None, BeforeValidator(blank_is_none)] = None
-    focus_distance_m: Annotated[FocusDistance | None, BeforeValidator(blank_is_none)] = None
-    pixel_pitch_um: Annotated[PixelPitch | None, BeforeValidator(blank_is_none)] = None
+    lens_id: Id | None = None
+    lens_serial: Name | None = None
+    lens_model: Name | None = None
+    lens_maker: Name | None = None
+    aperture: Aperture | None = None
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: PixelPitch | None = None
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _left_out_if_blank(cls, value: object) -> object:
+        return blank_is_none(value)
 
 
 class NewLens(Question):
@@ -206,14 +199,6 @@ class PatchCounts(Model):
     rejected: int
 
 
-class PhotoLinks(Model):
-    """Where to go from a photo."""
-
-    self: str
-    job: str
-    lens: str | None
-
-
 class PhotoOut(Model):
     """A photo."""
 
@@ -241,10 +226,10 @@ class PhotoOut(Model):
 
     @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
     @property
-    def links(self) -> PhotoLinks:
+    def links(self) -> Links:
         """Where to go from here."""
         lens = None if self.lens_id is None else f"{V1}/lenses/{self.lens_id}"
-        return PhotoLinks(self=f"{V1}/photos/{self.id}", job=f"{V1}/jobs/{self.id}", lens=lens)
+        return {"self": f"{V1}/photos/{self.id}", "job": f"{V1}/jobs/{self.id}", "lens": lens}
 
 
 class PatchOut(Model):
@@ -306,33 +291,20 @@ class CorrectionIn(Question):
         max_length=60,
         description="default: standard, and paper where the model of the lens is that of the paper",
     )
-    strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
+    strength: float = Field(1.0, ge=0, le=1)
     halo: float | None = Field(
         None,
         ge=0,
-        allow_inf_nan=False,
         description="how far beside edges to leave the range of light around; default: by the model's error",
     )
-    texture: float = Field(
-        1.0, ge=0, le=1, allow_inf_nan=False, description="how much of its faint texture the photo keeps"
-    )
-    denoise: float = Field(
-        0.0, ge=0, le=1, allow_inf_nan=False, description="how much of the photo's grain to take away"
-    )
+    texture: float = Field(1.0, ge=0, le=1, description="how much of its faint texture the photo keeps")
+    denoise: float = Field(0.0, ge=0, le=1, description="how much of the photo's grain to take away")
     output: OutputOptions = OutputOptions()
     roi: Region | None = None
     layers: bool = Field(
         default=False,
         description="with roi: keep it without faint texture and without grain as well, for a preview to mix",
     )
-
-
-class CorrectionLinks(Model):
-    """Where to go from a correction."""
-
-    self: str
-    job: str
-    result: str | None
 
 
 class CorrectionOut(Model):
@@ -354,11 +326,11 @@ class CorrectionOut(Model):
 
     @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
     @property
-    def links(self) -> CorrectionLinks:
+    def links(self) -> Links:
         """Where to go from here."""
         own = f"{V1}/corrections/{self.id}"
         result = f"{own}/result" if self.state == "succeeded" else None
-        return CorrectionLinks(self=own, job=f"{V1}/jobs/{self.id}", result=result)
+        return {"self": own, "job": f"{V1}/jobs/{self.id}", "result": result}
 
 
 class CorrectionPage(Page[CorrectionOut]):
@@ -376,16 +348,6 @@ class JobProgress(Model):
     unit: str
 
 
-class JobLinks(Model):
-    """Where to go from a job."""
-
-    self: str
-    photo: str | None
-    lens: str | None
-    correction: str | None
-    result: str | None
-
-
 class JobOut(Model):
     """Background work: of a photo or of a correction; its id is that of what it makes."""
 
@@ -400,13 +362,7 @@ class JobOut(Model):
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
-    links: JobLinks
-
-
-class RetriedOut(Model):
-    """How many jobs were started anew."""
-
-    retried: int
+    links: Links
 
 
 class JobPage(Page[JobOut]):
@@ -414,17 +370,6 @@ class JobPage(Page[JobOut]):
 
 
 SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
-
-
-class LensLinks(Model):
-    """Where to go from a lens."""
-
-    self: str
-    psf: str
-    field: str
-    calibrations: str
-    lateral_colour: str
-    photos: str
 
 
 class LensOut(Model):
@@ -449,17 +394,13 @@ class LensOut(Model):
 
     @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
     @property
-    def links(self) -> LensLinks:
+    def links(self) -> Links:
         """Where to go from here."""
         own = f"{V1}/lenses/{self.id}"
-        return LensLinks(
-            self=own,
-            psf=f"{own}/psf",
-            field=f"{own}/field.png",
-            calibrations=f"{own}/calibrations",
-            lateral_colour=f"{own}/lateral-colour",
-            photos=f"{V1}/photos?lens_id={self.id}",
-        )
+        parts = {"psf": "psf", "field": "field.png", "calibrations": "calibrations"}
+        parts["lateral_colour"] = "lateral-colour"
+        photos = f"{V1}/photos?lens_id={self.id}"
+        return {"self": own, **{name: f"{own}/{part}" for name, part in parts.items()}, "photos": photos}
 
 
 class CalibrationOut(Model):
@@ -501,21 +442,15 @@ class CalibrationPage(Page[CalibrationOut]):
 class PsfQuery(Question):
     """Where and how to ask for a PSF."""
 
-    r: float = Field(ge=0, le=1, allow_inf_nan=False, description="half diagonals: 0 centre, 1 corner")
-    phi: float = Field(
-        0.0, ge=-100, le=100, allow_inf_nan=False, description="radians, counter-clockwise from the right"
-    )
+    r: float = Field(ge=0, le=1, description="half diagonals: 0 centre, 1 corner")
+    phi: float = Field(0.0, ge=-100, le=100, description="radians, counter-clockwise from the right")
     aperture: Aperture | None = None
     channel: Channel = "g"
     size: KernelSize = 55
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
     pixel_pitch_um: float | None = Field(
-        None,
-        gt=0.1,
-        le=100,
-        allow_inf_nan=False,
-        description="pixel of the answer; that of most photos by default",
+        None, gt=0.1, le=100, description="pixel of the answer; that of most photos by default"
     )
     version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
@@ -591,16 +526,14 @@ class FieldQuery(Question):
     channel: Channel = "g"
     grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
     size: KernelSize = 55
-    aspect: float = Field(
-        1.5, ge=0.2, le=5, allow_inf_nan=False, description="width over height of the picture"
-    )
+    aspect: float = Field(1.5, ge=0.2, le=5, description="width over height of the picture")
     view: str = Field(
         "0,0,1,1",
         pattern=r"^(0|1|0?\.\d{1,6})(,(0|1|0?\.\d{1,6})){3}$",
         description="part of the picture that is shown: left, top, width and height as shares of it",
     )
     version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
-    gamma: float = Field(0.5, ge=0.1, le=2, allow_inf_nan=False, description="brightness ~ value^gamma")
+    gamma: float = Field(0.5, ge=0.1, le=2, description="brightness ~ value^gamma")
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
 

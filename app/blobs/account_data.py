@@ -23,9 +23,8 @@ TABLES: Final[Mapping[str, type[Base]]] = {
     "corrections": CorrectionRow,
     "keys": KeyRow,
 }
+# Columns that say nothing about the owner, or must not leave the service
 INSIDE: Final = frozenset({"owner_id", "key_hash"})
-"""Columns that say nothing about the owner, or must not leave the service."""
-
 README: Final = """What lensmodel keeps of one owner.
 
 *.jsonl        one JSON object a line, as in the tables; `photo_id`, `lens_id` and `patch_id` name the `id` of

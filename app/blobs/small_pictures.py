@@ -14,32 +14,17 @@ from PIL import Image, ImageOps
 from lensmodel.patches import r_map
 from lensmodel.photo import LinearPhoto, upright
 
+# Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen
 THUMBNAIL_SIDE: Final = 480
-"""Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""
-
-MAP_SIDE: Final = 1600
-"""Longer side of the picture in pixels at most (chosen): fills a usual screen."""
-
-_EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}
-"""LibRaw's `flip` as EXIF orientation."""
-
+MAP_SIDE: Final = 1600  # longer side of the picture in pixels at most (chosen): fills a usual screen
+_EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}  # libRaw's `flip` as EXIF orientation
 _PLAIN: Final = frozenset({"jpeg", "png"})
 _ORIENTATION: Final = 0x0112  # EXIF 2.3, tag Orientation
 
 
 def thumbnail(path: Path, kind: str, orientation: int) -> bytes:
-    """Render a photo file as a small upright JPEG, as cheaply as its kind allows.
-
-    Of RAW files the camera's embedded preview is used, or where there is none every second pixel.
-
-    Parameters
-    ----------
-    path : Path
-    kind : str
-        As inspection names it: raw, dng, tiff, png, jpeg.
-    orientation : int
-        EXIF orientation of the photo.
-    """
+    """Render a photo file as a small upright JPEG, as cheaply as its kind allows."""
+    # Of RAW files the camera's embedded preview is used, or where there is none every second pixel
     if kind in _PLAIN:
         with Image.open(path) as image:
             image.draft("RGB", (2 * THUMBNAIL_SIDE, 2 * THUMBNAIL_SIDE))

@@ -28,17 +28,14 @@ if TYPE_CHECKING:
     from obstore import GetResult
     from obstore.store import ClientConfig
 
+# Bytes that are read at once (chosen): large enough that calls cost nothing beside the copying
 CHUNK = 1 << 20
-"""Bytes that are read at once (chosen): large enough that calls cost nothing beside the copying."""
-
+# Seconds for one request to an object store (chosen): it moves at most 8 MiB, at 0.4 MiB/s
 PATIENCE_S: Final = 20.0
-"""Seconds for one request to an object store (chosen): it moves at most 8 MiB, at 0.4 MiB/s."""
-
+# Seconds to connect (chosen): a store that lives answers in far less, and a request waits for it
 CONNECT_S: Final = 5.0
-"""Seconds to connect (chosen): a store that lives answers in far less, and a request waits for it."""
-
+# A file in each folder of blobs: the empty mount point of a missing disk has none
 MARK: Final = "lensmodel-blobs"
-"""A file in each folder of blobs: the empty mount point of a missing disk has none."""
 
 
 class AsyncBlobWriter(Protocol):
@@ -73,19 +70,7 @@ def _is_on(name: str) -> bool:
 
 
 class Storage:
-    """All blobs of the service.
-
-    Parameters
-    ----------
-    url : str
-        ``file:///folder``, ``s3://bucket/prefix`` or another address that obstore knows.
-    patience_s : float
-        How long one request to an object store may take. It is retried once, quickly; jobs wait for
-        longer outages, and requests are answered with an error.
-    create : bool
-        Whether to create a missing folder. Where it may be unmounted rather than new use `settle`: a folder
-        that is created while its disk is missing hides that.
-    """
+    """All blobs of the service."""
 
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
         parts = urlsplit(url)
@@ -109,11 +94,9 @@ class Storage:
             (self.folder / MARK).write_text("Without this file the folder counts as not mounted.\n")
 
     def settle(self, newest: Callable[[], str | None]) -> None:
-        """Create the folder if it is new; leave one whose disk is only unmounted as it is.
-
-        It is new as long as no row names a file; `newest` returns the key of the file of the newest photo, by
-        which a folder is recognised that is older than the mark.
-        """
+        """Create the folder if it is new; leave one whose disk is only unmounted as it is."""
+        # It is new as long as no row names a file; `newest` returns the key of the file of the newest photo,
+        # by which a folder is recognised that is older than the mark
         if self.folder is None or self.is_there:
             return
         try:

@@ -20,23 +20,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.blobs.storage import Storage
-from app.errors import NotReadyError, UnknownPictureError
+from app.errors import NotReadyError, UnknownError
 
-TILE: Final = 512
-"""Side of a tile in pixels, as `static/viewer.js` has it."""
-
+TILE: Final = 512  # side of a tile in pixels, as `static/viewer.js` has it
+# Longer side of the whole picture in pixels at most (chosen): fills most screens until there are tiles
 WHOLE: Final = 1600
-"""Longer side of the whole picture in pixels at most (chosen): fills most screens until there are tiles."""
-
+# Places of the small parts, as fractions of height and width
 PLACES: Final = tuple((row, col) for row in (0.0, 0.5, 1.0) for col in (0.0, 0.5, 1.0))
-"""Places of the small parts, as fractions of height and width."""
-
+# Height and width of a small part in pixels (chosen): nine of them fill the width of a page
 PART: Final = (170, 255)
-"""Height and width of a small part in pixels (chosen): nine of them fill the width of a page."""
-
+# Bytes of one picture at most (chosen): JPEG of noise takes 1 MiB for a tile, 3 MiB for the whole
 MAX_PICTURE: Final = 4 << 20
-"""Bytes of one picture at most (chosen): JPEG of noise takes 1 MiB for a tile, 3 MiB for the whole."""
-
 _HEAD: Final = struct.Struct("<4sIII")  # signature, height, width, number of pictures
 _SIGNATURE: Final = b"LTL1"
 _FIRST_TILE: Final = 1 + len(PLACES)
@@ -106,7 +100,7 @@ def whole(storage: Storage, key: str) -> bytes:
 def part(storage: Storage, key: str, place: int) -> bytes:
     """Return the small part at one of `PLACES`."""
     if not 0 <= place < len(PLACES):
-        raise UnknownPictureError(f"the picture has {len(PLACES)} places, not one of number {place}")
+        raise UnknownError("photo", f"with a place {place}")
     return _read(storage, key, 1 + place)
 
 
@@ -115,7 +109,7 @@ def tile(storage: Storage, key: str, level: int, col: int, row: int) -> bytes:
     height, width, _ = _table(storage, key)
     levels = _levels(height, width)
     if not (level < len(levels) and row < levels[level][0] and col < levels[level][1]):
-        raise UnknownPictureError(f"the picture has no tile {level}/{col}_{row}")
+        raise UnknownError("photo", f"with a tile {level}/{col}_{row}")
     before = sum(rows * cols for rows, cols in levels[:level])
     return _read(storage, key, _FIRST_TILE + before + row * levels[level][1] + col)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.store.tables import KeyRow
 
 keys = typer.Typer(
-    help="""Make, list, renew and end the keys of a service that others can reach.
+    help="""Make, list and end the keys of a service that others can reach.
 
 Examples:
 
@@ -34,9 +34,7 @@ Exit status: 0 done, 1 it could not be, 2 wrong usage.""",
 )
 
 SPAN: Final = re.compile(r"(\d{1,6})(h|d|w|y)", re.ASCII)
-HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}
-"""Hours of each unit of a span."""
-
+HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}  # hours of each unit of a span
 GIB: Final = 1 << 30  # bytes of a GiB
 
 
@@ -188,29 +186,6 @@ Prefix = Annotated[str, typer.Argument(metavar="PREFIX", help="The characters af
 def _prefix(text: str) -> str:
     """Return the prefix of a key that was given wholly or in part."""
     return text.removeprefix("lpk_").partition("_")[0]
-
-
-@keys.command()
-def rotate(
-    prefix: Prefix,
-    keep: Annotated[
-        str, typer.Option(metavar="SPAN", help="How long the old key stays valid: 0h ends it at once.")
-    ] = "24h",
-    data: Data = None,
-) -> None:
-    """Make a key in place of another, with the same owner and scope, and print it, once.
-
-    Example:
-
-        lensmodel keys rotate abcd2345 --keep 1h
-
-    Exit status: 0 made, 1 there is no such valid key, 2 wrong usage.
-    """
-    with _opened(data) as store:
-        new_key = store.rotate_key(_prefix(prefix), keep=_span(keep))
-    if new_key is None:
-        raise InvalidInputError(f"no valid key begins with {_prefix(prefix)}: lensmodel keys list shows them")
-    _show(new_key.text)
 
 
 @keys.command()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, fields
 from inspect import iscoroutinefunction
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -34,7 +34,7 @@ class Services:
     store: Store
     storage: Storage
     models: ModelCache
-    uploads: Places
+    uploads: asyncio.Semaphore
     gate: Gate
     readiness: Fresh[Readiness]
 
@@ -56,31 +56,12 @@ class Fresh(Generic[T]):
             return self._value
 
 
-class Places:
-    """A limit on how many of something run at once, counted in the event loop."""
-
-    def __init__(self, free: int) -> None:
-        self.free = free
-
-    @contextmanager
-    def take(self, refusal: Exception) -> Iterator[None]:
-        """Take a place; raise the refusal where none is free."""
-        if self.free <= 0:
-            raise refusal
-        self.free -= 1
-        try:
-            yield
-        finally:
-            self.free += 1
-
-
 @dataclass(frozen=True, slots=True)
-class Call:
+class Call(Services):
     """One request: the services, who asks, and the head of the response."""
 
     request: Request
     response: Response
-    services: Services
     who: Who
 
     @property
@@ -88,30 +69,15 @@ class Call:
         """Owner of the data that the request concerns."""
         return self.who.owner
 
-    @property
-    def settings(self) -> Settings:
-        """The settings."""
-        return self.services.settings
-
-    @property
-    def store(self) -> Store:
-        """The tables."""
-        return self.services.store
-
-    @property
-    def storage(self) -> Storage:
-        """The blobs."""
-        return self.services.storage
-
-    @property
-    def models(self) -> ModelCache:
-        """The fitted models."""
-        return self.services.models
+    @classmethod
+    def of(cls, request: Request, response: Response, who: Who) -> Call:
+        """Return a request to the application that it came to."""
+        services: Services = request.app.state.services
+        parts = {part.name: getattr(services, part.name) for part in fields(services)}
+        return cls(**parts, request=request, response=response, who=who)
 
 
 BEARER = HTTPBearer(auto_error=False, description="A key that `lensmodel keys create` made.")
-"""For the OpenAPI description only; `Gate` identifies who asks."""
-
 NOBODY = Who("", ())
 
 
@@ -128,12 +94,12 @@ async def call_of(
     if who is None:
         who = await run_in_threadpool(services.gate.who, request)
     services.gate.admit(who, request.method)
-    return Call(request, response, services, who)
+    return Call.of(request, response, who)
 
 
 async def probe_of(request: Request, response: Response) -> Call:
     """Return the `Call` of a probe, which anybody may ask: it has no owner."""
-    return Call(request, response, request.app.state.services, NOBODY)
+    return Call.of(request, response, NOBODY)
 
 
 ProbeDep = Annotated[Call, Depends(probe_of)]
@@ -141,10 +107,9 @@ CallDep = Annotated[Call, Depends(call_of)]
 
 
 class OneSession(APIRoute):
-    """A route whose reads are all of one session of the database, and so of one moment.
+    """A route whose reads are all of one session of the database, and so of one moment."""
 
-    Not those of routes that wait: between two looks others must be able to change what they look at.
-    """
+    # Not those of routes that wait: between two looks others must be able to change what they look at
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """Return what answers a request, in a session that ends before the answer is sent."""

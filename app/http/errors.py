@@ -21,7 +21,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from app.errors import RangeError, ServiceError, StorageFullError
+from app.errors import ServiceError
 from app.runtime.outage import is_no_room, is_outage
 from app.schemas import FieldError, Problem
 from lensmodel.core import errors as library
@@ -30,15 +30,14 @@ log = logging.getLogger(__name__)
 
 MEDIA_TYPE: Final = "application/problem+json"
 REQUEST_ID: Final = "X-Request-ID"
+# Headers of every response unless it sets its own: no scripts, no sniffing, no embedding elsewhere
 HEADERS: Final[Mapping[str, str]] = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Headers of every response unless it sets its own: no scripts, no sniffing, no embedding elsewhere."""
-
-
+# Status of the codes that errors have and jobs end with; all others are faults of ours
 STATUS_OF_CODE: Final[Mapping[str, int]] = {
     **dict.fromkeys(("malformed_upload", "invalid_request"), 400),
     "not_signed_in": 401,
@@ -50,15 +49,10 @@ STATUS_OF_CODE: Final[Mapping[str, int]] = {
     **dict.fromkeys(("image_too_large", "decompression_bomb", "body_too_large"), 413),
     **dict.fromkeys(("not_an_image", "truncated_image", "unsupported_format", "raw_decode_failed"), 415),
     **dict.fromkeys(("metadata_missing", "invalid_parameter", "no_usable_patches", "outside_support"), 422),
-    **dict.fromkeys(("memory_limit", "time_limit"), 422),
+    **dict.fromkeys(("memory_limit", "time_limit", "turned_pixels"), 422),
     "quota_exceeded": 429,
     **dict.fromkeys(("busy", "outage"), 503),
 }
-"""Status of the codes that errors have and jobs end with; all others are faults of ours."""
-
-STATUS: Final[Mapping[type[Exception], int]] = {StorageFullError: 507, RangeError: 416}
-"""Errors whose status is not that of their code."""
-
 CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
     405: "method_not_allowed",
@@ -71,9 +65,9 @@ CODE_OF_STATUS: Final[Mapping[int, str]] = {
 
 def status_of(error: library.LensModelError) -> int:
     """Return the HTTP status of an error: its own, that of its code, or that of its nearest ancestor's."""
-    if type(error) in STATUS:
-        return STATUS[type(error)]
-    codes = (getattr(kind, "code", "") for kind in type(error).__mro__)
+    if isinstance(error, ServiceError) and error.status is not None:
+        return error.status
+    codes = (error.code, *(getattr(kind, "code", "") for kind in type(error).__mro__))
     return next((STATUS_OF_CODE[code] for code in codes if code in STATUS_OF_CODE), 500)
 
 
@@ -162,8 +156,8 @@ def install(app: FastAPI) -> None:
         status = status_of(error)
         if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, ServiceError):
             log.error("unexpected %s", error.code, exc_info=error)
-        extra = error if isinstance(error, ServiceError) else ServiceError("")
-        return respond(request, status, error.code, str(error), errors=extra.errors, headers=extra.headers)
+        headers = error.headers if isinstance(error, ServiceError) else {}
+        return respond(request, status, error.code, str(error), headers=headers)
 
     @app.exception_handler(RequestValidationError)
     @app.exception_handler(ValidationError)
@@ -203,10 +197,7 @@ def install(app: FastAPI) -> None:
     async def _bug(request: Request, error: Exception) -> Response:
         request_id = getattr(request.state, "request_id", None)  # no longer in the logging context here
         log.error(
-            "unexpected error, request_id=%s",
-            request_id,
-            exc_info=error,
-            extra={"request_id": request_id},
+            "unexpected error, request_id=%s", request_id, exc_info=error, extra={"request_id": request_id}
         )
         detail = "an error of ours; the log has it under this request_id"
         return respond(request, 500, "internal_error", detail)

@@ -13,7 +13,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
-from app.errors import ConflictError, UnknownLensError
+from app.errors import ConflictError, UnknownError
 from app.runtime import metrics
 from app.schemas import PsfModel
 from app.store import Store, StoredSample
@@ -25,9 +25,8 @@ from lensmodel.workflow.sampling import PRESETS
 
 log = logging.getLogger(__name__)
 
+# Memory of the models of one process (chosen): some hundred lenses of a hundred photos
 MAX_BYTES: Final = 1 << 30
-"""Memory of the models of one process (chosen): some hundred lenses of a hundred photos."""
-
 _Key: TypeAlias = tuple[str, int | None]
 
 
@@ -46,15 +45,7 @@ class Fitted:
 
 
 class ModelCache:
-    """Least recently used models of one process.
-
-    Parameters
-    ----------
-    store : Store
-        Where the samples are.
-    max_bytes : int, optional
-        Estimated size at most; the model in use is kept in any case.
-    """
+    """Least recently used models of one process."""
 
     def __init__(self, store: Store, max_bytes: int = MAX_BYTES) -> None:
         self._store, self._max_bytes = store, max_bytes
@@ -63,13 +54,11 @@ class ModelCache:
         self._building: dict[str, threading.Lock] = {}
 
     def get(self, lens_id: str, version: int | None = None, *, state: LensState | None = None) -> Fitted:
-        """Return the model of a lens, current or of an earlier version.
-
-        `state` is that of the lens if the caller has just read it.
-        """
+        """Return the model of a lens, current or of an earlier version."""
+        # `state` is that of the lens if the caller has just read it
         state = self._store.lenses.state_of(lens_id) if state is None else state
         if state is None:
-            raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
+            raise UnknownError("lens", lens_id)
         if version is not None and version != state.version:
             return self._earlier(lens_id, version, state)
         fitted = self._recall((lens_id, None))

@@ -19,29 +19,20 @@ from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import PsfAnswer
 from lensmodel.report.lens_report import UNKNOWN
 
-SIDE: Final = 1000
-"""Height of the frame of a map in pixels (chosen): only its aspect ratio matters."""
-
+SIDE: Final = 1000  # height of the frame of a map in pixels (chosen): only its aspect ratio matters
+# Part of a picture: left, top, width and height as fractions of it
 View: TypeAlias = tuple[float, float, float, float]
-"""Part of a picture: left, top, width and height as fractions of it."""
-
-DIGITS: Final = 10
-"""Decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001."""
-
+DIGITS: Final = 10  # decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001
 SCALE: Final = "X-PSF-Scale"
 ANSWERED_BY: Final = "X-PSF-Answered-By"
+# What headers say of pictures and arrays, which have no other room for it
 HEADERS: Final = {
     SCALE: "of one PSF as PNG: the value of white, and the gamma",
     ANSWERED_BY: "what made the answer, as `support.answered_by` of the JSON, which has no such header; of a "
     "map all that took part, those of most places first, with semicolons between",
 }
-"""What headers say of pictures and arrays, which have no other room for it."""
-
-GAP_PX: Final = 2
-"""Pixels between the kernels of a map (chosen for looks)."""
-
-HATCH_PX: Final = 7
-"""Pixels between the strokes over a cell that is not known (chosen for looks)."""
+GAP_PX: Final = 2  # pixels between the kernels of a map (chosen for looks)
+HATCH_PX: Final = 7  # pixels between the strokes over a cell that is not known (chosen for looks)
 
 
 def describe(
@@ -106,10 +97,9 @@ def field_map(
     aspect: float = 1.5,
     view: View = (0.0, 0.0, 1.0, 1.0),
 ) -> tuple[bytes, Mapping[str, str]]:
-    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak.
-
-    `ask` answers with a kernel of side `size`. Where too little is known the cell is hatched, as in reports.
-    """
+    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak."""
+    # `ask` answers with a kernel of side `size`. Where too little is known the cell is hatched, as in
+    # reports.
     frame = Frame(SIDE, round(SIDE * aspect))
     left_edge, top_edge, wide, high = view
     pitch = size + GAP_PX

@@ -15,6 +15,7 @@ from app.store.tables import Base, CorrectionRow, EventRow, LensRow, PatchRow, P
 
 M = TypeVar("M", bound=s.Model)
 
+# State of the job, by the state of the photo
 JOB_STATES: Final[dict[str, s.JobState]] = {
     "received": "queued",
     "inspecting": "running",
@@ -28,7 +29,6 @@ JOB_STATES: Final[dict[str, s.JobState]] = {
     "failed": "failed",
     "cancelled": "cancelled",
 }
-"""State of the job, by the state of the photo."""
 
 
 def _of(model: type[M], row: Base, **more: object) -> M:

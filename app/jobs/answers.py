@@ -181,13 +181,7 @@ class ReadProfile(Answer):
 
 
 def checked(kind: type[A], answer: Any) -> dict[str, Any]:  # noqa: ANN401 - a child's JSON
-    """Return the answer of a task as JSON of this kind.
-
-    Raises
-    ------
-    JobFailedError
-        If it is anything else.
-    """
+    """Return the answer of a task as JSON of this kind."""
     try:
         return kind.model_validate(answer).model_dump(exclude_unset=True)
     except (ValidationError, RecursionError) as error:

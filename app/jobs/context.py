@@ -10,7 +10,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -29,21 +29,18 @@ from lensmodel.core.types import ignore_step
 
 log = logging.getLogger(__name__)
 
+# Deaths of a child by a signal before its job fails (chosen): one may be the machine's fault, three are the
+# file's
 CRASHES: Final = 3
-"""Deaths of a child by a signal before its job fails (chosen): one may be the machine's fault, three are the
-file's."""
-
+# Seconds before the second attempt, four times as long before each further one (chosen): a machine short of
+# memory recovers, and its owner hardly waits
 BACKOFF_S: Final = 0.5
-"""Seconds before the second attempt, four times as long before each further one (chosen): a machine short of
-memory recovers, and its owner hardly waits."""
-
+# Address space in MiB of a task besides its picture (chosen): what libraries reserve, and room to spare
 SPARE_MB: Final = 768
-"""Address space in MiB of a task besides its picture (chosen): what libraries reserve, and room to spare."""
-
-
+SIBLINGS: Final = 7  # photos that tell of the defects of a sensor (chosen): more tell hardly more
+# Size of the cache at most (chosen: some seventy photos of 24 megapixels as planes of float32), or half of
+# the free disk if that is less
 KEEP_BYTES: Final = 20 << 30
-"""Size of the cache at most (chosen: some seventy photos of 24 megapixels as planes of float32), or half of
-the free disk if that is less."""
 
 
 class JobFailedError(Exception):
@@ -66,10 +63,12 @@ class JobContext:
     store: Store
     storage: Storage
     sandbox: Sandbox
+    warmed: threading.Event = field(default_factory=threading.Event)  # whether loops are compiled for all
     _locks: defaultdict[str, threading.Lock] = field(init=False)
 
     def __post_init__(self) -> None:
         self._locks = defaultdict(threading.Lock)
+        self.warmed.set()  # unless the worker says that it compiles them
 
     def attempt(
         self,
@@ -83,13 +82,13 @@ class JobContext:
         compiles_for: int | None = None,
         on_progress: ProgressHook = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
-        """Run a task, with retries where they can help; return its result.
-
-        After a death by signal the task is retried after a pause, after too little memory once with twice
-        as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
-        `JobFailedError`, or `OutageError` where the machine lacks disk space or memory. `compiles_for` is
-        the owner whose compiled code it may use and add to.
-        """
+        """Run a task, with retries where they can help; return its result."""
+        # After a death by signal the task is retried after a pause, after too little memory once with twice
+        # as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
+        # `JobFailedError`, or `OutageError` where the machine lacks disk space or memory. `compiles_for` is
+        # the owner whose compiled code it may use and add to.
+        if compiles_for is not None:
+            self.warmed.wait()  # else it would compile the same at the same time
         wanted = _patient(wanted)
         crashes = 0
         enlarged = False
@@ -132,11 +131,9 @@ class JobContext:
             time.sleep(0.05)
 
     def _give_way(self) -> NoReturn:
-        """Leave a job: for good if it was cancelled, else until another worker takes it over.
-
-        While this process shuts down the job must not look finished to the engine, so its
-        thread waits here until the process ends.
-        """
+        """Leave a job: for good if it was cancelled, else until another worker takes it over."""
+        # While this process shuts down the job must not look finished to the engine, so its thread waits here
+        # until the process ends
         while self.sandbox.stopping:
             time.sleep(1.0)
         raise NotWantedError
@@ -162,6 +159,18 @@ class JobContext:
                 text = f"the file of photo {photo.public_id} is no longer stored; upload it again"
                 raise JobFailedError("unknown_photo", text) from error
 
+    @contextmanager
+    def _siblings(self, photo: PhotoRow) -> Iterator[list[Path]]:
+        """Provide other photos of the same body, which tell of defects of its sensor, if they are here."""
+        found = [] if self.storage.folder is None else self.store.photos.siblings(photo, SIBLINGS)
+        with self.sandbox.folder() as folder, ExitStack() as opened:
+            paths = []
+            for row in found:
+                with suppress(OSError):  # deleted meanwhile
+                    file = self.storage.as_file(row.blob_key, folder, copied=self.sandbox.account is not None)
+                    paths.append(opened.enter_context(file))
+            yield paths
+
     def _is_stored(self, key: str) -> bool:
         """Say whether there is a blob; OSError while its folder is away: nothing is known then."""
         try:
@@ -183,9 +192,18 @@ class JobContext:
                 return target
             target.parent.mkdir(parents=True, exist_ok=True)
             limits = self.limits(photo, self.settings.develop_seconds, 120)
-            with self.original(photo) as path, self.sandbox.folder() as folder:
-                arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
-                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
+            with (
+                self.original(photo) as path,
+                self._siblings(photo) as siblings,
+                self.sandbox.folder() as folder,
+            ):
+                arguments = {
+                    "path": str(path),
+                    "siblings": [str(sibling) for sibling in siblings],
+                    "max_megapixels": self.settings.max_megapixels,
+                }
+                reads = [path, *siblings]
+                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=reads)
                 for name in (R_MAP, SHOWN):
                     if (folder / name).is_file():
                         self.storage.put_file(f"{photo.folder}{name}", folder / name)
@@ -209,17 +227,7 @@ def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
 
 
 def drop_developed(base: Path, existing: Callable[[Iterable[str]], set[str]], idle_s: float) -> None:
-    """Bound the cache in `base`; developed photos whose photo was deleted are removed first.
-
-    Parameters
-    ----------
-    base : Path
-        A folder for each photo.
-    existing : callable
-        Returns which of some photos exist.
-    idle_s : float
-        Folders used within so many seconds may be in use.
-    """
+    """Bound the cache in `base`; developed photos whose photo was deleted are removed first."""
     folders = [path for path in base.iterdir() if path.is_dir()] if base.is_dir() else []
     known = existing(path.name for path in folders)
     used = sorted((_used(path), path) for path in folders)

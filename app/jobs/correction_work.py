@@ -12,12 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any, Final
 
 from app.jobs.answers import Corrected, Measured, checked
-from app.jobs.context import (
-    SPARE_MB,
-    JobContext,
-    JobFailedError,
-    NotWantedError,
-)
+from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
@@ -42,12 +37,10 @@ MEDIA_TYPE: Final = {
     ".jpg": "image/jpeg",
     ".dng": "image/x-adobe-dng",
 }
-PROGRESS_S: Final = 0.5
-"""Seconds between two writes of the progress (chosen): each is a transaction."""
-
+PROGRESS_S: Final = 0.5  # seconds between two writes of the progress (chosen): each is a transaction
+# Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
+# most of it never touched
 THREAD_MB: Final = 136
-"""Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
-most of it never touched."""
 
 
 class CorrectionWork:
@@ -171,53 +164,31 @@ class CorrectionWork:
         def wanted() -> bool:
             return self._is_newest(lens_id, version)
 
-        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=self._context.settings.patch_seconds)
+        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=self._context.settings.task_seconds)
+        lens = lenses.get(lens_id, ANY_OWNER)
+        if lens is None:
+            return
         try:
             with self._context.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                mode = PRESETS[state.way].mode
                 metrics = self._context.attempt(
                     "measure",
-                    {"mode": mode},
+                    {"mode": PRESETS[state.way].mode, "about": self._about(lens)},
                     folder=folder,
                     limits=limits,
                     wanted=wanted,
-                    compiles_for=self._lens(lens_id).owner_id,
+                    compiles_for=lens.owner_id,
                 )
                 metrics = checked(Measured, metrics)
-                key = report_key(lens_id, version, state.rebuild_epoch)
-                self._report(lens_id, key, mode, folder, wanted)
+                if (folder / REPORT).is_file():
+                    key = report_key(lens_id, version, state.rebuild_epoch)
+                    self._context.storage.put_file(key, folder / REPORT)
         except NotWantedError:
             return
         except JobFailedError as error:
             log.warning("lens %s version %d could not be measured: %s", lens_id, version, error.detail)
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
-
-    def _report(self, lens_id: str, key: str, mode: str, folder: Path, wanted: Callable[[], bool]) -> None:
-        """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
-        settings = self._context.settings
-        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.task_seconds)
-        lens = self._lens(lens_id)
-        arguments = {"mode": mode, "about": self._about(lens)}
-        try:
-            self._context.attempt(
-                "report",
-                arguments,
-                folder=folder,
-                limits=limits,
-                wanted=wanted,
-                compiles_for=lens.owner_id,
-            )
-            self._context.storage.put_file(key, folder / REPORT)
-        except (JobFailedError, FileNotFoundError) as error:
-            log.warning("lens %s has no report: %s", lens_id, error)
-
-    def _lens(self, lens_id: str) -> LensRow:
-        lens = self._context.store.lenses.get(lens_id, ANY_OWNER)
-        if lens is None:
-            raise NotWantedError
-        return lens
 
     def _about(self, lens: LensRow) -> dict[str, Any]:
         """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from app.jobs.answers import Inspected, checked
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError
-from app.jobs.task_files import CLEANED, THUMBNAIL
+from app.jobs.task_files import CLEANED, PLACE, THUMBNAIL
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName
 from app.store.owners import ANY_OWNER
@@ -25,24 +25,51 @@ from lensmodel.core.names import name_key, serial_key
 
 log = logging.getLogger(__name__)
 
+MAX_WORD: Final = 20  # bytes of what a child says of the place: a word
+
+# Fields of a header that have columns of the same name
 _COLUMNS: Final = (
     *("camera_maker", "camera_model", "aperture", "focal_mm", "focus_m", "pixel_pitch_um"),
     *("orientation", "iso", "exposure_s"),
 )
-"""Fields of a header that have columns of the same name."""
 
 
 def inspect(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
-    """Read and record the header of a photo, and store a small picture of it."""
-    limits = TaskLimits(memory_mb=SPARE_MB, wall_s=context.settings.inspect_seconds)
+    """Read and record the header of a photo; remove its place, and store a small picture of it."""
+    _record(context, photo, _examined(context, photo, wanted))
+
+
+def remove_location(context: JobContext, photo: PhotoRow) -> PhotoRow:
+    """Remove the place from the file of a photo, once; return the photo with the file that it has now."""
+    photos = context.store.photos
+    if photo.location is not None or photo.file_gone_at is not None:
+        return photo
+    try:
+        _examined(context, photo, lambda: True)
+    except JobFailedError as error:
+        log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
+    searched = photos.get(photo.public_id, ANY_OWNER) or photo
+    if searched.location is None:  # its file is lost, which the doctor reports
+        photos.record_location(searched, "unknown")
+    return photos.get(photo.public_id, ANY_OWNER) or photo
+
+
+def _examined(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> dict[str, Any]:
+    """Have a child read a file; whatever it says of the header, keep what it says of the place."""
+    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
     with context.original(photo) as path, context.sandbox.folder() as folder:
         arguments = {"path": str(path), "max_megapixels": context.settings.max_megapixels}
-        info = context.attempt(
-            "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
-        )
-        info = checked(Inspected, info)
-        _keep_thumbnail(context, photo, info, path, wanted)
-    _record(context, photo, info)
+        try:
+            info = context.attempt(
+                "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
+            )
+        except JobFailedError:
+            _record_place(context, photo, folder)
+            raise
+        _record_place(context, photo, folder)
+        if (folder / THUMBNAIL).is_file():
+            context.storage.put_file(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
+        return checked(Inspected, info)
 
 
 def _record(context: JobContext, photo: PhotoRow, info: dict[str, Any]) -> None:
@@ -68,45 +95,19 @@ def body_key(maker: str | None, model: str | None, serial: str | None) -> str | 
     return hashlib.sha256(identity.encode()).hexdigest()[:16]
 
 
-def _keep_thumbnail(
-    context: JobContext, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
-) -> None:
-    """Store a small picture of the photo at `path`; none where it cannot be rendered."""
-    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
-    arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
-    with context.sandbox.folder() as folder:
-        outcome = context.sandbox.run(
-            "thumbnail", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
-        )
-        if outcome.ending == "ok" and (folder / THUMBNAIL).is_file():
-            context.storage.put_file(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
-
-
-def remove_location(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
-    """Remove the place from the file of a photo, once; return the photo with the file that it has now."""
-    if photo.location is not None or photo.file_gone_at is not None:
-        return photo
-    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
-    with context.original(photo) as path, context.sandbox.folder() as folder:
-        try:
-            found = context.attempt(
-                "location", {"path": str(path)}, folder=folder, limits=limits, wanted=wanted, reads=[path]
-            )
-        except JobFailedError as error:
-            log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
-            found = "unknown"
-        _record_location(context, photo, found, folder / CLEANED)
-    return context.store.photos.get(photo.public_id, ANY_OWNER) or photo
-
-
-def _record_location(context: JobContext, photo: PhotoRow, found: Any, cleaned: Path) -> None:  # noqa: ANN401 - a child's JSON
-    photos = context.store.photos
-    word = found if found in {"none", "removed"} else "unknown"
-    if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
-        with cleaned.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        key = f"{photo.folder}cleaned-{digest[:16]}"
-        context.storage.put_file(key, cleaned)
-        photos.record_location(photo, word, key=key, digest=digest)
-    else:
-        photos.record_location(photo, word)
+def _record_place(context: JobContext, photo: PhotoRow, folder: Path) -> None:
+    """Record what a child has written of the place; a file without it becomes that of the photo."""
+    if photo.location is not None:
+        return
+    photos, word, cleaned = context.store.photos, "unknown", folder / CLEANED
+    if (folder / PLACE).is_file() and (folder / PLACE).stat().st_size < MAX_WORD:
+        told = (folder / PLACE).read_text(encoding="ascii", errors="replace")
+        word = told if told in {"none", "removed"} else "unknown"
+        if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
+            with cleaned.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            key = f"{photo.folder}cleaned-{digest[:16]}"
+            context.storage.put_file(key, cleaned)
+            photos.record_location(photo, word, key=key, digest=digest)
+            return
+    photos.record_location(photo, word)

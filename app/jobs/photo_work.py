@@ -18,7 +18,7 @@ from typing import Any, Final
 from app.jobs import inspection
 from app.jobs.answers import ReadProfile, Selected, checked
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
-from app.jobs.queue import JobEngine
+from app.jobs.queue import DbosEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.other_lens import REMEDY, Described, difference
 from app.presets import configured_preset
@@ -37,38 +37,30 @@ from lensmodel.workflow.sampling import Preset
 
 log = logging.getLogger(__name__)
 
+# Seconds between two looks at the open cells of a photo (chosen): a cell takes seconds, a look one query
 WAIT_S: Final = 0.2
-"""Seconds between two looks at the open cells of a photo (chosen): a cell takes seconds, a look one query."""
-
+# Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one
 LOOK_AFTER_S: Final = 5.0
-"""Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one."""
-
-
+# Who chooses the patches of a photo that names nobody, of `lensmodel.patches.selectors`
 SELECTOR: Final = "r-map"
-"""Who chooses the patches of a photo that names nobody, of `lensmodel.patches.selectors`."""
-
-
+# Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken
 MAX_PLACES: Final = 1000
-"""Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken."""
-
+# How long the open photo of a pair waits until the closed one is inspected (chosen): that takes seconds,
+# unless many photos are before it
 WAIT_FOR_REFERENCE_S: Final = 60.0
-"""How long the open photo of a pair waits until the closed one is inspected (chosen): that takes
-seconds, unless many photos are before it."""
-
 _UNREAD: Final = ("received", "inspecting")
 _MEASURING: Final = 96  # bytes a pixel (chosen, by counting): two mapped photos, a float64 plane of each
 
+# Times the unpacked size that reading takes (chosen, by counting): bytes, float32, float64, the model
 COPIES: Final = 8
-"""Times the unpacked size that reading takes (chosen, by counting): bytes, float32, float64, the model."""
-
+# Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has
 MAX_UNPACKED: Final = 256 << 20
-"""Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has."""
 
 
 class PhotoWork:
     """Jobs of photos and of their cells."""
 
-    def __init__(self, context: JobContext, engine: JobEngine) -> None:
+    def __init__(self, context: JobContext, engine: DbosEngine) -> None:
         self._context, self._engine = context, engine
         self._store = context.store
 
@@ -144,7 +136,7 @@ class PhotoWork:
 class _Steps:
     """The work on a photo by rows and tasks: each step does only what the tables do not have yet."""
 
-    def __init__(self, context: JobContext, engine: JobEngine, photo: PhotoRow) -> None:
+    def __init__(self, context: JobContext, engine: DbosEngine, photo: PhotoRow) -> None:
         self._context, self._engine, self._photo = context, engine, photo
         self._store = context.store
         self._developed = Path()
@@ -172,7 +164,6 @@ class _Steps:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
         if self._photo.state != "inspecting":
             return True
-        self._photo = inspection.remove_location(self._context, self._photo, self._wanted)
         inspection.inspect(self._context, self._photo, self._wanted)
         self._photo = _row(self._store, self._photo.public_id)
         goes_on = self._identify()
@@ -299,10 +290,8 @@ class _Measured(_Steps):
     """A photo that was made to measure the lens: one task measures all over it."""
 
     def select(self) -> None:
-        """Measure; the places are the patches, and their samples are there at once.
-
-        A repeated call adds nothing twice.
-        """
+        """Measure; the places are the patches, and their samples are there at once."""
+        # A repeated call adds nothing twice
         photo, settings = self._photo, self._context.settings
         folders = [self._developed, *self._reference()]
         arguments = {
@@ -350,12 +339,12 @@ class _Measured(_Steps):
         self._finish()
 
 
+# States of a photo that is being worked on, with the one that comes before each
 _BEFORE: Final[Mapping[str, str]] = {
     "developing": "inspecting",
     "selecting": "developing",
     "estimating": "selecting",
 }
-"""States of a photo that is being worked on, with the one that comes before each."""
 
 
 def _row(store: Store, photo_id: str) -> PhotoRow:

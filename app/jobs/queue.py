@@ -1,4 +1,4 @@
-"""The durable queue behind a small protocol: every job that is enqueued is run, even after a crash.
+"""The durable queue: every job that is enqueued is run, even after a crash.
 
 The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. No other
 module uses it. A job is a name with a few ids and numbers; what it did is recorded in our own
@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import datetime
-from typing import Any, Final, Literal, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Literal, ParamSpec, TypeAlias, TypeVar
 
 from dbos import DBOS, DBOSConfig, EnqueueOptions
 from dbos import Serializer as DBOSSerializer
@@ -27,9 +27,7 @@ from app.store.jobs import Job, Kind
 
 log = logging.getLogger(__name__)
 
-JOB_PROTOCOL: Final = 1
-"""Raised when jobs of an older program can no longer be finished by this one."""
-
+JOB_PROTOCOL: Final = 1  # raised when jobs of an older program can no longer be finished by this one
 Status: TypeAlias = Literal["unknown", "waiting", "done", "lost"]
 Handler: TypeAlias = Callable[..., None]
 P = ParamSpec("P")
@@ -41,42 +39,13 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
     "correction": "corrections",
     "measure": "patches",
 }
+# Deaths of its worker after which a job is started again (chosen): the job of a photo only waits for others
+# and hardly kills one, the others may be what killed it
 MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
-"""Deaths of its worker after which a job is started again (chosen): the job of a photo only waits for others
-and hardly kills one, the others may be what killed it."""
-
-_DEATHS: Final = "deaths"
-"""Attribute of a job: how many workers have died of it, or while it ran."""
-
+_DEATHS: Final = "deaths"  # attribute of a job: how many workers have died of it, or while it ran
+# Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core
 POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
-"""Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core."""
-
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
-
-
-class JobEngine(Protocol):
-    """A durable queue with its workers."""
-
-    def start(self, handlers: Mapping[Kind, Handler]) -> None:
-        """Start running jobs: `handlers[kind](*arguments)`."""
-
-    def enqueue(self, job: Job) -> None:
-        """Enqueue a job; a second call does nothing, even after the job ended."""
-
-    def status(self, job: Job) -> Status:
-        """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
-
-    def take_over(self, executor_id: str) -> None:
-        """Put the running jobs of a dead worker back into the queue, or give them up."""
-
-    def holders(self) -> set[str]:
-        """Return the workers that run jobs, as far as the engine knows."""
-
-    def forget(self, before: datetime) -> int:
-        """Delete the records of jobs that ended before a time; return how many."""
-
-    def stop(self) -> None:
-        """Run no more jobs, without waiting for those that are running."""
 
 
 class _Json(DBOSSerializer):
@@ -93,19 +62,7 @@ class _Json(DBOSSerializer):
 
 
 class DbosEngine:
-    """DBOS in this process; one at a time, since the library keeps one state per process.
-
-    Parameters
-    ----------
-    url : str
-        SQLAlchemy address of the engine's own tables.
-    executor_id : str
-        A new id for each process: two processes of one id would run the same jobs.
-    slots : int
-        Children at once; one more job is fetched ahead, so that no slot idles until the next poll.
-    photos : int
-        Photos at once; they only wait for their cells.
-    """
+    """DBOS in this process; one at a time, since the library keeps one state per process."""
 
     def __init__(self, url: str, executor_id: str, *, slots: int, photos: int = 8) -> None:
         self._url, self._executor_id = url, executor_id
@@ -114,7 +71,7 @@ class DbosEngine:
         self._guard = threading.Lock()
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
-        """Open the tables, declare the queues, start running jobs. See `JobEngine`."""
+        """Open the tables, declare the queues, start running jobs: `handlers[kind](*arguments)`."""
         _switch_on_wal(self._url)
         config: DBOSConfig = {
             "name": "lensmodel",
@@ -139,7 +96,7 @@ class DbosEngine:
             )
 
     def enqueue(self, job: Job) -> None:
-        """Put a job into its queue. See `JobEngine`."""
+        """Put a job into its queue; a second call does nothing, even after the job ended."""
         with self._guard:
             if job.id in self._enqueued:
                 return
@@ -155,7 +112,7 @@ class DbosEngine:
             self._enqueued.add(job.id)
 
     def status(self, job: Job) -> Status:
-        """Look a job up. See `JobEngine`."""
+        """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
         record = _outside(DBOS.get_workflow_status, job.id)
         if record is None:
             with self._guard:
@@ -166,11 +123,9 @@ class DbosEngine:
         return "lost" if record.status == "CANCELLED" else "done"
 
     def take_over(self, executor_id: str) -> None:
-        """Resume the running jobs of a dead worker in their queues. See `JobEngine`.
-
-        Interrupted, it can be done again. Should two workers do it at once, a job may run twice: the tables
-        count what it did once.
-        """
+        """Resume the running jobs of a dead worker in their queues."""
+        # Interrupted, it can be done again. Should two workers do it at once, a job may run twice: the tables
+        # count what it did once.
         for row in _listed(status="PENDING", executor_id=executor_id, app_version=str(JOB_PROTOCOL)):
             deaths = (row.attributes or {}).get(_DEATHS, 0) + 1
             if deaths > MAX_DEATHS[row.name]:
@@ -180,12 +135,12 @@ class DbosEngine:
                 _outside(DBOS.resume_workflow, row.workflow_id, queue_name=row.queue_name)
 
     def holders(self) -> set[str]:
-        """Return the workers that run jobs. See `JobEngine`."""
+        """Return the workers that run jobs, as far as the engine knows."""
         running = _listed(status="PENDING", app_version=str(JOB_PROTOCOL))
         return {row.executor_id for row in running if row.executor_id is not None}
 
     def forget(self, before: datetime) -> int:
-        """Delete old records. See `JobEngine`."""
+        """Delete the records of jobs that ended before a time; return how many."""
         ended = _listed(
             status=["SUCCESS", "ERROR", "CANCELLED"], completed_before=before.isoformat(), limit=1000
         )
@@ -197,7 +152,7 @@ class DbosEngine:
         return len(ids)
 
     def stop(self) -> None:
-        """Close the tables. See `JobEngine`."""
+        """Run no more jobs, without waiting for those that are running."""
         DBOS.destroy(destroy_registry=True)
 
 
@@ -215,11 +170,9 @@ def _listed(**which: Any) -> list[Any]:  # noqa: ANN401 - of `DBOS.list_workflow
 
 
 def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
-    """Call the library as if outside of any job.
-
-    Inside a job it would record the call as one of the job's steps and replay it after a crash;
-    our jobs look at our tables instead.
-    """
+    """Call the library as if outside of any job."""
+    # Inside a job it would record the call as one of the job's steps and replay it after a crash; our jobs
+    # look at our tables instead
     return contextvars.Context().run(call, *arguments, **options)
 
 

@@ -22,9 +22,9 @@ from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
 from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
 
+# Pixels across a returned kernel at most (chosen): as in a profile, docs/topics/profile-format.md
 MAX_SIDE: Final = 255
-"""Pixels across a returned kernel at most (chosen): as in a profile, docs/topics/profile-format.md."""
-
+# What reading the answer of a task raises if the task did not write what it should
 DAMAGED: Final = (
     InvalidInputError,
     OSError,
@@ -32,19 +32,10 @@ DAMAGED: Final = (
     *(ArithmeticError, MemoryError, RecursionError),  # numbers, arrays and lists as large as one may claim
     TokenError,  # a header that NumPy takes for one of Python 2
 )
-"""What reading the answer of a task raises if the task did not write what it should."""
 
 
 def write_samples(folder: Path, samples: Sequence[PsfSample]) -> None:
-    """Write samples for a task, or for the worker that waits for them.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the task.
-    samples : sequence of PsfSample
-        One at least.
-    """
+    """Write samples for a task, or for the worker that waits for them."""
     packed = pack_samples(samples)
     with (folder / KERNELS).open("wb") as file:
         save_array(file, packed.kernels)
@@ -55,40 +46,12 @@ def write_samples(folder: Path, samples: Sequence[PsfSample]) -> None:
 
 
 def read_samples(folder: Path) -> list[PsfSample]:
-    """Read what `write_samples` wrote.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the task.
-
-    Returns
-    -------
-    list of PsfSample
-    """
+    """Read what `write_samples` wrote."""
     return unpack_samples(_packed(folder))
 
 
 def returned_samples(folder: Path, *, count: int) -> list[PsfSample]:
-    """Read the samples that a task returned, as untrusted input.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the task, which the photo that it decoded may have taken over.
-    count : int
-        How many there must be.
-
-    Returns
-    -------
-    list of PsfSample
-
-    Raises
-    ------
-    InvalidInputError
-        If there are not `count`, or their kernels are wider than `MAX_SIDE`, or a value is out of its range.
-        Files of another kind raise any other of `DAMAGED`.
-    """
+    """Read the samples that a task returned, as untrusted input."""
     if (folder / SAMPLES).stat().st_size > MAX_RESULT:
         raise InvalidInputError(f"{SAMPLES} is larger than {MAX_RESULT} bytes")
     packed = _packed(folder)

@@ -5,41 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-KERNELS: Final = "kernels.npy"
-"""Kernels, one a row: `(n, k, k)`."""
-
-SAMPLES: Final = "samples.json"
-"""Position, settings, weight and origin of each kernel."""
-
-ENCODED: Final = "encoded.npy"
-"""What patches say without a kernel, one a row."""
-
-CLEANED: Final = "cleaned"
-"""The file of a photo without the place where it was taken."""
-
-REPORT: Final = "report.json"
-"""The report of a lens test."""
-
+KERNELS: Final = "kernels.npy"  # kernels, one a row: `(n, k, k)`
+SAMPLES: Final = "samples.json"  # position, settings, weight and origin of each kernel
+ENCODED: Final = "encoded.npy"  # what patches say without a kernel, one a row
+PLACE: Final = "place"  # whether the file of a photo said where it was taken: none, removed or unknown
+CLEANED: Final = "cleaned"  # the file of a photo without the place where it was taken
+REPORT: Final = "report.json"  # the report of a lens test
+# Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`
 R_MAP: Final = "r-map.png"
-"""Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`."""
-
+# Small picture of a photo before it is developed, by `app.blobs.small_pictures`; stored ones too
 THUMBNAIL: Final = "glance.jpg"
-"""Small picture of a photo before it is developed, by `app.blobs.small_pictures`; stored ones too."""
-
-SHOWN: Final = "shown.tiles"
-"""The developed photo in full size, by `app.blobs.tiles`."""
-
+SHOWN: Final = "shown.tiles"  # the developed photo in full size, by `app.blobs.tiles`
+# A whole photo before and after its correction, by `app.blobs.tiles`
 SIDES: Final[Mapping[str, str]] = {"before": "before.tiles", "after": "after.tiles"}
-"""A whole photo before and after its correction, by `app.blobs.tiles`."""
-
+# A part of a photo before and after its correction; for sliders also without texture or grain
 LAYER_FILES: Final[Mapping[str, str]] = {
     "before": "before.png",
     "after": "after.png",
     "smooth": "smooth.png",
     "clean": "clean.png",
 }
-"""A part of a photo before and after its correction; for sliders also without texture or grain."""
-
+# Ending of a corrected file, by its format
 SUFFIX: Final[Mapping[str, str]] = {
     "tiff16": ".tif",
     "png16": ".png",
@@ -47,4 +33,3 @@ SUFFIX: Final[Mapping[str, str]] = {
     "jpeg": ".jpg",
     "dng": ".dng",
 }
-"""Ending of a corrected file, by its format."""

@@ -25,16 +25,8 @@ from app import distances
 from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
-from app.jobs.task_files import (
-    CLEANED,
-    LAYER_FILES,
-    R_MAP,
-    REPORT,
-    SHOWN,
-    SIDES,
-    SUFFIX,
-    THUMBNAIL,
-)
+from app.jobs.task_files import CLEANED, LAYER_FILES, PLACE, R_MAP, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
+from app.jobs.warming import warm
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import correction, photo
 from lensmodel import measured as lens_measure
@@ -55,11 +47,9 @@ from lensmodel.workflow import correcting, sampling
 
 log = logging.getLogger(__name__)
 
-CIFF: Final = b"HEAPCCDR"
-"""Signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS."""
-
+CIFF: Final = b"HEAPCCDR"  # signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS
+# What the library imports where it is used: here the fork server does it once, not each of its children
 LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
-"""What the library imports where it is used: here the fork server does it once, not each of its children."""
 
 for _module in LATE:
     importlib.import_module(_module)
@@ -77,28 +67,32 @@ _ready_for_loops()
 
 
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Read the header of `path`: size, kind, camera, lens, settings."""
-    del folder, progress
-    info = photo.inspect(Path(arguments["path"]), photo.Limits(max_megapixels=arguments["max_megapixels"]))
+    """Return the header of `path`: size, kind, camera, lens, settings.
+
+    To the folder go a word on whether it tells where it was taken, itself without that, a small picture.
+    """
+    del progress
+    path = Path(arguments["path"])
+    word = _without_place(path, folder / CLEANED)
+    (folder / PLACE).write_text(word, encoding="ascii")
+    info = photo.inspect(path, photo.Limits(max_megapixels=arguments["max_megapixels"]))
+    with contextlib.suppress(Exception):  # a photo without a small picture goes on
+        picture = small_pictures.thumbnail(path, info.kind, info.metadata.orientation or 1)
+        (folder / THUMBNAIL).write_bytes(picture)
     header: dict[str, Any] = codec.to_json(info)
     header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
     return header
 
 
-def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> str:
-    """Say whether the file at `path` tells where it was taken: none, removed or unknown.
-
-    Without the place it is written to the folder, of the same length.
-    """
-    del progress
-    path = Path(arguments["path"])
+def _without_place(path: Path, cleaned: Path) -> str:
+    """Copy a file without the place where it was taken, if it tells it; of the same length."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         if mapped[6:14] == CIFF:
             return "none"
         traces = find_location(mapped)
     if traces.overwrites:
-        shutil.copyfile(path, folder / CLEANED)
-        with (folder / CLEANED).open("r+b") as copy:
+        shutil.copyfile(path, cleaned)
+        with cleaned.open("r+b") as copy:
             for overwrite in traces.overwrites:
                 copy.seek(overwrite.start)
                 copy.write(overwrite.data)
@@ -107,20 +101,12 @@ def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
     return "removed" if traces.overwrites else "none"
 
 
-def thumbnail(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Render a small picture of the photo at `path`."""
-    del progress
-    kind, orientation = arguments["kind"], arguments["orientation"] or 1
-    picture = small_pictures.thumbnail(Path(arguments["path"]), kind, orientation)
-    (folder / THUMBNAIL).write_bytes(picture)
-    return {}
-
-
 def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Develop `path` to linear planes in the folder."""
     del progress
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
-    developed = photo.develop(Path(arguments["path"]), limits=limits)
+    siblings = [Path(name) for name in arguments.get("siblings", ())]
+    developed = photo.develop(Path(arguments["path"]), limits=limits, siblings=siblings)
     sampling.save_developed(developed, folder)
     (folder / R_MAP).write_bytes(small_pictures.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
@@ -156,10 +142,8 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
-    """Estimate the PSF of one field cell in each channel, from its patches.
-
-    The samples go to the folder.
-    """
+    """Estimate the PSF of one field cell in each channel, from its patches."""
+    # The samples go to the folder
     developed = sampling.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
     numbers = {(patch.row, patch.col): idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
@@ -182,11 +166,9 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
 
 
 def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Correct the photo in `developed` with the samples in the folder; write the result there.
-
-    A compressed photo that would gain nothing to be seen is left as it is, which some of its cells tell soon.
-    The photo's own samples join them, unless they are there already: `photo` is what they are called.
-    """
+    """Correct the photo in `developed` with the samples in the folder; write the result there."""
+    # A compressed photo that would gain nothing to be seen is left as it is, which some of its cells tell
+    # soon. The photo's own samples join them, unless they are there already: `photo` is what they are called.
     _log_compiling()
     developed = sampling.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
@@ -243,28 +225,24 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Return the error that the model of the samples in the folder expects in each zone."""
-    del progress
-    model = _model(folder, arguments["mode"])
+    """Return the errors that the model of the samples in the folder expects; write the report of the lens.
+
+    `about` has the name of the lens and the shape of its photos.
+    """
+    model, about = _model(folder, arguments["mode"]), arguments["about"]
+    lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
+    with contextlib.suppress(LensModelError):  # a lens without a report goes on
+        report = lens_report(
+            model,
+            about["name"],
+            aspect=about["aspect"],
+            height_px=about["height_px"],
+            lateral=lateral,
+            on_step=progress,
+        )
+        (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(report))), encoding="utf-8")
     error = codec.to_json(model.expected_errors())
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
-
-
-def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Write the report of the lens of the samples in the folder; `about` has its name and photo shape."""
-    model = _model(folder, arguments["mode"])
-    about = arguments["about"]
-    lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
-    result = lens_report(
-        model,
-        about["name"],
-        aspect=about["aspect"],
-        height_px=about["height_px"],
-        lateral=lateral,
-        on_step=progress,
-    )
-    (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(result))), encoding="utf-8")
-    return {}
 
 
 def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
@@ -311,17 +289,15 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
 
 TASKS: Final[Mapping[str, Task]] = {
-    "location": location,
     "inspect": inspect,
-    "thumbnail": thumbnail,
     "develop": develop,
     "select": select,
     "estimate": estimate,
     "correct": correct,
     "measure": measure,
-    "report": report,
     "measure-lens": measure_lens,
     "profile": profile,
+    "warm": warm,
 }
 
 for _registry in (estimators, selectors, correction.deconvolvers):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import os
@@ -14,18 +15,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 from structlog.contextvars import bound_contextvars
 
+import lensmodel
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
-from app.jobs.context import JobContext, JobFailedError, drop_developed
+from app.jobs.context import SPARE_MB, JobContext, JobFailedError, drop_developed
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
-from app.jobs.queue import DbosEngine, Handler, JobEngine
+from app.jobs.queue import DbosEngine, Handler
 from app.jobs.task_files import R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
@@ -33,47 +36,35 @@ from app.runtime.outage import Patience, is_outage
 from app.runtime.processes import end_with_parent, is_running, on_signals, started_at
 from app.runtime.settings import Settings
 from app.sandbox import account, confine
-from app.sandbox.runner import Budget, Sandbox
+from app.sandbox.outcome import TaskLimits
+from app.sandbox.runner import COMMON, Budget, Sandbox
 from app.store import Store
 from app.store.database import new_id
 from app.store.jobs import Job, Kind
 from app.store.owners import ANY_OWNER
-from app.store.tables import PhotoRow
 
 log = logging.getLogger(__name__)
 
+# Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)
 EXIT_FENCED: Final = 70
-"""Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)."""
-
 # seconds between two rounds of a duty, all chosen
 SWEEP_S: Final = 0.5  # of the tables for new work: a read of two indexes
 RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
+# How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into
 KEEP_JOBS: Final = timedelta(days=2)
-"""How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into."""
-
+# How long a job waits for a database, a storage or a disk before it fails (chosen): a night
 OUTAGE_S: Final = 12 * 3600.0
-"""How long a job waits for a database, a storage or a disk before it fails (chosen): a night."""
-
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"
 
 
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """Why a job was given up: a fixed code and a sentence for its owner."""
-
-    code: str
-    detail: str
-
-    @classmethod
-    def of(cls, error: BaseException) -> Ending:
-        """Return the ending of a job whose last attempt failed with this error."""
-        if is_outage(error):
-            return cls(
-                OUTAGE, f"the service waited in vain for what it needs ({type(error).__name__}): {_LATER}"
-            )
-        return cls("internal_error", _OURS)
+def ending_of(error: BaseException) -> JobFailedError:
+    """Return why a job is given up whose last attempt failed with this error."""
+    if not is_outage(error):
+        return JobFailedError("internal_error", _OURS)
+    text = f"the service waited in vain for what it needs ({type(error).__name__}): {_LATER}"
+    return JobFailedError(OUTAGE, text)
 
 
 _SUBJECT: Final = {
@@ -139,7 +130,7 @@ class Worker:
             Storage(settings.storage, patience_s=settings.storage_seconds, create=False),
             self._sandbox,
         )
-        self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
+        self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
         self._last_beat = time.monotonic()
         self._files = {path: _identity(path) for path in self._database_files()}
@@ -178,6 +169,8 @@ class Worker:
             "correction": corrections.correction,
             "measure": corrections.measure,
         }
+        self._context.warmed.clear()
+        threading.Thread(target=self._do, args=(self._warm,), daemon=True).start()
         self._engine.start({kind: self._safe(handler, kind) for kind, handler in handlers.items()})
         self._take_over_gone(host)
         self._start_thread(SWEEP_S, self._sweep)
@@ -264,7 +257,7 @@ class Worker:
                     else:
                         log.exception("job %s", name)
                     if pause is None:
-                        ending = Ending.of(error)
+                        ending = ending_of(error)
                         record.ending = ending.code
                         break
                     record.retries(error)
@@ -281,7 +274,7 @@ class Worker:
         self._stop.wait(seconds)
         self._hold_while_stopping()
 
-    def _end(self, job: Job, ending: Ending) -> None:
+    def _end(self, job: Job, ending: JobFailedError) -> None:
         """End the work of a job with a reason; changes nothing where that has ended meanwhile."""
         why, subject = (ending.code, ending.detail), str(job.arguments[0])
         number = int(job.arguments[1])
@@ -350,13 +343,15 @@ class Worker:
             if ended:
                 self._end(job, ended)
 
-    def _lost(self, job: Job) -> Ending | None:
+    def _lost(self, job: Job) -> JobFailedError | None:
         status = self._engine.status(job)
         if status == "unknown":
             self._engine.enqueue(job)
         if status == "lost":
-            return Ending("crashed_repeatedly", "the worker died each time that it tried; report the file")
-        return Ending("internal_error", _OURS) if status == "done" else None
+            return JobFailedError(
+                "crashed_repeatedly", "the worker died each time that it tried; report the file"
+            )
+        return JobFailedError("internal_error", _OURS) if status == "done" else None
 
     def _tidy(self) -> None:
         """Delete data that are no longer needed."""
@@ -367,7 +362,7 @@ class Worker:
         for photo_id in self._store.photos.read_profiles():
             self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))
         for photo in self._store.photos.unsearched():
-            self._do(partial(self._search, photo))
+            self._do(partial(remove_location, self._context, photo))
         expired = datetime.now(UTC) - timedelta(days=self._settings.keep_results_days)
         for correction_id in self._store.jobs.ended_before(expired):
             self._do(partial(self._store.jobs.delete, correction_id, ANY_OWNER))
@@ -378,11 +373,21 @@ class Worker:
         developed = self._context.developed_folder("x").parent
         drop_developed(developed, self._context.store.photos.existing, self._settings.task_seconds)
 
-    def _search(self, photo: PhotoRow) -> None:
+    def _warm(self) -> None:
+        """Compile the inner loops for all owners, unless that was done for this program."""
         try:
-            remove_location(self._context, photo, lambda: True)
-        except JobFailedError:  # its file is lost, which the doctor reports
-            self._store.photos.record_location(photo, "unknown")
+            cache = self._sandbox.cache
+            if cache is None or (done := cache / COMMON / f"warm-{fingerprint()}").exists():
+                return
+            limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=self._settings.task_seconds)
+            with self._sandbox.folder() as folder:
+                outcome = self._sandbox.run("warm", {}, folder=folder, limits=limits, compiles=COMMON)
+            if outcome.ending == "ok":
+                done.touch()
+            else:
+                log.warning("the inner loops were not compiled: %s", outcome.detail)
+        finally:
+            self._context.warmed.set()
 
     def _delete(self, prefix: str) -> None:
         if not self._store.jobs.claim_garbage(prefix):
@@ -401,6 +406,13 @@ class Worker:
         metrics.FENCED.inc()
         logging.shutdown()
         os._exit(EXIT_FENCED)
+
+
+def fingerprint() -> str:
+    """Return a digest of the library and its compiler: what was compiled for others is of no use."""
+    files = sorted(Path(lensmodel.__file__).parent.rglob("*.py"))
+    stamps = [(str(path), path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(f"{version('numba')} {stamps}".encode()).hexdigest()[:16]
 
 
 def _identity(path: Path) -> tuple[int, int]:

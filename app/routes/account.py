@@ -13,34 +13,29 @@ from starlette.responses import StreamingResponse
 from app.access import COOKIE, SESSION
 from app.blobs.account_data import erase, exported
 from app.http.dependencies import CallDep, OneSession, ProbeDep
-from app.routes.common import problems
+from app.routes.common import file_answer, file_headers, problems
 from app.routes.photos import most
 from app.runtime.settings import LOOPBACK
 from app.schemas import AccountOut, SessionOut, SignIn
 
 router = APIRouter(tags=["account"], route_class=OneSession)
+# Open to strangers, of whom one may be about to sign in
 sign_ins = APIRouter(tags=["account"], route_class=OneSession)
-"""Open to strangers, of whom one may be about to sign in."""
-
 HTTPS: Final = "https"
 
 
-@router.get("/account", operation_id="getAccount", responses=problems(401))
+@router.get("/account", operation_id="getAccount")
 def read_account(call: CallDep) -> AccountOut:
     """Return what the owner has, and may have."""
-    has = call.store.accounts.holdings_of(call.owner)
-    most_bytes, most_photos = most(call.settings, call.store.accounts.quota_of(call.owner))
+    usage = call.store.accounts.usage(call.owner)
+    max_bytes, max_photos = most(call.settings, usage)
     return AccountOut.model_validate(
         {
             "owner": call.owner,
             "scopes": call.who.scopes,
-            "photos": has.photos,
-            "max_photos": most_photos,
-            "stored_bytes": has.stored_bytes,
-            "max_stored_bytes": most_bytes,
-            "lenses": has.lenses,
-            "corrections": has.corrections,
-            "created_at": has.created_at,
+            "max_photos": max_photos,
+            "max_stored_bytes": max_bytes,
+            **{name: getattr(usage, name) for name in AccountOut.model_fields if hasattr(usage, name)},
         }
     )
 
@@ -49,39 +44,22 @@ def read_account(call: CallDep) -> AccountOut:
     "/account/export",
     operation_id="exportAccount",
     response_class=Response,
-    responses=problems(
-        401,
-        503,
-        also={
-            200: {
-                "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
-                "description": "All that is kept of the owner: rows as JSON lines, originals, results",
-            }
-        },
-    ),
+    responses=file_answer("application/zip", "Rows as JSON lines, originals, results"),
 )
 def export_account(call: CallDep) -> Response:
     """Return all that is kept of the owner as a ZIP file, which is made while it is sent."""
-    headers = {
-        "Content-Disposition": 'attachment; filename="lensmodel-account.zip"',
-        "Cache-Control": "private, no-store",
-    }
+    headers = file_headers("lensmodel-account.zip", cache="private, no-store")
     body = exported(call.store, call.storage, call.owner)
     return StreamingResponse(body, headers=headers, media_type="application/zip")
 
 
-@router.delete(
-    "/account",
-    operation_id="eraseAccount",
-    status_code=status.HTTP_204_NO_CONTENT,
-    responses=problems(401, 403),
-)
+@router.delete("/account", operation_id="eraseAccount", status_code=status.HTTP_204_NO_CONTENT)
 def erase_account(call: CallDep) -> None:
     """Erase the owner: photos, lenses, samples, corrections, keys and sign-ins. There is no way back.
 
     Begun, it is carried through, whatever happens to this request.
     """
-    call.services.gate.require(call.who, "admin")
+    call.gate.require(call.who, "admin")
     accounts = call.store.accounts
     key = accounts.begin_erasing(call.owner)
     if key is not None:
@@ -94,7 +72,7 @@ def erase_account(call: CallDep) -> None:
 )
 async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
-    gate = call.services.gate
+    gate = call.gate
     who, token = await run_in_threadpool(gate.sign_in, credentials.key.strip())
     call.response.set_cookie(
         COOKIE,
@@ -119,7 +97,7 @@ async def read_session(call: CallDep) -> SessionOut:
 )
 async def sign_out(call: ProbeDep) -> None:
     """Sign the browser out."""
-    await run_in_threadpool(call.services.gate.sign_out, call.request)
+    await run_in_threadpool(call.gate.sign_out, call.request)
     call.response.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=must_be_secure(call.request))
 
 

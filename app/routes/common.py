@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from typing import Annotated, Any, Protocol, TypeAlias, TypeVar
-from urllib.parse import urlencode
+from typing import Annotated, Any, Final, Protocol, TypeAlias, TypeVar
+from urllib.parse import quote, urlencode
 
 from fastapi import Query
 
-from app.errors import UnknownLensError
+from app.errors import UnknownError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
 from app.other_lens import Described
@@ -46,6 +47,26 @@ def problems(*statuses: int, also: Answers | None = None) -> Answers:
     return answers | (also or {})
 
 
+NOT_CHANGED: Final[Answers] = {304: {"description": "Not changed"}}
+
+
+def file_answer(media_type: str, description: str, status: int = 200) -> Answers:
+    """Return the OpenAPI entry of an answer that is a file."""
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {status: {"content": content, "description": description}}
+
+
+def file_headers(name: str, *, inline: bool = False, cache: str = "private, no-cache") -> dict[str, str]:
+    """Return the headers of a file that is saved under a name, or shown."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-") or "file"
+    how = "inline" if inline else "attachment"
+    return {
+        "Content-Disposition": f"{how}; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}",
+        "Cache-Control": cache,
+        "X-Content-Type-Options": "nosniff",
+    }
+
+
 def matches_tag(call: Call, tag: str) -> bool:
     """Say whether a request already has the answer of this tag (RFC 9110, 13.1.2)."""
     sent = call.request.headers.get("if-none-match", "")
@@ -56,7 +77,7 @@ def find_lens(call: Call, lens_id: str) -> LensRow:
     """Return a lens of the owner."""
     lens = call.store.lenses.get(lens_id, call.owner)
     if lens is None:
-        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
+        raise UnknownError("lens", lens_id)
     return lens
 
 

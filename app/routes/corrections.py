@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import re
 from typing import Final
-from urllib.parse import quote
 
 from fastapi import APIRouter, Response, status
 from starlette.responses import StreamingResponse
 
-from app.errors import (
-    ConflictError,
-    InvalidParameterError,
-    NotReadyError,
-    OtherLensError,
-    QuotaError,
-    RangeError,
-    UnknownCorrectionError,
-)
+from app.errors import ConflictError, InvalidParameterError, NotReadyError, UnknownError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
 from app.presets import configured_preset
-from app.routes import photos as photo_routes
 from app.routes.common import (
+    NOT_CHANGED,
     Cursor,
     Limit,
     OnlyId,
     cut,
     described_lens,
+    file_answer,
+    file_headers,
     find_lens,
     matches_tag,
     next_link,
     problems,
 )
-from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
+from app.routes.photos import SEND_AGAIN, check_usage, find_photo
 from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.photos import stored_settings
 from app.store.samples import LensState
@@ -53,13 +46,7 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
     operation_id="createCorrection",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=CorrectionOut,
-    responses=problems(
-        404,
-        409,
-        422,
-        429,
-        also={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
-    ),
+    responses={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
 )
 def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     """Correct a photo with the model of its lens, or of another."""
@@ -77,7 +64,8 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     if not options.any_lens and lens.id != photo.lens_id:
         _check_lens(call, photo, lens)
     version = _version_for(call, lens, options.lens_version)
-    _admit(call)
+    usage = call.store.accounts.usage(call.owner)
+    check_usage(call.settings, usage, usage.working_corrections, "corrections")
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
     params["method"] = options.method or configured_preset(call.settings, lens.way).method
     # with other settings of the photo the same request is a new correction
@@ -91,18 +79,6 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
     call.response.headers["Location"] = f"{V1}/corrections/{row.public_id}"
     return views.correction_out(row)
-
-
-def _admit(call: Call) -> None:
-    """Refuse a correction whose owner has too many unfinished ones, or stores too much."""
-    most_bytes, _ = most(call.settings, call.store.accounts.quota_of(call.owner))
-    check_stored(call.store.photos.load_of(call.owner)[1], most_bytes)
-    unfinished = call.store.jobs.unfinished_of(call.owner)
-    if unfinished >= photo_routes.MAX_UNFINISHED:
-        raise QuotaError(
-            f"{unfinished} corrections are unfinished, {photo_routes.MAX_UNFINISHED} may be: wait",
-            headers={"Retry-After": "30"},
-        )
 
 
 def _check_read(photo: PhotoRow) -> None:
@@ -155,7 +131,9 @@ def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
     )
     why = difference(described_lens(call, lens), own_lens)
     if why is not None:
-        raise OtherLensError(f"{photo.filename} seems to be of another lens: {why}; {REMEDY}")
+        raise ConflictError(
+            f"{photo.filename} seems to be of another lens: {why}; {REMEDY}", code="other_lens"
+        )
 
 
 def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
@@ -175,16 +153,13 @@ def find_correction(call: Call, correction_id: str) -> CorrectionRow:
     """Return a correction of the owner with its photo and lens."""
     row = call.store.jobs.correction(correction_id, call.owner)
     if row is None:
-        raise UnknownCorrectionError(f"there is no correction {correction_id[:60]}: it may be deleted")
+        raise UnknownError("correction", correction_id)
     return row
 
 
-@router.get("/corrections", operation_id="listCorrections", responses=problems(404, 422))
+@router.get("/corrections", operation_id="listCorrections")
 def list_corrections(
-    call: CallDep,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-    photo_id: OnlyId = None,
+    call: CallDep, limit: Limit = 50, cursor: Cursor = None, photo_id: OnlyId = None
 ) -> CorrectionPage:
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)
@@ -193,25 +168,20 @@ def list_corrections(
     return CorrectionPage(items=[*map(views.correction_out, page)], next=next_link(call, following))
 
 
-@router.get("/corrections/{correction_id}", operation_id="getCorrection", responses=problems(404, 422))
+@router.get("/corrections/{correction_id}", operation_id="getCorrection")
 def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
     """Return one correction."""
     return views.correction_out(find_correction(call, correction_id))
 
 
 @router.delete(
-    "/corrections/{correction_id}",
-    operation_id="deleteCorrection",
-    status_code=status.HTTP_204_NO_CONTENT,
-    responses=problems(404, 422),
+    "/corrections/{correction_id}", operation_id="deleteCorrection", status_code=status.HTTP_204_NO_CONTENT
 )
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
     prefix = call.store.jobs.delete(correction_id, call.owner)
     if prefix is None:
-        raise UnknownCorrectionError(
-            f"there is no correction {correction_id[:60]}: it may be deleted already"
-        )
+        raise UnknownError("correction", correction_id)
     call.storage.delete(prefix)
 
 
@@ -220,21 +190,7 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
     operation_id="getCorrectionResult",
     response_class=Response,
     responses=problems(
-        404,
-        409,
-        416,
-        422,
-        also={
-            200: {
-                "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
-                "description": "The file",
-            },
-            206: {
-                "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
-                "description": "A part",
-            },
-            304: {"description": "Not changed"},
-        },
+        416, also=file_answer("image/*", "The file") | file_answer("image/*", "A part", 206) | NOT_CHANGED
     ),
 )
 def read_result(correction_id: str, call: CallDep) -> Response:
@@ -249,13 +205,7 @@ def read_result(correction_id: str, call: CallDep) -> Response:
     assert row.result_key is not None
     assert row.result_bytes is not None
     tag = f'"{row.result_etag}"'
-    headers = {
-        "ETag": tag,
-        "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",
-        "Content-Disposition": _disposition(row.result_name or "corrected"),
-        "X-Content-Type-Options": "nosniff",
-    }
+    headers = {"ETag": tag, "Accept-Ranges": "bytes", **file_headers(row.result_name or "corrected")}
     if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     part = call.request.headers.get("range")
@@ -272,10 +222,8 @@ def read_result(correction_id: str, call: CallDep) -> Response:
 
 
 def byte_range(header: str | None, size: int) -> tuple[int, int]:
-    """Return the part of a file that a Range header asks for, its end excluded.
-
-    Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows.
-    """
+    """Return the part of a file that a Range header asks for, its end excluded."""
+    # Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None or match.group(0) == "bytes=-":
         return 0, size
@@ -287,13 +235,9 @@ def byte_range(header: str | None, size: int) -> tuple[int, int]:
     if last and first and int(last) < int(first):
         return 0, size
     if start >= size or start >= end:
-        raise RangeError(
+        raise InvalidParameterError(
             f"range {header!r} lies beyond the {size} bytes of the file",
             headers={"Content-Range": f"bytes */{size}"},
+            status=416,
         )
     return start, end
-
-
-def _disposition(name: str) -> str:
-    plain = re.sub(r"[^A-Za-z0-9._-]", "_", name)
-    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"

@@ -12,7 +12,6 @@ from typing import Final, get_args
 from fastapi import APIRouter, Response, status
 
 from app.http.dependencies import Call, CallDep, OneSession, ProbeDep
-from app.routes.common import problems
 from app.routes.jobs import LONG_POLL_S
 from app.routes.photos import GIB, MAX_UNFINISHED
 from app.routes.psf import MEDIA_TYPES
@@ -33,12 +32,9 @@ from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
 from lensmodel.patches import selectors
 
+# Seconds for which `/readyz` repeats its answer (chosen): strangers who ask often cost nothing
 FRESH_S: Final = 2.0
-"""Seconds for which `/readyz` repeats its answer (chosen): strangers who ask often cost nothing."""
-
-READY_S: Final = 3.0
-"""Seconds for all checks (chosen): less than the 5 s that container engines usually wait."""
-
+READY_S: Final = 3.0  # seconds for all checks (chosen): less than the 5 s that container engines usually wait
 probes = APIRouter(tags=["service"], route_class=OneSession)
 router = APIRouter(tags=["service"], route_class=OneSession)
 
@@ -56,7 +52,7 @@ def healthz() -> Health:
 )
 def readyz(call: ProbeDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
-    readiness = call.services.readiness.get(lambda: _readiness(call))
+    readiness = call.readiness.get(lambda: _readiness(call))
     if readiness.status != "ready":
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
     return readiness
@@ -131,7 +127,7 @@ def read_metrics(call: CallDep) -> Response:
     return Response(text, media_type=metrics.CONTENT_TYPE)
 
 
-@router.get("/version", operation_id="getVersion", responses=problems())
+@router.get("/version", operation_id="getVersion")
 def read_version(call: CallDep) -> VersionOut:
     """Return what runs here."""
     revision = migrate.current(call.store.database)

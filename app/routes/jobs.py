@@ -12,22 +12,19 @@ from fastapi import APIRouter, Query, Response, status
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import ConflictError, UnknownJobError
+from app.errors import ConflictError, UnknownError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
-from app.routes.common import Cursor, Limit, next_link, problems
+from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, next_link
 from app.routes.photos import SEND_AGAIN, candidates
-from app.runtime.outage import CODE as OUTAGE
-from app.schemas import JobOut, JobPage, RetriedOut
+from app.schemas import JobOut, JobPage
 
 router = APIRouter(tags=["jobs"], route_class=OneSession)
 
+# Longest that a question for a job waits for a change of it (chosen): proxies end requests after 30 s
 LONG_POLL_S: Final = 20.0
-"""Longest that a question for a job waits for a change of it (chosen): proxies end requests after 30 s."""
-
+# Seconds between two looks at a job that somebody waits for (chosen): each is one or two reads
 LOOK_S: Final = 0.5
-"""Seconds between two looks at a job that somebody waits for (chosen): each is one or two reads."""
-
 FINAL = {"succeeded", "failed", "cancelled"}
 
 
@@ -38,7 +35,7 @@ def find_job(call: Call, job_id: str) -> JobOut:
         return views.photo_job(photo, candidates(call, photo))
     correction = call.store.jobs.correction(job_id, call.owner)
     if correction is None:
-        raise UnknownJobError(f"there is no job {job_id[:60]}: its photo or correction may be deleted")
+        raise UnknownError("job", job_id)
     return views.correction_job(correction)
 
 
@@ -47,12 +44,8 @@ def fingerprint(job: JobOut) -> str:
     return hashlib.sha256(job.model_dump_json(exclude={"eta_seconds"}).encode()).hexdigest()[:16]
 
 
-@router.get("/jobs", operation_id="listJobs", responses=problems(422))
-def list_jobs(
-    call: CallDep,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-) -> JobPage:
+@router.get("/jobs", operation_id="listJobs")
+def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> JobPage:
     """List jobs of photos and corrections, newest first."""
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
     corrections = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1)
@@ -62,12 +55,7 @@ def list_jobs(
     return JobPage(items=newest[:limit], next=next_link(call, following))
 
 
-@router.get(
-    "/jobs/{job_id}",
-    operation_id="getJob",
-    response_model=JobOut,
-    responses=problems(404, 422, also={304: {"description": "Not changed"}}),
-)
+@router.get("/jobs/{job_id}", operation_id="getJob", response_model=JobOut, responses=NOT_CHANGED)
 async def read_job(
     job_id: str,
     call: CallDep,
@@ -100,7 +88,6 @@ async def read_job(
     operation_id="cancelJob",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=JobOut,
-    responses=problems(404, 409, 422),
 )
 def cancel_job(job_id: str, call: CallDep) -> JobOut:
     """Cancel a job: running parts of it stop within a second, nothing of it counts."""
@@ -116,7 +103,6 @@ def cancel_job(job_id: str, call: CallDep) -> JobOut:
     operation_id="retryJob",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=JobOut,
-    responses=problems(404, 409, 422),
 )
 def retry_job(job_id: str, call: CallDep) -> JobOut:
     """Start a failed or cancelled job anew."""
@@ -133,39 +119,11 @@ def retry_job(job_id: str, call: CallDep) -> JobOut:
     return job
 
 
-@router.post(
-    "/jobs/retry",
-    operation_id="retryJobs",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=RetriedOut,
-    responses=problems(409, 422),
-)
-def retry_jobs(
-    call: CallDep,
-    code: Annotated[str, Query(pattern="^[a-z_]{1,40}$", description="with which they failed")] = OUTAGE,
-    limit: Annotated[int, Query(ge=1, le=1000, description="jobs at once")] = 1000,
-) -> RetriedOut:
-    """Start anew all jobs that failed with a code, the oldest first; by default those that an outage ended.
-
-    Call it again until it says 0 where there are more than `limit`.
-    """
-    photos, corrections = call.store.photos, call.store.jobs
-    retried = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
-    rest = corrections.failed_by(call.owner, code, limit - retried) if retried < limit else []
-    return RetriedOut(retried=retried + sum(corrections.retry(key, call.owner) for key in rest))
-
-
 @router.get(
     "/jobs/{job_id}/events",
     operation_id="watchJob",
     response_class=EventSourceResponse,
-    responses=problems(
-        404,
-        422,
-        also={
-            200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events"}
-        },
-    ),
+    responses=file_answer("text/event-stream", "Events"),
 )
 async def watch_job(job_id: str, call: CallDep) -> EventSourceResponse:
     """Send the job as a server-sent event now and at each change, until it is finished.
@@ -187,8 +145,8 @@ async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
             return
         await asyncio.sleep(LOOK_S)
         try:
-            if not await run_in_threadpool(call.services.gate.is_still, call.who):
+            if not await run_in_threadpool(call.gate.is_still, call.who):
                 return  # the key was revoked meanwhile
             job = await run_in_threadpool(find_job, call, job.id)
-        except UnknownJobError:  # deleted while watched
+        except UnknownError:  # deleted while watched
             return

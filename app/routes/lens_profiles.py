@@ -5,26 +5,17 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import io
-import re
 import time
-from collections.abc import Mapping
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response, status
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import (
-    ConflictError,
-    MalformedUploadError,
-    OtherLensError,
-    ServiceError,
-    TooLargeError,
-    UnknownLensError,
-)
+from app.errors import ServiceError
 from app.http import upload
 from app.http.dependencies import Call, CallDep, OneSession
 from app.routes import jobs
-from app.routes.common import find_lens, problems
+from app.routes.common import file_answer, file_headers, find_lens, problems
 from app.routes.lenses import read_lens
 from app.routes.photos import delete_photo, receiving, recorded
 from app.schemas import V1, LensOut
@@ -34,25 +25,17 @@ from lensmodel.model.profile import LensProfile, write_profile
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 
-_PAGE: Final = 200
-"""Photos that are read at once (chosen): bounds the memory that a large lens takes."""
-
+_PAGE: Final = 200  # photos that are read at once (chosen): bounds the memory that a large lens takes
 _FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
-_REFUSALS: Final[Mapping[str, type[ServiceError]]] = {
-    "malformed_upload": MalformedUploadError,
-    "image_too_large": TooLargeError,
-    "memory_limit": TooLargeError,
-    "unknown_lens": UnknownLensError,
-    "other_lens": OtherLensError,
-}
-"""Responses by the code with which the reading of a profile failed; all others are conflicts."""
+# Codes with which the reading of a profile is refused as such; all others are conflicts
+_REFUSALS: Final = frozenset({"malformed_upload", "image_too_large", "unknown_lens", "other_lens"})
 
 
 @router.get(
     "/lenses/{lens_id}/profile",
     operation_id="getLensProfile",
     response_class=Response,
-    responses=problems(404, 409, 422, also={200: {"content": _FILE, "description": "A .lensprofile"}}),
+    responses=file_answer("application/zip", "A .lensprofile"),
 )
 def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     """Return all that was learned of a lens as one file, which the command line reads too."""
@@ -66,13 +49,8 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     )
     out = io.BytesIO()
     write_profile(out, profile)
-    words = lens.label or full_name(lens.maker, lens.model)
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", words).strip("-") or "lens"
-    headers = {
-        "Content-Disposition": f'attachment; filename="{plain}.lensprofile"',
-        "Cache-Control": "private, no-cache",
-        "X-Content-Type-Options": "nosniff",
-    }
+    name = lens.label or full_name(lens.maker, lens.model) or "lens"
+    headers = file_headers(f"{name}.lensprofile")
     return Response(out.getvalue(), media_type="application/zip", headers=headers)
 
 
@@ -80,7 +58,10 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     "/lenses/{lens_id}/profile",
     operation_id="addLensProfile",
     responses=problems(
-        *(400, 404, 408, 409, 413, 422, 429, 507),
+        400,
+        408,
+        413,
+        507,
         also={202: {"model": LensOut, "description": "Still being read: `Location` is its job"}},
     ),
     openapi_extra={"requestBody": {"required": True, "content": _FILE}},
@@ -105,8 +86,9 @@ async def add_lens_profile(
         file = await run_in_threadpool(call.store.photos.get, file.public_id, call.owner)
     if file is not None and file.state in {"failed", "cancelled"}:
         await run_in_threadpool(delete_photo, file.public_id, call)
-        refusal = _REFUSALS.get(file.error_code or "", ConflictError)
-        raise refusal(file.error_detail or "the reading of the profile was cancelled: send it again")
+        code = "image_too_large" if file.error_code == "memory_limit" else file.error_code
+        detail = file.error_detail or "the reading of the profile was cancelled: send it again"
+        raise ServiceError(detail, code=code if code in _REFUSALS else "conflict")
     if file is not None and file.state not in PHOTO_FINAL:
         call.response.status_code = status.HTTP_202_ACCEPTED
         call.response.headers["Location"] = f"{V1}/jobs/{file.public_id}"

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import replace
 from typing import Annotated, Any, Final, Literal
-from urllib.parse import quote
 
 from fastapi import APIRouter, Query, Response, status
 
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
-from app.routes.common import find_lens, matches_tag, problems
+from app.routes.common import NOT_CHANGED, file_headers, find_lens, matches_tag
 from app.schemas import Aperture, OptionalId
 from app.store.lenses import report_key
 from app.store.tables import LensRow
@@ -56,12 +54,7 @@ def stored_report(call: Call, lens: LensRow) -> LensReport:
     "/lenses/{lens_id}/report.{form}",
     operation_id="getLensReport",
     response_class=Response,
-    responses=problems(
-        404,
-        409,
-        422,
-        also={200: {"content": _CONTENT, "description": "Report"}, 304: {"description": "Not changed"}},
-    ),
+    responses={200: {"content": _CONTENT, "description": "Report"}, **NOT_CHANGED},
 )
 def read_report(
     lens_id: str,
@@ -84,12 +77,7 @@ def read_report(
     question = f"{form} {second_state} {aperture} {against_aperture}"
     digest = hashlib.sha256(f"{question} {channel} {compared}".encode()).hexdigest()[:12]
     tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{digest}"'
-    headers = {
-        "ETag": tag,
-        "Cache-Control": "private, no-cache",
-        "X-Content-Type-Options": "nosniff",
-        "Content-Disposition": _disposition(test.name, form),
-    }
+    headers = {"ETag": tag, **file_headers(f"{test.name}-report.{form}", inline=form == "pdf")}
     if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     if compared:
@@ -157,9 +145,3 @@ def _figures(comparison: Comparison) -> dict[str, Any]:
         "verdict": comparison.verdict,
         "zones": to_json(comparison.zones),
     }
-
-
-def _disposition(name: str, form: Form) -> str:
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-") or "lens"
-    how = "inline" if form == "pdf" else "attachment"
-    return f"{how}; filename=\"{plain}-report.{form}\"; filename*=UTF-8''{quote(name, safe='')}-report.{form}"

@@ -8,24 +8,20 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, status
 from pydantic import Field
 
-from app.errors import ConflictError, InvalidParameterError, OtherLensError, UnknownLensError
+from app.errors import ConflictError, InvalidParameterError, UnknownError
 from app.http import views
 from app.http.dependencies import CallDep, OneSession
 from app.other_lens import REMEDY, difference
-from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link
 from app.schemas import MAX_VERSION, CalibrationPage, Id, LateralOut, LensOut, LensPage, Name, Question
 from lensmodel.core.errors import NoSamplesError
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 
-@router.get("/lenses", operation_id="listLenses", responses=problems(422))
+@router.get("/lenses", operation_id="listLenses")
 def list_lenses(
-    call: CallDep,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-    model: OnlyName = None,
-    serial: OnlyName = None,
+    call: CallDep, limit: Limit = 50, cursor: Cursor = None, model: OnlyName = None, serial: OnlyName = None
 ) -> LensPage:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
@@ -35,7 +31,7 @@ def list_lenses(
     return LensPage(items=items, next=next_link(call, following))
 
 
-@router.get("/lenses/{lens_id}", operation_id="getLens", responses=problems(404, 422))
+@router.get("/lenses/{lens_id}", operation_id="getLens")
 def read_lens(lens_id: str, call: CallDep) -> LensOut:
     """Return one lens."""
     lens = find_lens(call, lens_id)
@@ -59,15 +55,13 @@ class LensIn(Question):
     label: Name = Field(description="what its owner calls it")
 
 
-@router.post(
-    "/lenses", operation_id="createLens", status_code=status.HTTP_201_CREATED, responses=problems(422)
-)
+@router.post("/lenses", operation_id="createLens", status_code=status.HTTP_201_CREATED)
 def create_lens(new: LensIn, call: CallDep) -> LensOut:
     """Create a lens, to add a profile to; photos create theirs by themselves."""
     return read_lens(call.store.lenses.create(call.owner, new.label), call)
 
 
-@router.patch("/lenses/{lens_id}", operation_id="changeLens", responses=problems(404, 409, 422))
+@router.patch("/lenses/{lens_id}", operation_id="changeLens")
 def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     """Rename a lens, merge it into another, or go back to an earlier version.
 
@@ -92,7 +86,7 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
             None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
         )
         if why is not None:
-            raise OtherLensError(f"the two seem to be different lenses: {why}; {REMEDY}")
+            raise ConflictError(f"the two seem to be different lenses: {why}; {REMEDY}", code="other_lens")
         if not lenses.merge(lens_id, change.merge_into, call.owner):
             raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
         return read_lens(change.merge_into, call)
@@ -105,19 +99,14 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     return read_lens(lens_id, call)
 
 
-@router.delete(
-    "/lenses/{lens_id}",
-    operation_id="deleteLens",
-    status_code=status.HTTP_204_NO_CONTENT,
-    responses=problems(404, 422),
-)
+@router.delete("/lenses/{lens_id}", operation_id="deleteLens", status_code=status.HTTP_204_NO_CONTENT)
 def delete_lens(lens_id: str, call: CallDep) -> None:
     """Delete a lens with its serial and all that was learned of it; its photos stay and can be corrected."""
     if not call.store.lenses.delete(lens_id, call.owner):
-        raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
+        raise UnknownError("lens", lens_id)
 
 
-@router.get("/lenses/{lens_id}/calibrations", operation_id="listCalibrations", responses=problems(404, 422))
+@router.get("/lenses/{lens_id}/calibrations", operation_id="listCalibrations")
 def list_calibrations(
     lens_id: str,
     call: CallDep,
@@ -132,9 +121,7 @@ def list_calibrations(
     return CalibrationPage(items=items, next=next_link(call, following))
 
 
-@router.get(
-    "/lenses/{lens_id}/lateral-colour", operation_id="getLateralColour", responses=problems(404, 409, 422)
-)
+@router.get("/lenses/{lens_id}/lateral-colour", operation_id="getLateralColour")
 def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     """Return the lateral colour shift, which the kernels do not contain.
 

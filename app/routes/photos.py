@@ -13,43 +13,39 @@ from fastapi import APIRouter, status
 from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
-from app.errors import (
-    BusyError,
-    ConflictError,
-    InvalidParameterError,
-    QuotaError,
-    ServiceError,
-    StorageFullError,
-    UnknownPhotoError,
-)
+from app.errors import BusyError, ConflictError, InvalidParameterError, QuotaError, ServiceError, UnknownError
 from app.http import middleware, upload, views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.middleware import CLOSE
 from app.routes.common import Cursor, Limit, OnlyId, cut, find_lens, next_link, problems
 from app.runtime.settings import MIB, Settings
-from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotosChange, PhotoState, UploadFields
+from app.schemas import (
+    V1,
+    PatchPage,
+    PhotoChange,
+    PhotoOut,
+    PhotoPage,
+    PhotosChange,
+    PhotoState,
+    UploadFields,
+)
 from app.store import LensName
-from app.store.accounts import Quota
+from app.store.accounts import Usage
 from app.store.database import new_id
 from app.store.photos import GIVEN_SETTINGS, NewCopy, Received
 from app.store.tables import LensRow, PhotoRow
-from lensmodel.core.errors import UnknownMethodError
 from lensmodel.patches import selectors
 
 router = APIRouter(tags=["photos"], route_class=OneSession)
 GIB = 1024 * MIB  # bytes
+# Longest that a photo may be on its way to us in seconds (chosen): 512 MiB come within it at 1.2 Mbit/s
 UPLOAD_S: Final = 3600.0
-"""Longest that a photo may be on its way to us in seconds (chosen): 512 MiB come within it at 1.2 Mbit/s."""
-
+# Files that are received at once (chosen): each takes a connection and a file, and hardly any memory
 MAX_UPLOADS: Final = 8
-"""Files that are received at once (chosen): each takes a connection and a file, and hardly any memory."""
-
+# Photos of one owner, unless his keys say another number (chosen): all that one photographer has
 MAX_PHOTOS: Final = 100_000
-"""Photos of one owner, unless his keys say another number (chosen): all that one photographer has."""
-
+# Photos, and corrections, of one owner that wait or are worked on (chosen): a day's work of one machine
 MAX_UNFINISHED: Final = 500
-"""Photos, and corrections, of one owner that wait or are worked on (chosen): a day's work of one machine."""
-
 SEND_AGAIN = "send the same file again, and ask then (LENS_KEEP_PHOTOS says how long files stay)"
 
 _FIELDS: Final = {
@@ -66,7 +62,7 @@ _UPLOAD_BODY: Final = {
     },
 }
 
-_REFUSED: Final = (400, 403, 404, 408, 409, 413, 415, 422, 429, 507)  # of uploads and the checks before them
+_REFUSED: Final = (400, 408, 413, 415, 507)  # of uploads and the checks before them
 _RECEIVED: Final = problems(
     *_REFUSED, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
 )
@@ -114,11 +110,10 @@ async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
 @asynccontextmanager
 async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
     """Admit an upload, whose body comes in the block; give the id of its row and the key of its blob."""
-    many = BusyError(
-        f"{MAX_UPLOADS} files are being received, more may not be: try again in a few seconds",
-        headers={"Retry-After": "5", **CLOSE},
-    )
-    with call.services.uploads.take(many):
+    if call.uploads.locked():
+        text = f"{MAX_UPLOADS} files are being received, more may not be: try again in a few seconds"
+        raise BusyError(text, headers={"Retry-After": "5", **CLOSE})
+    async with call.uploads:
         await run_in_threadpool(_admit, call)
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
@@ -143,13 +138,12 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
     """Create a photo from an upload."""
     try:
         _check_kind(call, uploaded.fields, measured=measured)
-        _check_selector(uploaded.fields)
         photo, fresh = _record(call, public_id, uploaded, key)
     except ServiceError:
         call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
         raise
     call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
-    call.response.headers["Location"] = photo.links.self
+    call.response.headers["Location"] = f"{V1}/photos/{photo.id}"
     return photo
 
 
@@ -166,20 +160,11 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         )
     if fields.reference_id is not None:
         find_photo(call, fields.reference_id)
-
-
-def _check_selector(fields: UploadFields) -> None:
-    """Refuse a selector that is not there, or one for a photo whose patches nobody chooses."""
-    if fields.selector is None:
-        return
-    if fields.kind is not None:
-        raise InvalidParameterError(
-            f"selector={fields.selector} and kind exclude each other: leave one of them out"
-        )
-    try:
-        selectors.create(fields.selector)
-    except UnknownMethodError as error:
-        raise InvalidParameterError(str(error)) from error
+    if fields.selector is not None and fields.kind is not None:
+        raise InvalidParameterError(f"selector={fields.selector} and kind exclude each other: leave one out")
+    if fields.selector is not None and fields.selector not in selectors:
+        known = ", ".join(selectors)
+        raise InvalidParameterError(f"no selector {fields.selector[:60]!r}; known: {known}")
 
 
 def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
@@ -197,40 +182,35 @@ def _admit(call: Call) -> None:
     free = call.storage.free_bytes()
     coming = middleware.declared_length(call.request.headers) or 0
     if free is not None and free - coming < limits.min_free_mb * MIB:
-        raise StorageFullError(
+        raise QuotaError(
             f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "
-            f"{coming / MIB:.1f} MiB are to come: delete photos, or make room on the disk"
+            f"{coming / MIB:.1f} MiB are to come: delete photos, or make room on the disk",
+            status=507,
         )
-    unfinished, stored, kept = call.store.photos.load_of(call.owner)
-    quota = call.store.accounts.quota_of(call.owner)
-    most_bytes, most_photos = most(limits, quota)
-    if unfinished >= MAX_UNFINISHED:
-        raise QuotaError(
-            f"{unfinished} photos are being worked on, {MAX_UNFINISHED} may be: wait for some to finish",
-            headers={"Retry-After": "30"},
-        )
-    check_stored(stored, most_bytes)
-    if kept >= most_photos:
-        raise QuotaError(
-            f"{kept} photos are there, {most_photos} may be: delete some", headers={"Retry-After": "3600"}
-        )
+    usage = call.store.accounts.usage(call.owner)
+    check_usage(limits, usage, usage.working_photos, "photos")
+    max_photos = most(limits, usage)[1]
+    if usage.photos >= max_photos:
+        text = f"{usage.photos} photos are there, {max_photos} may be: delete some"
+        raise QuotaError(text, headers={"Retry-After": "3600"})
 
 
-def check_stored(stored: int, most_bytes: int) -> None:
-    """Refuse more where an owner stores as many bytes of photos and results as he may."""
-    if stored >= most_bytes:
-        raise QuotaError(
-            f"{stored / GIB:.1f} GiB of photos and results are stored, {most_bytes / GIB:g} GiB may be: "
-            "delete some",
-            headers={"Retry-After": "3600"},
-        )
+def check_usage(settings: Settings, usage: Usage, working: int, what: str) -> None:
+    """Refuse more where an owner stores as many bytes, or has as much in work, as he may."""
+    if working >= MAX_UNFINISHED:
+        text = f"{working} {what} are being worked on, {MAX_UNFINISHED} may be: wait for some to finish"
+        raise QuotaError(text, headers={"Retry-After": "30"})
+    stored, max_bytes = usage.stored_bytes, most(settings, usage)[0]
+    if stored >= max_bytes:
+        kept = f"{stored / GIB:.1f} GiB of photos and results are stored, {max_bytes / GIB:g} GiB may be"
+        raise QuotaError(f"{kept}: delete some", headers={"Retry-After": "3600"})
 
 
-def most(settings: Settings, quota: Quota) -> tuple[int, int]:
+def most(settings: Settings, usage: Usage) -> tuple[int, int]:
     """Return how many bytes and how many photos an owner may have."""
     return (
-        int(settings.max_stored_gb * GIB) if quota.stored_bytes is None else quota.stored_bytes,
-        MAX_PHOTOS if quota.photos is None else quota.photos,
+        int(settings.max_stored_gb * GIB) if usage.quota_bytes is None else usage.quota_bytes,
+        MAX_PHOTOS if usage.quota_photos is None else usage.quota_photos,
     )
 
 
@@ -291,11 +271,11 @@ def find_photo(call: Call, photo_id: str) -> PhotoRow:
     """Return a photo of the owner."""
     photo = call.store.photos.get(photo_id, call.owner)
     if photo is None:
-        raise UnknownPhotoError(f"there is no photo {photo_id[:60]}: GET /v1/photos lists those there are")
+        raise UnknownError("photo", photo_id)
     return photo
 
 
-@router.get("/photos", operation_id="listPhotos", responses=problems(422))
+@router.get("/photos", operation_id="listPhotos")
 def list_photos(
     call: CallDep,
     limit: Limit = 50,
@@ -309,34 +289,29 @@ def list_photos(
     return PhotoPage(items=[views.photo_out(row) for row in page], next=next_link(call, following))
 
 
-@router.get("/photos/{photo_id}", operation_id="getPhoto", responses=problems(404, 422))
+@router.get("/photos/{photo_id}", operation_id="getPhoto")
 def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
     return described_photo(call, find_photo(call, photo_id))
 
 
-@router.get("/photos/{photo_id}/patches", operation_id="listPatches", responses=problems(404, 422))
+@router.get("/photos/{photo_id}/patches", operation_id="listPatches")
 def list_patches(photo_id: str, call: CallDep) -> PatchPage:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
     photo = find_photo(call, photo_id)
     return PatchPage(items=[views.patch_out(row) for row in call.store.photos.windows(photo.public_id)])
 
 
-@router.delete(
-    "/photos/{photo_id}",
-    operation_id="deletePhoto",
-    status_code=status.HTTP_204_NO_CONTENT,
-    responses=problems(404, 422),
-)
+@router.delete("/photos/{photo_id}", operation_id="deletePhoto", status_code=status.HTTP_204_NO_CONTENT)
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
     prefix = call.store.photos.delete(photo_id, call.owner)
     if prefix is None:
-        raise UnknownPhotoError(f"there is no photo {photo_id[:60]}: it may be deleted already")
+        raise UnknownError("photo", photo_id)
     call.storage.delete(prefix)
 
 
-@router.patch("/photos/{photo_id}", operation_id="changePhoto", responses=problems(404, 409, 422))
+@router.patch("/photos/{photo_id}", operation_id="changePhoto")
 def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     """Name the lens, correct the settings, take the photo out of its lens's model, or let it teach that.
 
@@ -355,12 +330,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     if change.calibrate and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
     done = call.store.photos.change(
-        photo_id,
-        call.owner,
-        given,
-        lens=lens,
-        excluded=change.excluded,
-        calibrate=bool(change.calibrate),
+        photo_id, call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
     )
     photo = find_photo(call, photo_id)
     if not done and lens is not None:
@@ -389,7 +359,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     return None
 
 
-@router.patch("/photos", operation_id="changePhotos", responses=problems(404, 409, 422))
+@router.patch("/photos", operation_id="changePhotos")
 def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 

@@ -23,13 +23,12 @@ from lensmodel.core.types import StepHook, ignore_step
 
 ROWS: Final = "app.db"
 BLOBS: Final = "blobs"
+# Snapshots until one has all its blobs (chosen): each failure needs a deletion in just these moments
 TRIES: Final = 5
-"""Snapshots until one has all its blobs (chosen): each failure needs a deletion in just these moments."""
-
+# The blobs that cannot be made again: photos, and results of corrections
 _NAMED: Final = """
     SELECT blob_key FROM photo WHERE deleted_at IS NULL AND file_gone_at IS NULL
     UNION SELECT result_key FROM correction WHERE state = 'succeeded' AND result_key IS NOT NULL"""
-"""The blobs that cannot be made again: photos, and results of corrections."""
 
 
 class BackupError(LensModelError):

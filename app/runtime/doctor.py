@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Final
 
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select, text, update
 
 from app.blobs.storage import Storage
 from app.runtime.outage import CODE as OUTAGE
@@ -24,9 +24,8 @@ from app.store.invariants import INVARIANTS
 from app.store.owners import now
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
 
+# Age of a blob without a row before it is deleted (chosen): its row may still be written
 STILL_COMING: Final = timedelta(minutes=30)
-"""Age of a blob without a row before it is deleted (chosen): its row may still be written."""
-
 _WITH_FILE: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
 
 
@@ -57,19 +56,9 @@ class DoctorReport:
 def examine(
     settings: Settings, store: Store, storage: Storage, *, repair: bool = False, deep: bool = False
 ) -> DoctorReport:
-    """Run all checks.
-
-    Parameters
-    ----------
-    settings, store, storage
-        The installation.
-    repair : bool
-        Mend findings where possible, each in a transaction of its own.
-    deep : bool
-        Read every photo and every kernel again and compare them with their checksums.
-    """
-    findings = list(_tables(store, repair=repair))
-    checks = [invariant.name for invariant in INVARIANTS]
+    """Run all checks."""
+    findings = list(_tables(store))
+    checks = ["database", *(invariant.name for invariant in INVARIANTS)]
     blobs: dict[str, Callable[[], Iterator[Violation]]] = {
         "work": lambda: _work(settings, store),
         "blobs": lambda: _blobs(store, storage, repair=repair),
@@ -82,19 +71,18 @@ def examine(
     return DoctorReport(tuple(checks), tuple(findings))
 
 
-def _tables(store: Store, *, repair: bool) -> Iterator[Violation]:
-    for invariant in INVARIANTS:
-        with store.database.reading() as session:
-            broken = invariant.find(session)
-        for subject in broken:
-            if invariant.mend is None or not repair:
-                remedy = invariant.remedy if invariant.mend is None else "lensmodel doctor --repair mends it"
+def _tables(store: Store) -> Iterator[Violation]:
+    remedy = "restore the last backup, and report it"
+    with store.database.reading() as session:
+        if store.database.is_sqlite:  # a database server checks its own pages
+            lines = [*session.scalars(text("PRAGMA integrity_check"))]
+            lines += [f"{row[0]} row {row[1]}" for row in session.execute(text("PRAGMA foreign_key_check"))]
+            for line in lines:
+                if line != "ok":
+                    yield Violation("database", str(line), "the database is damaged", remedy)
+        for invariant in INVARIANTS:
+            for subject in invariant.find(session):
                 yield Violation(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
-                continue
-            with store.database.writing() as session:
-                if subject in invariant.find(session):  # not mended by another process meanwhile
-                    invariant.mend(session, subject)
-            yield Violation(invariant.name, subject, f"was not so: {invariant.sentence}", "", mended=True)
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:

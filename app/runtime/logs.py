@@ -16,9 +16,9 @@ import structlog
 
 Format: TypeAlias = Literal["text", "json"]
 
+# Prefix of each further line of a record: no text from outside can imitate a record
 CONTINUED: Final = "\n    | "
-"""Prefix of each further line of a record: no text from outside can imitate a record."""
-
+# Fields of a record besides its text; the same names in the context of a thread and in `extra`
 FIELDS: Final = (
     "request_id",
     "job_id",
@@ -30,8 +30,6 @@ FIELDS: Final = (
     "status",
     "ms",
 )
-"""Fields of a record besides its text; the same names in the context of a thread and in `extra`."""
-
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 

@@ -10,14 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    generate_latest,
-    start_http_server,
-)
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest, start_http_server
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_1_0_0
 from prometheus_client.registry import Collector
@@ -27,10 +20,9 @@ from app.store import Store
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_1_0_0
 
 _QUICK: Final = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
+# Upper bounds of the buckets in seconds, of requests and of jobs: the goals of 5, 20 and 100 ms are among
+# them, the others are chosen, about evenly on a logarithmic scale
 _LONG: Final = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0)
-"""Upper bounds of the buckets in seconds, of requests and of jobs: the goals of 5, 20 and 100 ms are among
-them, the others are chosen, about evenly on a logarithmic scale."""
-
 API: Final = CollectorRegistry()
 WORKER: Final = CollectorRegistry()
 

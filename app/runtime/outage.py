@@ -21,36 +21,27 @@ from sqlalchemy import exc
 
 log = logging.getLogger(__name__)
 
-CODE: Final = "outage"
-"""Error code of a job that waited in vain."""
-
+CODE: Final = "outage"  # error code of a job that waited in vain
 FIRST_PAUSE_S: Final = 1.0
+# Shortest and longest pause before a retry (chosen): a restart of the database takes seconds, and after a
+# long outage work goes on within a minute
 LONGEST_PAUSE_S: Final = 60.0
-"""Shortest and longest pause before a retry (chosen): a restart of the database takes seconds, and after
-a long outage work goes on within a minute."""
-
+# Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
+# fault is reported soon
 BUGS: Final = 3
-"""Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
-fault is reported soon."""
-
-_SQLITE_FULL: Final = 13
-"""SQLITE_FULL of sqlite3.h."""
-
-_POSTGRES_FULL: Final = "53100"
-"""SQLSTATE disk_full (PostgreSQL documentation, appendix A)."""
-
+_SQLITE_FULL: Final = 13  # SQLITE_FULL of sqlite3.h
+_POSTGRES_FULL: Final = "53100"  # SQLSTATE disk_full (PostgreSQL documentation, appendix A)
+# How the storage reports ENOSPC and EDQUOT of Linux: the disk, or the quota of its user, is full
 _FULL: Final = ("os error 28", "os error 122")
-"""How the storage reports ENOSPC and EDQUOT of Linux: the disk, or the quota of its user, is full."""
-
+# SQLITE_ERROR of sqlite3.h, an invalid statement; every other code is a fault of the machine
 _SQLITE_ERROR: Final = 1
-"""SQLITE_ERROR of sqlite3.h, an invalid statement; every other code is a fault of the machine."""
-
 NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 _MACHINE: Final = NO_ROOM | {
     *(errno.EIO, errno.EROFS, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.EBUSY),
     *(errno.ENOMEM, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
     *(errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTDOWN, errno.EHOSTUNREACH),
 }
+# Errors of a working store; all others, including wrong credentials, can be mended while jobs wait
 _OF_THE_REQUEST: Final = (
     stored.NotFoundError,
     stored.AlreadyExistsError,
@@ -59,7 +50,6 @@ _OF_THE_REQUEST: Final = (
     stored.NotSupportedError,
     stored.PreconditionError,
 )
-"""Errors of a working store; all others, including wrong credentials, can be mended while jobs wait."""
 
 
 class OutageError(Exception):
@@ -104,15 +94,7 @@ def missable() -> Iterator[None]:
 
 
 class Patience:
-    """How long to wait after each failure of one job, and when to give up.
-
-    Parameters
-    ----------
-    outage_s : float
-        How long outages are waited for, from the first one on.
-    clock, rng
-        Replaced in tests.
-    """
+    """How long to wait after each failure of one job, and when to give up."""
 
     def __init__(
         self,
@@ -127,11 +109,9 @@ class Patience:
         self._outages = self._bugs = 0
 
     def pause_after(self, error: BaseException) -> float | None:
-        """Return how many seconds to wait before the next try; None = give up.
-
-        The pause doubles from 1 s to at most 60 s, and is drawn between 1 s and that: jobs that
-        failed together do not come back together.
-        """
+        """Return how many seconds to wait before the next try; None = give up."""
+        # The pause doubles from 1 s to at most 60 s, and is drawn between 1 s and that: jobs that failed
+        # together do not come back together
         if is_outage(error):
             now = self._clock()
             self._began = now if self._began is None else self._began

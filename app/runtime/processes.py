@@ -15,18 +15,13 @@ from typing import Final
 
 STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 
-PARENT: Final = "LENSMODEL_PARENT"
-"""Environment variable with the process id of the supervisor."""
-
-_PR_SET_PDEATHSIG: Final = 1
-"""Of linux/prctl.h."""
+PARENT: Final = "LENSMODEL_PARENT"  # environment variable with the process id of the supervisor
+_PR_SET_PDEATHSIG: Final = 1  # of linux/prctl.h
 
 
 def started_at(pid: int) -> float:
-    """Return when a process began, in clock ticks since the machine started; 0 where unknown.
-
-    Process ids are reused; id and start time together are not.
-    """
+    """Return when a process began, in clock ticks since the machine started; 0 where unknown."""
+    # Process ids are reused; id and start time together are not
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -56,12 +51,10 @@ def end_with_parent() -> None:
 
 
 def on_signals(stop: Callable[[signal.Signals], None], numbers: Sequence[int] = STOPPING) -> None:
-    """Call `stop` in a thread of its own each time that one of the signals comes.
-
-    A handler runs between two instructions of the main thread. If it set the very event that this thread is
-    waiting for, or wrote to the log that this thread is writing to, it could wait for a lock that its own
-    thread holds, for ever. So it writes one byte, which takes no lock.
-    """
+    """Call `stop` in a thread of its own each time that one of the signals comes."""
+    # A handler runs between two instructions of the main thread. If it set the very event that this thread is
+    # waiting for, or wrote to the log that this thread is writing to, it could wait for a lock that its own
+    # thread holds, for ever. So it writes one byte, which takes no lock.
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 

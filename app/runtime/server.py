@@ -15,14 +15,11 @@ from app.runtime.processes import end_with_parent, on_signals
 from app.runtime.settings import Settings
 from app.sandbox import confine
 
-SOCKET: Final = "LENSMODEL_SOCKET"
-"""Environment variable with the file descriptor of the listening socket."""
-
+SOCKET: Final = "LENSMODEL_SOCKET"  # environment variable with the file descriptor of the listening socket
+# Connections at once; more get 503 (chosen): fewer than the files that a process may have open
 MAX_CONNECTIONS: Final = 1000
-"""Connections at once; more get 503 (chosen): fewer than the files that a process may have open."""
-
+# How long open requests may take after the order to stop (chosen): less than `supervisor.STOP_S`
 GRACE_S: Final = 5
-"""How long open requests may take after the order to stop (chosen): less than `supervisor.STOP_S`."""
 
 
 def run(settings: Settings, listener: socket.socket) -> None:

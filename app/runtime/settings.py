@@ -18,19 +18,16 @@ from app.sandbox import account
 from lensmodel.core.errors import UnknownMethodError
 
 PREFIX = "LENS_"
-CLIENT_KEY = "LENS_API_KEY"
-"""Not a setting of the service: the key that its clients send."""
-
+CLIENT_KEY = "LENS_API_KEY"  # not a setting of the service: the key that its clients send
 MIB = 1024 * 1024  # bytes
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
 class Settings(BaseSettings):
-    """Configuration of one process; frozen, passed on, never looked up again.
+    """Configuration of one process; frozen, passed on, never looked up again."""
 
-    Unknown names in the environment that begin with `LENS_` are an error: most likely a mistyped
-    setting that the operator believes to be in force.
-    """
+    # Unknown names in the environment that begin with `LENS_` are an error: most likely a mistyped setting
+    # that the operator believes to be in force
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True)
 
@@ -57,8 +54,7 @@ class Settings(BaseSettings):
     )
 
     allowed_hosts: str = Field(
-        default="",
-        description="Names by which others reach it, by commas: behind a proxy, or in a network.",
+        default="", description="Names by which others reach it, by commas: behind a proxy, or in a network."
     )
 
     max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
@@ -113,7 +109,7 @@ class Settings(BaseSettings):
     task_seconds: float = Field(
         default=3600.0,
         gt=0,
-        description="Longest that correcting a photo may take; reading its header a 180th of it, developing "
+        description="Longest that correcting a photo may take; reading its header a 90th of it, developing "
         "a 20th, estimating in one cell a 6th.",
     )
     patches: int = Field(
@@ -128,8 +124,7 @@ class Settings(BaseSettings):
     )
 
     metrics_address: str = Field(
-        default="",
-        description="Where a worker has /metrics of its own, as 127.0.0.1:9000; empty: nowhere.",
+        default="", description="Where a worker has /metrics of its own, as 127.0.0.1:9000; empty: nowhere."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least that is logged."
@@ -224,7 +219,7 @@ class Settings(BaseSettings):
     @property
     def inspect_seconds(self) -> float:
         """Longest that reading the header of a photo may take."""
-        return self.task_seconds / 180
+        return self.task_seconds / 90
 
     @property
     def develop_seconds(self) -> float:

@@ -37,18 +37,13 @@ from lensmodel.core.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-POLL_S: Final = 0.1
-"""Seconds between two looks at the members (chosen): two calls of waitpid."""
-
+POLL_S: Final = 0.1  # seconds between two looks at the members (chosen): two calls of waitpid
+# Seconds between two requests of `/readyz` during the start (chosen): few beside a start of some seconds
 READY_POLL_S: Final = 0.25
-"""Seconds between two requests of `/readyz` during the start (chosen): few beside a start of some seconds."""
-
+# How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`
 STOP_S: Final = 15.0
-"""How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""
-
+# Modules of the members; tests replace the worker
 WORKER, API = "app.runtime.worker_main", "app.runtime.server"
-"""Modules of the members; tests replace the worker."""
-
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -71,11 +66,9 @@ def run_api(settings: Settings) -> None:
 
 
 def run_worker(settings: Settings) -> None:
-    """Replace this process by a worker.
-
-    A new program rather than a call: children import the main module of their parent again, and
-    that of a worker is small for this reason.
-    """
+    """Replace this process by a worker."""
+    # A new program rather than a call: children import the main module of their parent again, and that of a
+    # worker is small for this reason
     confine.keep_private()
     require_sandbox(settings)
     _migrate(settings)

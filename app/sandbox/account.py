@@ -23,18 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+# Special values of `LENS_TASK_USER`: the first of `USUAL` that exists; no separate account
 AUTO, NONE = "auto", "none"
-"""Special values of `LENS_TASK_USER`: the first of `USUAL` that exists; no separate account."""
-
 USUAL: Final = ("lens-task", "nobody")
-THROUGH: Final = 0o710
-"""Mode of a folder that the account may pass through but not list."""
-
+THROUGH: Final = 0o710  # mode of a folder that the account may pass through but not list
+# CAP_KILL, to end children, CAP_SETGID and CAP_SETUID (linux/capability.h)
 _NEEDED: Final = 1 << 5 | 1 << 6 | 1 << 7
-"""CAP_KILL, to end children, CAP_SETGID and CAP_SETUID (linux/capability.h)."""
-
+# _LINUX_CAPABILITY_VERSION_3 of linux/capability.h: two words of 32 bits for each set
 _CAPABILITY_VERSION: Final = 0x20080522
-"""_LINUX_CAPABILITY_VERSION_3 of linux/capability.h: two words of 32 bits for each set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +72,8 @@ class SystemAccount:
             path.chmod(mode)
 
     def is_of_use(self, data: Path) -> bool:
-        """Say whether children may change to it, and can then read the program and reach a data folder.
-
-        Tried in a forked process: call it while this one has a single thread.
-        """
+        """Say whether children may change to it, and can then read the program and reach a data folder."""
+        # Tried in a forked process: call it while this one has a single thread
         if not may_change():
             return False
         program = [Path(entry) for entry in [*sys.path, sys.prefix, sys.base_prefix] if entry]

@@ -29,27 +29,18 @@ from lensmodel.core import files
 from lensmodel.core.errors import LensModelError
 
 ProgressHook: TypeAlias = Callable[[int, int], None]
+# Called as `task(arguments, folder, progress)`; returns what JSON can write
 Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
-"""Called as `task(arguments, folder, progress)`; returns what JSON can write."""
-
 RESULT: Final = "result.json"
-COMPILED: Final = "compiled"
-"""Folder in that of a task with what it has compiled, as Numba keeps it."""
-
+COMPILED: Final = "compiled"  # folder in that of a task with what it has compiled, as Numba keeps it
+# Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes
 MAX_TEXT: Final = 4000
-"""Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes."""
-
 _MIB: Final = 1024 * 1024  # bytes
+# Default niceness of tasks above that of the worker (chosen): a tenth of the weight of one at 0, see sched(7)
 NICENESS: Final = 10
-"""Default niceness of tasks above that of the worker (chosen): a tenth of the weight of a process at 0
-(sched(7))."""
-
+# Seconds between two messages of progress (chosen): a bar that moves, and hardly any work for the parent
 _PROGRESS_S: Final = 0.1
-"""Seconds between two messages of progress (chosen): a bar that moves, and hardly any work for the parent."""
-
-_PR_SET_PDEATHSIG: Final = 1
-"""Of linux/prctl.h."""
-
+_PR_SET_PDEATHSIG: Final = 1  # of linux/prctl.h
 _KEPT_ENVIRONMENT: Final = (
     *("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "SYSTEMROOT"),
     "TMPDIR",  # where the fork server listens; a task has a folder of its own instead
@@ -59,12 +50,10 @@ _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREAD
 
 
 def main(order: dict[str, Any], line: Connection, said: Connection) -> None:
-    """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions.
-
-    `reads` are files and folders that it may read; None leaves the file system, the network and other
-    programs open to it. `cache` is one of them with compiled code, `account` the uid and gid that it changes
-    to, if any. What it prints goes to `said`.
-    """
+    """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions."""
+    # `reads` are files and folders that it may read; None leaves the file system, the network and other
+    # programs open to it. `cache` is one of them with compiled code, `account` the uid and gid that it
+    # changes to, if any. What it prints goes to `said`.
     for stream in (1, 2):
         os.dup2(said.fileno(), stream)
     said.close()
@@ -124,11 +113,9 @@ def _write_in_place() -> None:
 
 
 def _keep_compiled(kept: str, own: Path) -> None:
-    """Let Numba load compiled code from a folder of the owner, and save its own to that of the task.
-
-    The worker adds that to the owner's: a task that could replace files there could hide what it writes, and
-    code that one owner's photo could write must not run beside the photos of another.
-    """
+    """Let Numba load compiled code from a folder of the owner, and save its own to that of the task."""
+    # The worker adds that to the owner's: a task that could replace files there could hide what it writes,
+    # and code that one owner's photo could write must not run beside the photos of another
     try:
         caching = importlib.import_module("numba.core.caching")
         dispatcher = importlib.import_module("numba.core.dispatcher")
@@ -179,11 +166,9 @@ def clean_environment() -> dict[str, str]:
 
 
 def contain(folder: Path, limits: dict[str, int], niceness: int) -> None:
-    """Give up for good what a task does not need.
-
-    The memory limit counts from the address space that the process has already: libraries and
-    thread stacks of the program are not the task's.
-    """
+    """Give up for good what a task does not need."""
+    # The memory limit counts from the address space that the process has already: libraries and thread stacks
+    # of the program are not the task's
     _close_fork_server_line()
     with contextlib.suppress(OSError):
         os.setsid()  # Ctrl-C at the terminal reaches only the parent; a kill reaches the whole group
@@ -203,11 +188,9 @@ def contain(folder: Path, limits: dict[str, int], niceness: int) -> None:
 
 
 def give_way(niceness: int) -> None:
-    """Lower the priority of a task below that of requests, which take milliseconds rather than minutes.
-
-    Where the kernel schedules by sessions (autogroup, sched(7)), a nice value counts only within a session,
-    and a task has a session of its own; so the session gets the same value.
-    """
+    """Lower the priority of a task below that of requests, which take milliseconds rather than minutes."""
+    # Where the kernel schedules by sessions (autogroup, sched(7)), a nice value counts only within a session,
+    # and a task has a session of its own; so the session gets the same value
     with contextlib.suppress(OSError):
         os.nice(niceness)
         Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
@@ -228,11 +211,9 @@ def _address_space() -> int:
 
 
 def _close_fork_server_line() -> None:
-    """Close the pipe by which the fork server notices that its parent has ended.
-
-    Every child inherits it, so that the server would outlive a killed parent for as long as one
-    child runs. Closed here, the server ends with the parent, and its end kills the children.
-    """
+    """Close the pipe by which the fork server notices that its parent has ended."""
+    # Every child inherits it, so that the server would outlive a killed parent for as long as one child runs.
+    # Closed here, the server ends with the parent, and its end kills the children.
     server = getattr(forkserver, "_forkserver", None)
     inherited = getattr(server, "_forkserver_alive_fd", None)
     if server is not None and inherited is not None:

@@ -29,13 +29,10 @@ from app.sandbox import account as accounts
 from app.sandbox import seccomp
 from app.sandbox.account import SystemAccount
 
+# `account`: a separate one; `namespaces`: a network without interfaces and a separate count of processes;
+# `files`: Landlock; `system_calls`: seccomp
 MEASURES: Final = ("account", "no_new_privs", "namespaces", "files", "system_calls")
-"""`account`: a separate one; `namespaces`: a network without interfaces and a separate count of processes;
-`files`: Landlock; `system_calls`: seccomp."""
-
-MAX_PROCESSES: Final = 128
-"""Threads of one task at most (chosen): far more than a correction starts."""
-
+MAX_PROCESSES: Final = 128  # threads of one task at most (chosen): far more than a correction starts
 # linux/prctl.h, linux/sched.h
 _PR_SET_DUMPABLE: Final = 4
 _PR_SET_NO_NEW_PRIVS: Final = 38
@@ -55,9 +52,8 @@ _PATH_BENEATH: Final = 1
 
 _DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/urandom", "/dev/random")
 _MACHINE: Final = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime", "/sys/devices/system/cpu")
+# The loader, the libraries, and files from which numerical libraries learn about the machine
 _PROC: Final = ("/proc/self", "/proc/cpuinfo", "/proc/meminfo")
-"""The loader, the libraries, and files from which numerical libraries learn about the machine."""
-
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -71,19 +67,8 @@ class _Beneath(ctypes.Structure):
 
 
 def confine(folder: Path, reads: Iterable[Path] = (), account: SystemAccount | None = None) -> list[str]:
-    """Give up access to all but the program itself, `reads`, and a folder; return the measures in force.
-
-    Call it while the process has a single thread: others would keep their permissions.
-
-    Parameters
-    ----------
-    folder : Path
-        Where files may be created and changed; none loses its name, so that who counts them sees all.
-    reads : iterable of Path
-        Files and folders that may be read besides the libraries.
-    account : SystemAccount, optional
-        Account to change to; OSError if that is refused.
-    """
+    """Give up access to all but the program itself, `reads`, and a folder; return the measures in force."""
+    # Call it while the process has a single thread: others would keep their permissions
     in_force = []
     if account is not None:
         account.become()
@@ -112,15 +97,7 @@ def keep_private() -> None:
 
 
 def available(user: str, data: Path) -> dict[str, bool]:
-    """Return which measures are available on this machine, tried once in a separate process.
-
-    Parameters
-    ----------
-    user : str
-        The setting `LENS_TASK_USER`.
-    data : Path
-        The data folder, which another account has to reach.
-    """
+    """Return which measures are available on this machine, tried once in a separate process."""
     changes = user != accounts.NONE and accounts.may_change()
     in_force = (
         _measures_in_force(user, str(data.resolve())) if changes else _measures_in_force(accounts.NONE, "")
@@ -166,9 +143,7 @@ def _restrict_files(folder: Path, reads: Iterable[Path]) -> None:
     version = _check(_libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION))
     handled = sum(rights for since, rights in _HANDLED.items() if version >= since)
     ruleset = _Ruleset(
-        handled,
-        _TCP if version >= _NETWORK_SINCE else 0,
-        _SCOPES if version >= _SCOPE_SINCE else 0,
+        handled, _TCP if version >= _NETWORK_SINCE else 0, _SCOPES if version >= _SCOPE_SINCE else 0
     )
     # older kernels refuse a longer structure than theirs unless the rest is zero
     rules = _check(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import signal
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
@@ -15,38 +14,19 @@ from app.sandbox import child
 log = logging.getLogger(__name__)
 
 Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
-
+# Bytes of JSON that are read from a task at most (chosen): far more than any returns, arrays are files
 MAX_RESULT: Final = 16 * 1024 * 1024
-"""Bytes of JSON that are read from a task at most (chosen): far more than any returns, arrays are files."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskLimits:
-    """Resources that one task may use.
+    """Resources that one task may use."""
 
-    Parameters
-    ----------
-    memory_mb : int
-        Address space in MiB beyond that of the program itself; mapped files count.
-    wall_s : float
-        Seconds until it is killed.
-    cpu_s : int or None
-        Seconds of processor time; by default a little more than `wall_s`.
-    file_mb : int
-        Largest file it may write, in MiB.
-    scratch_mb : int
-        All that lies in its folder, in MiB.
-    files : int
-        Files in its folder.
-    open_files : int
-        Files it may have open at once.
-    """
-
-    memory_mb: int
+    memory_mb: int  # address space beyond that of the program itself; mapped files count
     wall_s: float
-    cpu_s: int | None = None
-    file_mb: int = 8192
-    scratch_mb: int = 8192
+    cpu_s: int | None = None  # by default a little more than `wall_s`
+    file_mb: int = 8192  # the largest file
+    scratch_mb: int = 8192  # all that lies in its folder
     files: int = 10_000
     open_files: int = 256
 
@@ -57,18 +37,10 @@ class TaskLimits:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a task ended.
+    """How a task ended; `value` is what it returned, `code` and `detail` are for whoever asked for the work.
 
-    Parameters
-    ----------
-    ending : str
-        `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
-        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
-        exception that nobody foresaw) or `cancelled`.
-    value : object
-        What the task returned.
-    code, detail : str
-        The fixed word and the sentence for whoever asked for the work.
+    `error`: the library refused, with its reason; `outage`: the machine had no room, or killed it; `crashed`:
+    another signal, or an exception that nobody foresaw.
     """
 
     ending: Ending
@@ -79,52 +51,35 @@ class Outcome:
 
 def outcome_of(message: dict[str, Any] | None, status: int, folder: Path, limits: TaskLimits) -> Outcome:
     """Return the outcome from the last message of a child, if any, and its exit status (or -signal)."""
-    ending = None if message is None else message.get("end")
+    said = message or {}
+    code, text = (str(said.get(key, "")) for key in ("code", "text"))
+    ending = said.get("end")
     if ending == "ok" and status == 0:
         return _result(folder / child.RESULT)
-    if ending in _OUTCOMES:
-        code, text = (str((message or {}).get(key, "")) for key in ("code", "text"))
-        return _OUTCOMES[ending](code, text, limits)
+    if ending == "error":
+        return Outcome("error", code=code, detail=text)
+    known: dict[object, tuple[Ending, str]] = {
+        "memory_limit": ("memory_limit", f"needs more than {limits.memory_mb} MiB: give a smaller photo"),
+        "no_room": ("outage", "there is no room on the disk for the work"),
+    }
+    if ending in known:
+        return ended(*known[ending])
+    if ending == "bug":
+        log.error("unforeseen %s in a task:\n%s", code, text)
+        why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+        return Outcome("crashed", code="internal_error", detail=why)
     if -status == signal.SIGXCPU:
-        detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
-        return Outcome("time_limit", code="time_limit", detail=detail)
-    why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
-    detail = f"the process that did the work died: {why}"
-    if -status == signal.SIGKILL:  # not by itself nor by us: by the kernel, out of memory
-        return Outcome("outage", code="outage", detail=detail)
-    return Outcome("crashed", code="crashed", detail=detail)
+        seconds = limits.cpu_s or limits.wall_s
+        return ended("time_limit", f"took more than {seconds:g} s of processor time; give a smaller photo")
+    how = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
+    # SIGKILL comes not from the task nor from us, but from the kernel, out of memory
+    died: Ending = "outage" if -status == signal.SIGKILL else "crashed"
+    return ended(died, f"the process that did the work died: {how}")
 
 
-def _refused(code: str, text: str, limits: TaskLimits) -> Outcome:
-    del limits
-    return Outcome("error", code=code, detail=text)
-
-
-def _swollen(code: str, text: str, limits: TaskLimits) -> Outcome:
-    del code, text
-    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
-    return Outcome("memory_limit", code="memory_limit", detail=detail)
-
-
-def _no_room(code: str, text: str, limits: TaskLimits) -> Outcome:
-    del code, text, limits
-    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
-
-
-def _bug(code: str, text: str, limits: TaskLimits) -> Outcome:
-    del limits
-    log.error("unforeseen %s in a task:\n%s", code, text)
-    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
-    return Outcome("crashed", code="internal_error", detail=why)
-
-
-_OUTCOMES: Final[Mapping[object, Callable[[str, str, TaskLimits], Outcome]]] = {
-    "error": _refused,
-    "memory_limit": _swollen,
-    "no_room": _no_room,
-    "bug": _bug,
-}
-"""Outcomes by the `end` of the last message of a child."""
+def ended(ending: Ending, detail: str = "the work was cancelled") -> Outcome:
+    """Return an outcome whose code is how it ended."""
+    return Outcome(ending, code=ending, detail=detail)
 
 
 def _result(path: Path) -> Outcome:
@@ -134,12 +89,4 @@ def _result(path: Path) -> Outcome:
 
 
 def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return "unknown"
-
-
-def cancelled() -> Outcome:
-    """Return the outcome of a task whose result is no longer wanted."""
-    return Outcome("cancelled", code="cancelled", detail="the work was cancelled")
+    return next((known.name for known in signal.Signals if known == number), "unknown")

@@ -33,27 +33,23 @@ from typing import Any, Final
 
 from app.sandbox import child
 from app.sandbox.account import SystemAccount
-from app.sandbox.outcome import Outcome, TaskLimits, cancelled, outcome_of
+from app.sandbox.outcome import Outcome, TaskLimits, ended, outcome_of
 from lensmodel.core.files import replacing
 from lensmodel.core.types import ignore_step
 
+# Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not
 MAX_MESSAGE: Final = 64 * 1024
-"""Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not."""
-
 MAX_NUMBER: Final = 2**31 - 1
+COMMON: Final = "common"  # whose compiled code all owners begin with: that of tasks which read no photo
 
-TASKS_MODULE = "app.jobs.tasks"
-"""Default module of the tasks; tests of the workers replace it."""
-
-
+TASKS_MODULE = "app.jobs.tasks"  # default module of the tasks; tests of the workers replace it
+# Bytes of the standard error of a task that are logged at most (chosen): an honest one says a few lines
 MAX_SAID: Final = 64 * 1024
-"""Bytes of the standard error of a task that are logged at most (chosen): an honest one says a few lines."""
-
 log = logging.getLogger(__name__)
 
 
+# Seconds between two questions whether a task is still wanted (chosen): each reads a row
 POLL_S: Final = 0.25
-"""Seconds between two questions whether a task is still wanted (chosen): each reads a row."""
 
 
 class Budget:
@@ -67,10 +63,8 @@ class Budget:
 
     @contextlib.contextmanager
     def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
-        """Wait for a slot and memory; yield False if the task is no longer wanted.
-
-        A task that needs more memory than the whole budget runs alone.
-        """
+        """Wait for a slot and memory; yield False if the task is no longer wanted."""
+        # A task that needs more memory than the whole budget runs alone
         memory = min(memory_mb, self.memory_mb)
         ticket = object()
         entered = self._enter(ticket, memory, wanted)
@@ -137,28 +131,7 @@ class _Watched:
 
 
 class Sandbox:
-    """Starts child processes, one for each task.
-
-    Parameters
-    ----------
-    scratch : Path
-        Where the private folders of the tasks lie; of this process alone, emptied at start.
-    budget : Budget
-        What all children together may take.
-    module : str, optional
-        Module whose `TASKS` maps names to functions; see `app.sandbox.child.Task`.
-    preload : sequence of str, optional
-        Modules that the fork server imports once, for all children; by default that module.
-    confined : bool
-        Whether children are kept from files, network and programs; see `app.sandbox.confine`.
-    cache : Path, optional
-        Where the compiled code of each owner is kept, unless the environment names another folder, which is
-        ignored with an `account` that might not reach it.
-    account : SystemAccount, optional
-        Account of confined children; None keeps that of this process.
-    niceness : int, optional
-        How far the children give way to this process, see nice(2); 0 = not at all.
-    """
+    """Starts child processes, one for each task."""
 
     def __init__(
         self,
@@ -176,7 +149,7 @@ class Sandbox:
         self.account = account if confined else None
         self.scratch, self.budget, self._confined = scratch, budget, confined
         configured = os.environ.get("NUMBA_CACHE_DIR")
-        self._cache = Path(configured).resolve() if configured and self.account is None else cache
+        self.cache = Path(configured).resolve() if configured and self.account is None else cache
         self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
@@ -184,27 +157,25 @@ class Sandbox:
         self._stopping = threading.Event()
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
-        if self._cache is not None:
-            self._cache.mkdir(parents=True, exist_ok=True)
+        if self.cache is not None:
+            self.cache.mkdir(parents=True, exist_ok=True)
         if self.account is not None:
             self.account.lets_through(scratch)
-            if self._cache is not None:
-                self.account.lets_through(self._cache)
+            if self.cache is not None:
+                self.account.lets_through(self.cache)
         self._serve()
 
     def _serve(self) -> None:
-        """Start the fork server unless it runs: children inherit its environment, which holds no secret.
-
-        The environment of the whole process changes meanwhile. So this is done once, before there are
-        threads, and again only after the server died.
-        """
+        """Start the fork server unless it runs: children inherit its environment, which holds no secret."""
+        # The environment of the whole process changes meanwhile. So this is done once, before there are
+        # threads, and again only after the server died.
         with self._alone:
             server = getattr(forkserver._forkserver, "_forkserver_pid", None)  # noqa: SLF001 - no public way
             if server is not None and _lives(server):
                 return
             before, clean = dict(os.environ), child.clean_environment()
-            if self._cache is not None:
-                clean["NUMBA_CACHE_DIR"] = str(self._cache)
+            if self.cache is not None:
+                clean["NUMBA_CACHE_DIR"] = str(self.cache)
             os.environ.clear()
             os.environ.update(clean)
             try:
@@ -245,32 +216,14 @@ class Sandbox:
         wanted: Callable[[], bool] = lambda: True,
         on_progress: child.ProgressHook = ignore_step,
     ) -> Outcome:
-        """Run one task to its end.
-
-        Parameters
-        ----------
-        task : str
-            Its name in `TASKS`.
-        arguments : mapping
-            What JSON can write: names, numbers, paths. Arrays travel as files.
-        folder : Path
-            The task's own folder, from `folder()`.
-        reads : sequence of Path
-            Files and folders that the task may read besides its own.
-        compiles : str, optional
-            Owner whose compiled code it may use; what it compiles joins that once it has succeeded.
-        wanted : callable
-            Called every `POLL_S`; once it returns False, the child is killed.
-        on_progress : callable
-            Called with the `(done, total)` that the task reports.
-        """
+        """Run one task to its end."""
 
         def still_wanted() -> bool:
             return not self._stopping.is_set() and wanted()
 
         with self.budget.share(limits.memory_mb, still_wanted) as entered:
             if not entered:
-                return cancelled()
+                return ended("cancelled")
             line, far_end = self._context.Pipe(duplex=True)
             said, far_said = self._context.Pipe(duplex=False)
             with line, said:
@@ -296,10 +249,12 @@ class Sandbox:
                 return outcome
 
     def _cache_of(self, owner: str | None) -> Path | None:
-        if owner is None or self._cache is None:
+        if owner is None or self.cache is None:
             return None
-        folder = (self._cache / owner).resolve()
+        folder = (self.cache / owner).resolve()
         folder.mkdir(parents=True, exist_ok=True)
+        if owner != COMMON:
+            _keep_compiled(self.cache / COMMON, folder)
         return folder
 
     def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
@@ -353,13 +308,13 @@ class Sandbox:
             if time.monotonic() - last_check > POLL_S:
                 last_check = time.monotonic()
                 if not wanted():
-                    return cancelled()
+                    return ended("cancelled")
                 if _overflows(watched.folder, limits):
                     text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
                     return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
             if time.monotonic() > watched.deadline:
                 text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
-                return Outcome("time_limit", code="time_limit", detail=text)
+                return ended("time_limit", text)
 
     def _exit_status(self, process: ForkServerProcess) -> int:
         with self._alone:
@@ -398,8 +353,11 @@ def _overflows(written: Path, limits: TaskLimits) -> bool:
 
 
 def _keep_compiled(compiled: Path, cache: Path) -> None:
-    """Add to an owner's cache what a task has compiled; each file appears complete."""
+    """Add to an owner's cache what was compiled since; each file appears complete."""
     for path in compiled.glob("*/*"):
+        kept = cache / path.parent.name / path.name
+        if kept.exists() and kept.stat().st_mtime >= path.stat().st_mtime:
+            continue
         (cache / path.parent.name).mkdir(exist_ok=True)
         with replacing(cache / path.parent.name / path.name) as part:
             shutil.copyfile(path, part)

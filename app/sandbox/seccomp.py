@@ -21,14 +21,13 @@ from typing import Final
 _PR_SET_SECCOMP, _MODE_FILTER = 22, 2
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _CLONE_THREAD: Final = 0x00010000
+# __X32_SYSCALL_BIT of asm/unistd.h: marks calls of the x32 interface, which nothing uses
 _X32: Final = 0x40000000
-"""__X32_SYSCALL_BIT of asm/unistd.h: marks calls of the x32 interface, which nothing uses."""
-
 # linux/bpf_common.h
 _LOAD, _EQUAL, _AT_LEAST, _ANY_OF, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+# Offsets of the fields of `struct seccomp_data`, which is little-endian on both processors
 _NUMBER, _PROCESSOR, _FIRST_ARGUMENT = 0, 4, 16
-"""Offsets of the fields of `struct seccomp_data`, which is little-endian on both processors."""
-
+# Calls that a task does not need; all fail with "not permitted"
 REFUSED: Final = (
     *("socket", "socketpair", "connect", "bind", "listen", "accept", "accept4", "sendto", "recvfrom"),
     *("execve", "execveat", "fork", "vfork"),
@@ -41,19 +40,13 @@ REFUSED: Final = (
     *("fanotify_init", "shmget", "msgget", "semget", "mq_open", "personality", "syslog"),
     *("tkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo", "pidfd_send_signal", "memfd_create"),
 )
-"""Calls that a task does not need; all fail with "not permitted"."""
-
+# Calls by which a file that is open loses its name, and `openat2`, whose flags no filter can read
 REMOVING: Final = ("unlink", "unlinkat", "rename", "renameat", "renameat2", "openat2")
-"""Calls by which a file that is open loses its name, and `openat2`, whose flags no filter can read."""
-
+# Calls that open files without a name, with the position of the argument that says so
 _UNNAMED: Final = {"open": 1, "openat": 2}
-"""Calls that open files without a name, with the position of the argument that says so."""
-
-_TMPFILE: Final = 0o20000000
-"""__O_TMPFILE of asm-generic/fcntl.h, the same on both processors."""
-
+_TMPFILE: Final = 0o20000000  # __O_TMPFILE of asm-generic/fcntl.h, the same on both processors
+# Calls that name a process, which must be the task itself: it may abort, and lower its own limits
 OWN: Final = ("kill", "tgkill", "prlimit64")
-"""Calls that name a process, which must be the task itself: it may abort, and lower its own limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +65,7 @@ _COMMON: Final = _table(
     "pidfd_open=434 pidfd_getfd=438 io_uring_setup=425 io_uring_enter=426 io_uring_register=427 "
     "open_tree=428 move_mount=429 fsopen=430 pidfd_send_signal=424 openat2=437"
 )
+# Numbers of the calls, from each processor's unistd.h; those that a processor has not are left out
 _PROCESSORS: Final = {
     "x86_64": _Processor(
         0xC000003E,
@@ -108,7 +102,6 @@ _PROCESSORS: Final = {
         ),
     ),
 }
-"""Numbers of the calls, from each processor's unistd.h; those that a processor has not are left out."""
 
 
 class _Instruction(ctypes.Structure):
@@ -125,10 +118,8 @@ class _Program(ctypes.Structure):
 
 
 def refuse() -> None:
-    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set.
-
-    Every file that a task makes keeps its name, so that whoever counts its folder sees it.
-    """
+    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set."""
+    # Every file that a task makes keeps its name, so that whoever counts its folder sees it
     processor = _PROCESSORS.get(platform.machine())
     if processor is None:
         raise OSError(errno.ENOSYS, f"no filter was written for {platform.machine()}")

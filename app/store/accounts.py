@@ -1,4 +1,4 @@
-"""Owners: their keys and sign-ins, their quotas, what they store, export and erasure of all of it.
+"""Owners: their keys and sign-ins, what they store and may store, export and erasure of all of it.
 
 A key is `lpk_<prefix>_<secret>`. The prefix finds its row and may be shown; the secret is 32 random bytes,
 shown once, and only its hash is kept.
@@ -20,6 +20,8 @@ from sqlalchemy.orm import Session, joinedload
 from app.store.database import Repository, new_id, reads, writes, writes_durably
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, now, owner_id
 from app.store.tables import (
+    CORRECTION_ACTIVE,
+    PHOTO_WORKED_ON,
     Base,
     CorrectionRow,
     EventRow,
@@ -33,21 +35,15 @@ from app.store.tables import (
 )
 
 Scope: TypeAlias = Literal["read", "write", "admin"]
+# Each includes those before it: read, write to change data, admin to erase the account
 SCOPES: Final[tuple[Scope, ...]] = get_args(Scope)
-"""Each includes those before it: read, write to change data, admin to erase the account."""
-
 _KEY: Final = re.compile(r"lpk_([a-z0-9]{8})_([A-Za-z0-9_-]{43})", re.ASCII)
-_PREFIX_SIGNS: Final = "abcdefghijkmnpqrstuvwxyz23456789"
-"""Characters of a prefix, without those that look alike."""
-
+_PREFIX_SIGNS: Final = "abcdefghijkmnpqrstuvwxyz23456789"  # without those that look alike
+# Photos that one transaction erases (chosen): each with some hundred samples, a few milliseconds
 AT_ONCE: Final = 50
-"""Photos that one transaction erases (chosen): each with some hundred samples, a few milliseconds."""
-
+# How long the emptied row of what was deleted is kept (chosen): no work that refers to it runs so long
 REMEMBERED: Final = timedelta(days=1)
-"""How long the emptied row of what was deleted is kept (chosen): no work that refers to it runs so long."""
-
-USE_PRECISION: Final = timedelta(minutes=10)
-"""Precision of `last_used_at` (chosen): each update is a write."""
+USE_PRECISION: Final = timedelta(minutes=10)  # of `last_used_at` (chosen): each update is a write
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,33 +56,18 @@ class NewKey:
 
 
 @dataclass(frozen=True, slots=True)
-class Holder:
-    """A key that may be used now, and whose it is."""
+class Usage:
+    """What an owner stores and has in work, and the limits that differ from the settings."""
 
-    key_id: int
-    owner: str
-    scopes: tuple[str, ...]
-    ends: datetime | None
-    last_used_at: datetime | None
-
-
-@dataclass(frozen=True, slots=True)
-class Quota:
-    """Limits of an owner that differ from the settings; None where they do not."""
-
-    stored_bytes: int | None = None
-    photos: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Holdings:
-    """How much an owner stores."""
-
-    photos: int
-    stored_bytes: int
-    lenses: int
-    corrections: int
-    created_at: Any
+    photos: int = 0
+    lenses: int = 0
+    corrections: int = 0
+    stored_bytes: int = 0
+    working_photos: int = 0
+    working_corrections: int = 0
+    quota_bytes: int | None = None
+    quota_photos: int | None = None
+    created_at: datetime | None = None
 
 
 class Accounts(Repository):
@@ -107,30 +88,25 @@ class Accounts(Repository):
         quota_photos: int | None = None,
     ) -> NewKey:
         """Create a key for an owner, and the owner if new; quotas that are given replace the present ones."""
-        key, owner_key = make(), ensure_owner(session, owner)
+        owner_key = ensure_owner(session, owner)
         quotas = {"quota_bytes": quota_bytes, "quota_photos": quota_photos}
         given = {name: value for name, value in quotas.items() if value is not None}
         if given:
             session.execute(update(OwnerRow).where(OwnerRow.id == owner_key).values(**given))
-        _add(session, owner_key, key, " ".join(scopes), label, lasts)
-        return key
-
-    @writes_durably
-    def rotate_key(self, session: Session, prefix: str, *, keep: timedelta) -> NewKey | None:
-        """Create a key in place of another: same owner, scopes and span; the old one ends after `keep`.
-
-        None if there is no such key, or it is no longer valid.
-        """
-        old = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix, _valid()).with_for_update())
-        if old is None:
-            return None
-        key, ends = make(), now() + keep
-        lasts = None if old.expires_at is None else old.expires_at - old.created_at
-        _add(session, old.owner_id, key, old.scopes, old.label, lasts)
-        if keep <= timedelta(0):
-            _end(session, old)
-        elif old.expires_at is None or old.expires_at > ends:
-            old.expires_at = ends
+        prefix = "".join(secrets.choice(_PREFIX_SIGNS) for _ in range(8))
+        text = f"lpk_{prefix}_{secrets.token_urlsafe(32)}"
+        key = NewKey(text, prefix, digest_of(text))
+        session.add(
+            KeyRow(
+                owner_id=owner_key,
+                prefix=key.prefix,
+                key_hash=key.key_hash,
+                label=label,
+                scopes=" ".join(scopes),
+                created_at=now(),
+                expires_at=None if lasts is None else now() + lasts,
+            )
+        )
         return key
 
     @writes_durably
@@ -138,7 +114,8 @@ class Accounts(Repository):
         """End a key and all sessions that began with it; False if there is no such key."""
         key = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix).with_for_update())
         if key is not None:
-            _end(session, key)
+            key.revoked_at = key.revoked_at or now()
+            session.execute(delete(SessionRow).where(SessionRow.key_id == key.id))
         return key is not None
 
     @reads
@@ -157,34 +134,29 @@ class Accounts(Repository):
     @reads
     def has_valid_key(self, session: Session) -> bool:
         """Say whether anybody could sign in."""
-        return session.scalar(_holders().limit(1)) is not None
+        return session.scalar(_valid().limit(1)) is not None
 
     @reads
-    def by_hash(self, session: Session, key_hash: str) -> Holder | None:
-        """Return the valid key of a hash."""
-        return _holder(session, _holders().where(KeyRow.key_hash == key_hash))
+    def shown(self, session: Session, digest: str) -> KeyRow | None:
+        """Return the valid key of the hash of a key, or of the token of a session that has not ended."""
+        key = session.scalar(_valid().where(KeyRow.key_hash == digest))
+        if key is not None:
+            return key
+        current = (SessionRow.token_hash == digest, SessionRow.expires_at > now())
+        return session.scalar(_valid().join(SessionRow, SessionRow.key_id == KeyRow.id).where(*current))
 
-    @reads
-    def by_session(self, session: Session, token_hash: str) -> Holder | None:
-        """Return the valid key of a browser session that has not ended."""
-        query = _holders().join(SessionRow, SessionRow.key_id == KeyRow.id)
-        return _holder(
-            session, query.where(SessionRow.token_hash == token_hash, SessionRow.expires_at > now())
-        )
-
-    def note_use(self, holder: Holder) -> None:
+    def note_use(self, key: KeyRow) -> None:
         """Record the time at which a key is used, to within `USE_PRECISION`."""
-        if holder.last_used_at is None or now() - holder.last_used_at >= USE_PRECISION:
+        if key.last_used_at is None or now() - key.last_used_at >= USE_PRECISION:
             with self.database.writing() as session:
-                session.execute(update(KeyRow).where(KeyRow.id == holder.key_id).values(last_used_at=now()))
+                session.execute(update(KeyRow).where(KeyRow.id == key.id).values(last_used_at=now()))
 
     @writes
     def sign_in(self, session: Session, key_id: int, token_hash: str, lasts: timedelta) -> None:
         """Begin a session; expired ones are deleted."""
         session.execute(delete(SessionRow).where(SessionRow.expires_at <= now()))
-        session.add(
-            SessionRow(token_hash=token_hash, key_id=key_id, created_at=now(), expires_at=now() + lasts)
-        )
+        times = {"created_at": now(), "expires_at": now() + lasts}
+        session.add(SessionRow(token_hash=token_hash, key_id=key_id, **times))
 
     @writes
     def sign_out(self, session: Session, token_hash: str) -> None:
@@ -194,34 +166,33 @@ class Accounts(Repository):
     # --- what they have ---------------------------------------------------------------------------
 
     @reads
-    def quota_of(self, session: Session, owner: str) -> Quota:
-        """Return the limits of an owner."""
-        row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner))
-        return Quota() if row is None else Quota(row.quota_bytes, row.quota_photos)
-
-    @reads
-    def holdings_of(self, session: Session, owner: str) -> Holdings:
-        """Return how much an owner stores."""
+    def usage(self, session: Session, owner: str) -> Usage:
+        """Return what an owner has, and may have."""
         row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner))
         if row is None:
-            return Holdings(0, 0, 0, 0, None)
-        photo = (PhotoRow.owner_id == row.id) & PhotoRow.deleted_at.is_(None)
+            return Usage()
         kept = func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None))
-        photos, stored = session.execute(
-            select(func.count(), func.coalesce(kept, 0)).select_from(PhotoRow).where(photo)
-        ).one()
-        lens = (LensRow.owner_id == row.id) & LensRow.deleted_at.is_(None)
-        made = session.scalar(
-            select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0)).where(
-                CorrectionRow.owner_id == row.id, CorrectionRow.state == "succeeded"
-            )
+        working = func.count().filter(PhotoRow.state.in_(PHOTO_WORKED_ON))
+        photos = select(func.count(), func.coalesce(kept, 0), working).where(
+            PhotoRow.owner_id == row.id, PhotoRow.deleted_at.is_(None)
         )
-        return Holdings(
-            photos,
-            int(stored) + int(made or 0),
-            _count(session, LensRow, lens),
-            _count(session, CorrectionRow, CorrectionRow.owner_id == row.id),
-            row.created_at,
+        made = func.sum(CorrectionRow.result_bytes).filter(CorrectionRow.state == "succeeded")
+        running = func.count().filter(CorrectionRow.state.in_(CORRECTION_ACTIVE))
+        corrections = select(func.count(), func.coalesce(made, 0), running).where(
+            CorrectionRow.owner_id == row.id
+        )
+        lenses = select(func.count()).where(LensRow.owner_id == row.id, LensRow.deleted_at.is_(None))
+        photo, correction = (session.execute(query).one() for query in (photos, corrections))
+        return Usage(
+            photos=photo[0],
+            lenses=session.scalar(lenses) or 0,
+            corrections=correction[0],
+            stored_bytes=int(photo[1] or 0) + int(correction[1] or 0),
+            working_photos=photo[2],
+            working_corrections=correction[2],
+            quota_bytes=row.quota_bytes,
+            quota_photos=row.quota_photos,
+            created_at=row.created_at,
         )
 
     def rows(self, table: type[Base], owner: str, *, at_once: int = 200) -> Iterator[dict[str, Any]]:
@@ -242,21 +213,12 @@ class Accounts(Repository):
 
     @writes_durably
     def begin_erasing(self, session: Session, owner: str) -> int | None:
-        """Remove the name and keys of an owner whose data are to be erased; return the row's key.
-
-        None if there is no such owner.
-        """
+        """Remove the name and keys of an owner whose data are to be erased; return the row's key, if any."""
         row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner).with_for_update())
         if row is None:
             return None
         row.name, row.erased_at = f"erased|{new_id()}", now()
-        keys = select(KeyRow.id).where(KeyRow.owner_id == row.id)
-        session.execute(delete(SessionRow).where(SessionRow.key_id.in_(keys)))
-        session.execute(
-            update(KeyRow)
-            .where(KeyRow.owner_id == row.id, KeyRow.revoked_at.is_(None))
-            .values(revoked_at=now())
-        )
+        session.execute(delete(KeyRow).where(KeyRow.owner_id == row.id))  # and by their keys the sessions
         return row.id
 
     @reads
@@ -270,17 +232,20 @@ class Accounts(Repository):
         of_owner = select(PhotoRow).where(PhotoRow.owner_id == owner_key)
         photos = list(session.scalars(of_owner.limit(AT_ONCE).with_for_update()))
         if photos:
-            return _erase_photos(session, photos)
-        if session.get(OwnerRow, owner_key) is None:
+            keys = [photo.id for photo in photos]
+            corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id.in_(keys)))
+            prefixes = [row.folder for row in corrections] + [photo.folder for photo in photos]
+            session.execute(delete(PhotoRow).where(PhotoRow.id.in_(keys)))  # and by their keys all of them
+        elif session.get(OwnerRow, owner_key) is None:
             return None
-        lenses = list(session.scalars(select(LensRow).where(LensRow.owner_id == owner_key)))
-        keys = [lens.id for lens in lenses]
-        session.execute(delete(CorrectionRow).where(CorrectionRow.owner_id == owner_key))
-        session.execute(delete(EventRow).where(EventRow.lens_id.in_(keys)))
-        session.execute(delete(LensRow).where(LensRow.owner_id == owner_key))
-        session.execute(delete(KeyRow).where(KeyRow.owner_id == owner_key))
-        session.execute(delete(OwnerRow).where(OwnerRow.id == owner_key))
-        return _discarded(session, [f"models/{lens.public_id}/" for lens in lenses])
+        else:
+            lenses = list(session.scalars(select(LensRow).where(LensRow.owner_id == owner_key)))
+            prefixes = [f"models/{lens.public_id}/" for lens in lenses]
+            session.execute(delete(EventRow).where(EventRow.lens_id.in_([lens.id for lens in lenses])))
+            session.execute(delete(LensRow).where(LensRow.owner_id == owner_key))
+            session.execute(delete(OwnerRow).where(OwnerRow.id == owner_key))
+        discard(session, *prefixes)  # once more later: a worker may be writing another blob
+        return prefixes
 
     @writes
     def purge(self, session: Session) -> None:
@@ -293,10 +258,6 @@ class Accounts(Repository):
             select(EventRow.lens_id),
         )
         session.execute(delete(LensRow).where(LensRow.deleted_at < old, LensRow.id.not_in(named)))
-
-
-def _count(session: Session, table: type[Base], condition: ColumnElement[bool]) -> int:
-    return session.scalar(select(func.count()).select_from(table).where(condition)) or 0
 
 
 def _of_owner(table: type[Base], key: int) -> ColumnElement[bool]:
@@ -314,68 +275,15 @@ def _of_owner(table: type[Base], key: int) -> ColumnElement[bool]:
     return conditions[table]
 
 
-def _erase_photos(session: Session, photos: list[PhotoRow]) -> list[str]:
-    keys = [photo.id for photo in photos]
-    corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id.in_(keys)))
-    prefixes = [row.folder for row in corrections] + [photo.folder for photo in photos]
-    session.execute(delete(PhotoRow).where(PhotoRow.id.in_(keys)))  # and by their keys all that is of them
-    return _discarded(session, prefixes)
+def _valid() -> Select[KeyRow]:
+    """Select the keys that may be used now, with their owners."""
+    lasting = or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > now())
+    return select(KeyRow).options(joinedload(KeyRow.owner)).where(KeyRow.revoked_at.is_(None), lasting)
 
 
-def _discarded(session: Session, prefixes: list[str]) -> list[str]:
-    """Have blobs deleted once more later: a worker may be writing another one."""
-    discard(session, *prefixes)
-    return prefixes
-
-
-def _valid() -> ColumnElement[bool]:
-    return KeyRow.revoked_at.is_(None) & or_(KeyRow.expires_at.is_(None), KeyRow.expires_at > now())
-
-
-def _holders() -> Select[KeyRow]:
-    kept = OwnerRow.erased_at.is_(None)
-    return select(KeyRow).options(joinedload(KeyRow.owner)).where(_valid(), KeyRow.owner.has(kept))
-
-
-def _holder(session: Session, query: Select[KeyRow]) -> Holder | None:
-    key = session.scalar(query)
-    if key is None:
-        return None
-    return Holder(key.id, key.owner.name, tuple(key.scopes.split()), key.expires_at, key.last_used_at)
-
-
-def _add(
-    session: Session, owner_key: int, key: NewKey, scopes: str, label: str | None, lasts: timedelta | None
-) -> None:
-    session.add(
-        KeyRow(
-            owner_id=owner_key,
-            prefix=key.prefix,
-            key_hash=key.key_hash,
-            label=label,
-            scopes=scopes,
-            created_at=now(),
-            expires_at=None if lasts is None else now() + lasts,
-        )
-    )
-
-
-def _end(session: Session, key: KeyRow) -> None:
-    key.revoked_at = key.revoked_at or now()
-    session.execute(delete(SessionRow).where(SessionRow.key_id == key.id))
-
-
-def make() -> NewKey:
-    """Generate a key."""
-    prefix = "".join(secrets.choice(_PREFIX_SIGNS) for _ in range(8))
-    text = f"lpk_{prefix}_{secrets.token_urlsafe(32)}"
-    return NewKey(text, prefix, digest_of(text))
-
-
-def prefix_of(text: str) -> str | None:
-    """Return the prefix of a text in the format of a key, None of any other."""
-    match = _KEY.fullmatch(text)
-    return None if match is None else match[1]
+def is_key(text: str) -> bool:
+    """Say whether a text has the format of a key."""
+    return _KEY.fullmatch(text) is not None
 
 
 def digest_of(text: str) -> str:

@@ -12,23 +12,25 @@ import secrets
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, TypeVar
+from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar
 from uuid import UUID
 
-from sqlalchemy import Connection, Engine, Executable, create_engine, event, make_url
+from sqlalchemy import Connection, Engine, Executable, Select, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
+from app.errors import BusyError
 from app.store.tables import Base
 
+# How long a transaction of SQLite waits for the one writer (chosen): transactions take milliseconds, on a
+# slow disk seconds
 BUSY_TIMEOUT_MS = 30_000
-"""How long a transaction of SQLite waits for the one writer (chosen): transactions take milliseconds, on a
-slow disk seconds."""
-
+# Settings of libpq in seconds, `tcp_user_timeout` in ms (chosen). When the network is cut no connection is
+# ever closed: without these a worker waits for a quarter of an hour, longer than any lease.
 SERVER_DEADLINES: Final = {
     "connect_timeout": 5,
     "tcp_user_timeout": 15_000,
@@ -36,18 +38,15 @@ SERVER_DEADLINES: Final = {
     "keepalives_interval": 5,
     "keepalives_count": 3,
 }
-"""Settings of libpq in seconds, `tcp_user_timeout` in ms (chosen). When the network is cut no connection is
-ever closed: without these a worker waits for a quarter of an hour, longer than any lease."""
+
+
+# How often to look again for a row of the same key (chosen: 80 simultaneous uploads and deletions of the same
+# bytes on PostgreSQL all end)
+TRIES: Final = 100
 
 
 class Database:
-    """The application database of one process.
-
-    Parameters
-    ----------
-    url : str
-        SQLAlchemy address; sqlite or postgresql.
-    """
+    """The application database of one process."""
 
     def __init__(self, url: str) -> None:
         self.url = make_url(url)
@@ -91,11 +90,9 @@ class Database:
 
     @contextmanager
     def writing(self, *, durable: bool = False) -> Iterator[Session]:
-        """Give a session whose changes are committed together at the end, or not at all.
-
-        `durable` also survives loss of power: for what a caller may rely on afterwards, such as
-        an accepted upload whose memory card is formatted next.
-        """
+        """Give a session whose changes are committed together at the end, or not at all."""
+        # `durable` also survives loss of power: for what a caller may rely on afterwards, such as an accepted
+        # upload whose memory card is formatted next
         engine, scope = self.durable if durable else self.writer, _SCOPE.get()
         with Session(engine, expire_on_commit=False) as session, session.begin():
             yield session
@@ -132,6 +129,7 @@ _SCOPE: ContextVar[_Scope | None] = ContextVar("scope", default=None)
 P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R", bound="Repository")
+B = TypeVar("B", bound=Base)
 
 
 class Repository:
@@ -141,37 +139,34 @@ class Repository:
         self.database = database
 
 
-def reads(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+Method: TypeAlias = Callable[Concatenate[R, Session, P], T]
+Called: TypeAlias = Callable[Concatenate[R, P], T]
+
+
+def _in(
+    method: Method[R, P, T], session_of: Callable[[Database], AbstractContextManager[Session]]
+) -> Called[R, P, T]:
+    @wraps(method)
+    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
+        with session_of(self.database) as session:
+            return method(self, session, *args, **options)
+
+    return run
+
+
+def reads(method: Method[R, P, T]) -> Called[R, P, T]:
     """Give a method the session that reads."""
-
-    @wraps(method)
-    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
-        with self.database.reading() as session:
-            return method(self, session, *args, **options)
-
-    return run
+    return _in(method, Database.reading)
 
 
-def writes(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+def writes(method: Method[R, P, T]) -> Called[R, P, T]:
     """Give a method a transaction of its own."""
-
-    @wraps(method)
-    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
-        with self.database.writing() as session:
-            return method(self, session, *args, **options)
-
-    return run
+    return _in(method, Database.writing)
 
 
-def writes_durably(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+def writes_durably(method: Method[R, P, T]) -> Called[R, P, T]:
     """Give a method a transaction of its own that survives loss of power once it has returned."""
-
-    @wraps(method)
-    def run(self: R, /, *args: P.args, **options: P.kwargs) -> T:
-        with self.database.writing(durable=True) as session:
-            return method(self, session, *args, **options)
-
-    return run
+    return _in(method, partial(Database.writing, durable=True))
 
 
 def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
@@ -214,17 +209,28 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
     return inserted
 
 
+def insert_or_find(
+    session: Session, table: type[B], fresh: dict[str, Any], query: Select[B], what: str
+) -> tuple[B, bool]:
+    """Insert a row, or find the one of the same unique key by a query; True if inserted."""
+    # On PostgreSQL another transaction may delete that one after it blocked our insert and before our select
+    for _ in range(TRIES):
+        created = insert_new(session, table, [fresh]) == 1
+        row = session.scalar(query)
+        if row is not None:
+            return row, created
+    raise BusyError(f"{TRIES} times the {what} came and went: send it again")
+
+
 def changed(session: Session, statement: Executable) -> int:
     """Execute an UPDATE or DELETE; return how many rows it changed."""
     return session.connection().execute(statement).rowcount
 
 
 def new_id() -> str:
-    """Return a UUID of version 7 (RFC 9562, section 5.7) as 32 hexadecimal digits.
-
-    48 bits of milliseconds followed by 74 random bits: ids made later sort later, so lists
-    in the order of ids are lists in the order of time.
-    """
+    """Return a UUID of version 7 (RFC 9562, section 5.7) as 32 hexadecimal digits."""
+    # 48 bits of milliseconds followed by 74 random bits: ids made later sort later, so lists in the order of
+    # ids are lists in the order of time
     millis = time.time_ns() // 1_000_000
     value = (millis & (1 << 48) - 1) << 80 | secrets.randbits(80)
     value = value & ~(0xF << 76) | 7 << 76

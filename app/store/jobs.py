@@ -12,11 +12,12 @@ from typing import Any, Final, Literal, TypeAlias
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
-from app.errors import BusyError, ConflictError, UnknownPhotoError
-from app.store.database import Repository, changed, insert_new, new_id, reads, writes, writes_durably
+from app.errors import ConflictError, UnknownError
+from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes, writes_durably
 from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, owned, present
 from app.store.tables import (
-    PHOTO_RUNNING,
+    CORRECTION_ACTIVE,
+    PHOTO_WORKED_ON,
     CorrectionRow,
     EventRow,
     GarbageRow,
@@ -28,18 +29,10 @@ from app.store.tables import (
 
 Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
 
-ACTIVE: Final = ("queued", "running")
 ENDED_BADLY: Final = ("failed", "cancelled")
 
-TRIES: Final = 10
-"""How often to look again for the same correction that ended between insert and select (chosen)."""
-
-_STATES: Final[Mapping[str, tuple[str, ...]]] = {
-    "photo": ("received", *PHOTO_RUNNING),
-    "correction": ACTIVE,
-}
-"""States of unfinished work by its kind, of work that nobody began first."""
-
+# States of unfinished work by its kind, of work that nobody began first
+_STATES: Final[Mapping[str, tuple[str, ...]]] = {"photo": PHOTO_WORKED_ON, "correction": CORRECTION_ACTIVE}
 _TABLES: Final[Mapping[Kind, type[PhotoRow | CorrectionRow]]] = {
     "photo": PhotoRow,
     "correction": CorrectionRow,
@@ -48,10 +41,9 @@ _TABLES: Final[Mapping[Kind, type[PhotoRow | CorrectionRow]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One job: its kind, the ids and numbers of its subject, and the owner for whom it runs.
+    """One job: its kind, the ids and numbers of its subject, and the owner for whom it runs."""
 
-    The id is made of kind and arguments: enqueuing a job twice runs it once.
-    """
+    # The id is made of kind and arguments: enqueuing a job twice runs it once
 
     kind: Kind
     arguments: tuple[str | int, ...]
@@ -138,16 +130,12 @@ class Jobs(Repository):
         current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
         # by its public id: SQLite may have given the key of a deleted photo to another one
         if current is None or (current.id, current.owner_id) != (photo.id, photo.owner_id):
-            raise UnknownPhotoError(f"photo {photo.public_id} was deleted meanwhile: send it again")
+            raise UnknownError("photo", photo.public_id)
         if current.file_gone_at is not None:
             raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
-        for _ in range(TRIES):
-            created = insert_new(session, CorrectionRow, [fresh]) == 1
-            row = session.scalar(_same(request))
-            if row is not None:
-                session.refresh(row, ["photo", "lens"])
-                return row, created
-        raise BusyError(f"{TRIES} times the same correction ended just then: ask for it again")
+        row, created = insert_or_find(session, CorrectionRow, fresh, _same(request), "same correction")
+        session.refresh(row, ["photo", "lens"])
+        return row, created
 
     @reads
     def correction(self, session: Session, correction_id: str, owner: Owner) -> CorrectionRow | None:
@@ -169,7 +157,7 @@ class Jobs(Repository):
     def is_live(self, correction_id: str, epoch: int | None = None) -> bool:
         """Say whether the correction is still wanted: the cancel poll."""
         row = self.correction(correction_id, ANY_OWNER)
-        return row is not None and row.state in ACTIVE and epoch in {None, row.epoch}
+        return row is not None and row.state in CORRECTION_ACTIVE and epoch in {None, row.epoch}
 
     @writes
     def set_state(
@@ -184,10 +172,8 @@ class Jobs(Repository):
         run: Run | None = None,
         **fields: object,
     ) -> bool:
-        """Move a correction from one of `from_states` to `to`; False where it was in none of them.
-
-        With `epoch` only if it was not started anew since, with `run` only if that is its last one.
-        """
+        """Move a correction from one of `from_states` to `to`; False where it was in none of them."""
+        # With `epoch` only if it was not started anew since, with `run` only if that is its last one
         conditions = [CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states)]
         if epoch is not None:
             conditions.append(CorrectionRow.epoch == epoch)
@@ -197,12 +183,10 @@ class Jobs(Repository):
 
     @writes
     def start(self, session: Session, correction_id: str, epoch: int | None = None) -> Run | None:
-        """Begin, or begin again after the death of a worker; None if it is not to be done any more.
-
-        What an earlier run has stored becomes garbage.
-        """
+        """Begin, or begin again after the death of a worker; None if it is not to be done any more."""
+        # What an earlier run has stored becomes garbage
         row = find_to_change(session, CorrectionRow, correction_id, ANY_OWNER)
-        if row is None or row.state not in ACTIVE or epoch not in {None, row.epoch}:
+        if row is None or row.state not in CORRECTION_ACTIVE or epoch not in {None, row.epoch}:
             return None
         if row.attempt:
             discard(session, row.run_folder)
@@ -211,10 +195,8 @@ class Jobs(Repository):
 
     @writes
     def retry(self, session: Session, correction_id: str, owner: Owner) -> bool:
-        """Start a failed or cancelled correction anew; False if it is in another state.
-
-        False as well if the same correction was requested again meanwhile: that one will do.
-        """
+        """Start a failed or cancelled correction anew; False if it is in another state."""
+        # False as well if the same correction was requested again meanwhile: that one will do
         row = find_to_change(session, CorrectionRow, correction_id, owner)
         if row is None or row.state not in ENDED_BADLY:
             return False
@@ -227,13 +209,6 @@ class Jobs(Repository):
         row.error_code = row.error_detail = row.started_at = row.finished_at = None
         row.attempt = row.progress_done = row.progress_total = 0
         return True
-
-    @reads
-    def failed_by(self, session: Session, owner: str, code: str, limit: int) -> list[str]:
-        """Return the corrections that ended with a code, oldest first."""
-        failed = (CorrectionRow.state == "failed", CorrectionRow.error_code == code)
-        query = owned(CorrectionRow, owner).where(*failed).order_by(CorrectionRow.id).limit(limit)
-        return [row.public_id for row in session.scalars(query)]
 
     def progress(self, run: Run, done: int, total: int, stage: str = "correcting") -> None:
         """Record how far a running correction is."""
@@ -259,24 +234,18 @@ class Jobs(Repository):
     def fail(self, correction_id: str, code: str, detail: str, *, epoch: int | None = None) -> bool:
         """End with a reason."""
         why: dict[str, Any] = {"error_code": code, "error_detail": detail, "finished_at": now()}
-        return self.set_state(correction_id, ACTIVE, "failed", epoch=epoch, **why)
+        return self.set_state(correction_id, CORRECTION_ACTIVE, "failed", epoch=epoch, **why)
 
     def cancel(self, correction_id: str, owner: Owner) -> bool:
         """Cancel an unfinished correction; False if it was finished already."""
         if self.correction(correction_id, owner) is None:
             return False
-        return self.set_state(correction_id, ACTIVE, "cancelled", finished_at=now())
-
-    @reads
-    def unfinished_of(self, session: Session, owner: str) -> int:
-        """Return how many corrections of an owner wait or run."""
-        of_owner = CorrectionRow.owner.has(OwnerRow.name == owner)
-        return session.scalar(select(func.count()).where(of_owner, CorrectionRow.state.in_(ACTIVE))) or 0
+        return self.set_state(correction_id, CORRECTION_ACTIVE, "cancelled", finished_at=now())
 
     @reads
     def ended_before(self, session: Session, moment: datetime, limit: int = 100) -> list[str]:
         """Return corrections that ended before a moment, whatever came of them."""
-        ended = (CorrectionRow.state.not_in(ACTIVE), CorrectionRow.finished_at < moment)
+        ended = (CorrectionRow.state.not_in(CORRECTION_ACTIVE), CorrectionRow.finished_at < moment)
         return list(session.scalars(select(CorrectionRow.public_id).where(*ended).limit(limit)))
 
     @writes

@@ -14,8 +14,7 @@ from typing import Any, Final, Literal
 from sqlalchemy import and_, bindparam, delete, func, select, update
 from sqlalchemy.orm import Session
 
-from app.errors import BusyError
-from app.store.database import Repository, changed, insert_new, new_id, reads, writes
+from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes
 from app.store.owners import (
     ANY_OWNER,
     Owner,
@@ -29,7 +28,8 @@ from app.store.owners import (
 )
 from app.store.samples import COLUMNS, LensState, StoredSample, sample_in
 from app.store.tables import (
-    PHOTO_RUNNING,
+    CORRECTION_ACTIVE,
+    PHOTO_WORKED_ON,
     CorrectionRow,
     EventRow,
     LensRow,
@@ -41,16 +41,10 @@ from app.store.tables import (
 from lensmodel.core.names import name_key, serial_key
 
 TEACHES: Final = and_(PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
-LEARNING: Final = ("received", *PHOTO_RUNNING)
 NO_RESULT: Final = ("failed", "cancelled")
 
-TRIES: Final = 10
-"""How often to look again for a lens that was deleted between insert and select (chosen): each
-time its last photo must have been deleted in between."""
-
+# How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
-"""How long the previous version is kept (chosen): a worker may still be reporting of it."""
-
 _STATE: Final = select(LensRow.version, LensRow.rebuild_epoch, LensRow.way).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
@@ -188,10 +182,8 @@ class Lenses(Repository):
             return None if row is None else LensState(*row)
 
     def known_of(self, lens_id: str, owner: str) -> LensState | None:
-        """Return `state_of` a lens of an owner by one read; None if the owner has no such lens.
-
-        Without a session, which costs time: part of every request that a cached model answers.
-        """
+        """Return `state_of` a lens of an owner by one read; None if the owner has no such lens."""
+        # Without a session, which costs time: part of every request that a cached model answers
         if not is_id(lens_id):
             return None
         with self.database.reader.connect() as connection:
@@ -201,11 +193,9 @@ class Lenses(Repository):
     def samples_of(
         self, lens_id: str, *, after_version: int = 0, up_to_version: int | None = None
     ) -> tuple[LensState, list[StoredSample]]:
-        """Return the state of a lens and its samples that joined after a version.
-
-        Both are of one moment. Versions grow under the lens's row lock, so no sample of a
-        version that was seen can turn up later.
-        """
+        """Return the state of a lens and its samples that joined after a version."""
+        # Both are of one moment. Versions grow under the lens's row lock, so no sample of a version that was
+        # seen can turn up later.
         query = (
             select(SampleRow.id, SampleRow.version_added, *COLUMNS)
             .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
@@ -252,11 +242,9 @@ class Lenses(Repository):
 
     @writes
     def merge(self, session: Session, lens_id: str, into: str, owner: str) -> bool:
-        """Give all photos of a lens to another one and forget it: they were one copy all along.
-
-        False if one of the two does not exist, photos of the first are still being learned from, or the two
-        have different models.
-        """
+        """Give all photos of a lens to another one and forget it: they were one copy all along."""
+        # False if one of the two does not exist, photos of the first are still being learned from, or the two
+        # have different models
         # always locked in the same order: two merges at once must not wait for each other
         rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
         lens, target = rows[lens_id], rows[into]
@@ -264,7 +252,7 @@ class Lenses(Repository):
             return False
         query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
         photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
-        if any(photo.state in LEARNING for photo in photos):
+        if any(photo.state in PHOTO_WORKED_ON for photo in photos):
             return False
         for photo in photos:
             move_photo(session, photo, target)
@@ -275,10 +263,8 @@ class Lenses(Repository):
 
     @writes
     def go_back(self, session: Session, lens_id: str, owner: str, version: int) -> int | None:
-        """Exclude the photos that joined a lens after a version; return how many, None without a lens.
-
-        They stay, and can be included again one by one.
-        """
+        """Exclude the photos that joined a lens after a version; return how many, None without a lens."""
+        # They stay, and can be included again one by one
         lens = find_to_change(session, LensRow, lens_id, owner)
         if lens is None:
             return None
@@ -302,7 +288,7 @@ class Lenses(Repository):
             _unlearn(session, photo)
         session.execute(
             update(CorrectionRow)
-            .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(("queued", "running")))
+            .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(CORRECTION_ACTIVE))
             .values(state="cancelled", finished_at=now())
         )
         session.flush()
@@ -329,13 +315,10 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
 
 
 def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
-    """Return the lens of a serial, creating it if need be; a label always creates a new lens.
-
-    `way` is how a new lens is learned.
-    """
+    """Return the lens of a serial, creating it if need be; a label always creates a new lens."""
+    # `way` is how a new lens is learned
     lens = _found(session, owner_id, name, way=way, creates=True)
-    if lens is None:
-        raise BusyError(f"{TRIES} times the lens was forgotten just then: name it again")
+    assert lens is not None
     return lens
 
 
@@ -360,14 +343,9 @@ def _found(
         "created_at": now(),
         **dict.fromkeys(("version", "rebuild_epoch", "photo_count", "sample_count"), 0),
     }
-    for _ in range(TRIES):
-        if creates:
-            insert_new(session, LensRow, [fresh])
-        # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
-        lens = session.scalar(select(LensRow).where(*_same(owner_id, key)).with_for_update())
-        if lens is not None or not creates:
-            return lens
-    return None
+    # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
+    query = select(LensRow).where(*_same(owner_id, key)).with_for_update()
+    return insert_or_find(session, LensRow, fresh, query, "lens")[0] if creates else session.scalar(query)
 
 
 # --- samples and versions -------------------------------------------------------------------------
@@ -422,11 +400,9 @@ def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
 
 
 def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
-    """Raise the version by one and return it.
-
-    The UPDATE locks the lens's row until the transaction ends. `rebuild` says that samples went away or
-    changed: models in memory must be fitted anew instead of extended.
-    """
+    """Raise the version by one and return it."""
+    # The UPDATE locks the lens's row until the transaction ends. `rebuild` says that samples went away or
+    # changed: models in memory must be fitted anew instead of extended.
     raised = 1 if rebuild else 0
     version, epoch, public_id = session.execute(
         update(LensRow)
@@ -492,10 +468,8 @@ def record_event(
 
 
 def forget_if_empty(session: Session, photo: PhotoRow) -> None:
-    """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it.
-
-    A lens that the owner named stays as long as there is any photo of it, even a failed one.
-    """
+    """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it."""
+    # A lens that the owner named stays as long as there is any photo of it, even a failed one
     if photo.lens_id is None:
         return
     lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
@@ -516,7 +490,7 @@ def forget_if_empty(session: Session, photo: PhotoRow) -> None:
 
 
 def _unlearn(session: Session, photo: PhotoRow) -> None:
-    if photo.state in LEARNING:
+    if photo.state in PHOTO_WORKED_ON:
         photo.state, photo.finished_at = "cancelled", now()
     elif photo.state in {"counted", "excluded"}:
         photo.state, photo.calibrate = "stored", False
@@ -534,10 +508,8 @@ def forget_patches(session: Session, photo: PhotoRow) -> None:
 
 
 def _forget(session: Session, lens: LensRow) -> None:
-    """Empty the row of a lens that no photo belongs to any more; its reports become garbage.
-
-    The row stays because finished corrections refer to it.
-    """
+    """Empty the row of a lens that no photo belongs to any more; its reports become garbage."""
+    # The row stays because finished corrections refer to it
     session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
     lens.serial = lens.label = None
     lens.serial_source = "none"

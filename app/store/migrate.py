@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from alembic.script import Script, ScriptDirectory
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, text
 
 import migrations
@@ -33,11 +32,6 @@ def head() -> str | None:
     return ScriptDirectory.from_config(alembic_config()).get_current_head()
 
 
-def steps() -> list[Script]:
-    """Return all steps, the newest first."""
-    return list(ScriptDirectory.from_config(alembic_config()).walk_revisions())
-
-
 def current(database: Database) -> str | None:
     """Return the revision of the database; None if it is empty."""
     with database.reader.connect() as connection:
@@ -45,20 +39,15 @@ def current(database: Database) -> str | None:
 
 
 def upgrade(database: Database) -> bool:
-    """Run the missing steps; return whether there were any.
-
-    Only one process at a time gets in; the others wait and then find nothing left to do. A
-    SQLite file that holds data is copied first, beside itself.
-    """
+    """Run the missing steps, one process at a time; return whether there were any."""
     before = current(database)
     if before == head():
         return False
-    if before is not None and before not in {step.revision for step in steps()}:
+    known = {step.revision for step in ScriptDirectory.from_config(alembic_config()).walk_revisions()}
+    if before is not None and before not in known:
         raise InvalidInputError(
             f"the database was made by a newer program, schema {before}; update lensmodel, or use other data"
         )
-    if database.is_sqlite and before is not None:
-        _copy(database.path, before)
     with _alone(database) as connection:
         command.upgrade(alembic_config(connection), "head")
     return True
@@ -82,27 +71,7 @@ def downgrade(database: Database, revision: str) -> None:
 
 @contextmanager
 def _alone(database: Database) -> Iterator[Connection]:
-    with database.writer.connect() as connection, _without_cascades(connection), connection.begin():
+    with database.writer.connect() as connection, connection.begin():
         if not database.is_sqlite:  # on SQLite BEGIN IMMEDIATE shuts the others out
             connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
         yield connection
-
-
-@contextmanager
-def _without_cascades(connection: Connection) -> Iterator[None]:
-    """Let SQLite copy tables: to drop the old one of a parent would delete its children with it."""
-    driver = connection.connection.driver_connection
-    if not isinstance(driver, sqlite3.Connection):
-        yield
-        return
-    driver.execute("PRAGMA foreign_keys=OFF")  # within a transaction it would do nothing
-    try:
-        yield
-    finally:
-        driver.execute("PRAGMA foreign_keys=ON")
-
-
-def _copy(path: Path, revision: str) -> None:
-    target = path.with_name(f"{path.name}.before-{revision}")
-    with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(target)) as copy:
-        source.backup(copy)

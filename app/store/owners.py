@@ -10,15 +10,13 @@ from sqlalchemy import ColumnElement, Select, select
 from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.orm.interfaces import ORMOption
 
-from app.errors import NotSignedInError
+from app.errors import ServiceError
 from app.store.database import insert_new
 from app.store.tables import Base, CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
-LOCAL: Final = "local"
-"""The one owner in a service without sign-in."""
-
+LOCAL: Final = "local"  # the one owner in a service without sign-in
+# Deleted blobs are deleted once more after this time (chosen): a worker may have written another one
 LATE: Final = timedelta(minutes=10)
-"""Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
 
 
 class AnyOwner(Enum):
@@ -28,17 +26,16 @@ class AnyOwner(Enum):
 
 
 ANY_OWNER: Final = AnyOwner.ANY
+# Whose rows are asked for; there is no default, so that nobody asks for everybody's by leaving it out
 Owner: TypeAlias = str | AnyOwner
-"""Whose rows are asked for; there is no default, so that nobody asks for everybody's by leaving it out."""
-
 Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
 
+# What is read with a row: what nearly all who ask for it need of it
 _WITH: Final[dict[type[Base], tuple[ORMOption, ...]]] = {
     PhotoRow: (joinedload(PhotoRow.lens),),
     LensRow: (),
     CorrectionRow: (joinedload(CorrectionRow.photo), joinedload(CorrectionRow.lens)),
 }
-"""What is read with a row: what nearly all who ask for it need of it."""
 
 
 def now() -> datetime:
@@ -56,7 +53,7 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
     key = owner_id(session, name)
     if key is None:
         if not may_be_new:
-            raise NotSignedInError("this account was erased: nothing is kept of it")
+            raise ServiceError("this account was erased: nothing is kept of it", code="not_signed_in")
         insert_new(session, OwnerRow, [{"name": name, "created_at": now()}])
         key = owner_id(session, name)
     assert key is not None

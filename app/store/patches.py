@@ -21,9 +21,9 @@ from lensmodel.core.types import FieldPosition
 
 OPEN: Final = ("pending", "running")
 
+# Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
+# diagonal is 3,600 pixels
 DIGITS: Final = 4
-"""Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
-diagonal is 3,600 pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +55,8 @@ class Patches(Repository):
 
     @writes
     def plan_patches(self, session: Session, photo_id: str, epoch: int, patches: Sequence[NewPatch]) -> int:
-        """Write the plan of a photo once; return how many patches are to be estimated.
-
-        A second call, by a worker that repeats the step, adds nothing.
-        """
+        """Write the plan of a photo once; return how many patches are to be estimated."""
+        # A second call, by a worker that repeats the step, adds nothing
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
@@ -108,10 +106,8 @@ class Patches(Repository):
 
     @writes
     def begin_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
-        """Take up the open patches of one cell; empty if there are none or the photo needs them no more.
-
-        The attempt is counted before it is made.
-        """
+        """Take up the open patches of one cell; empty if there are none or the photo needs them no more."""
+        # The attempt is counted before it is made
         query = _patches_of(photo_id, epoch).where(
             PhotoRow.epoch == epoch,
             PhotoRow.state == "estimating",
@@ -126,11 +122,9 @@ class Patches(Repository):
 
     @writes
     def add_samples(self, session: Session, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
-        """Store the samples of some patches and mark these done; return how many samples were new.
-
-        Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated
-        call stores nothing twice: patch and channel are a unique key.
-        """
+        """Store the samples of some patches and mark these done; return how many samples were new."""
+        # Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated call
+        # stores nothing twice: patch and channel are a unique key.
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0

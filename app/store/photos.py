@@ -9,25 +9,26 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final, Literal
 
-from sqlalchemy import case, delete, func, select, update
+from sqlalchemy import case, delete, select, update
 from sqlalchemy.orm import Session, joinedload
 
 from app import distances
-from app.errors import BusyError, ConflictError, UnknownPhotoError
+from app.errors import BusyError, ConflictError, UnknownError
 from app.store import lenses
-from app.store.database import changed, insert_new, new_id, reads, writes, writes_durably
+from app.store.database import changed, insert_new, insert_or_find, new_id, reads, writes, writes_durably
 from app.store.lenses import LensName, forget_if_empty, forget_patches, give_back, join, may_move
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, owned
 from app.store.patches import Patches
 from app.store.samples import PROFILE, columns_of
 from app.store.tables import (
+    CORRECTION_ACTIVE,
     PHOTO_FINAL,
-    PHOTO_RUNNING,
+    PHOTO_UNFINISHED,
+    PHOTO_WORKED_ON,
     PROFILE_FILE,
     CorrectionRow,
     GarbageRow,
     LensRow,
-    OwnerRow,
     PatchRow,
     PhotoRow,
     SampleRow,
@@ -35,46 +36,31 @@ from app.store.tables import (
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 
-WORKED_ON: Final = ("received", *PHOTO_RUNNING)
-"""States that cost computing time; a photo that waits for its owner costs space only."""
-
-UNFINISHED: Final = (*WORKED_ON, "needs_lens")
+# Fields that the owner may give, with the column that each fills
 GIVEN_SETTINGS: Final = {
     "aperture": "aperture",
     "focal_length_mm": "focal_mm",
     "focus_distance_m": "focus_m",
     "pixel_pitch_um": "pixel_pitch_um",
 }
-"""Fields that the owner may give, with the column that each fills."""
-
+# Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
+# under their own names are corrections made since and go before the header.
 FALLBACKS: Final = "fallbacks"
-"""Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
-under their own names are corrections made since and go before the header."""
-
+# Columns that describe a photo; all are emptied when it is deleted
 DESCRIPTION: Final = (
     *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),
     *("aperture", "focal_mm", "focus_m", "pixel_pitch_um", "iso", "exposure_s", "taken_at", "lateral"),
     *("width", "height", "orientation", "location", "error_detail", "body_key"),
 )
-"""Columns that describe a photo; all are emptied when it is deleted."""
-
-
-TRIES: Final = 100
-"""How often an upload looks again for the photo of the same bytes that was deleted between insert and select
-(chosen: 80 simultaneous uploads and deletions of the same bytes on PostgreSQL all end)."""
-
+# Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
+# several machines differ by less
 SPARE: Final = timedelta(hours=1)
-"""Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
-several machines differ by less."""
-
-
+# How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen): its
+# owner looks again within a day
 FILE_KEPT: Final = timedelta(days=1)
-"""How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen):
-its owner looks again within a day."""
-
+# With `keep_photos=corrections`: how long a photo that has just calibrated its lens can still be corrected
+# (chosen): who sent photos to correct them asks for it in the same sitting
 GRACE: Final = timedelta(hours=1)
-"""With `keep_photos=corrections`: how long a photo that has just calibrated its lens can still be corrected
-(chosen): who sent photos to correct them asks for it in the same sitting."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +76,7 @@ class Received:
 
     photo: PhotoRow
     fresh: bool
-    wants_file: bool = False
-    """Whether the photo is known without its file, which has now come again."""
+    wants_file: bool = False  # whether the photo is known without its file, which has now come again
 
 
 class Photos(Patches):
@@ -129,32 +114,13 @@ class Photos(Patches):
         return list(session.scalars(query.order_by(PhotoRow.public_id.desc()).limit(limit)))
 
     @reads
-    def load_of(self, session: Session, owner: str) -> tuple[int, int, int]:
-        """Return `(unfinished photos, bytes of stored files and results, all photos)` of an owner."""
-        results = select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0)).where(
-            CorrectionRow.owner.has(OwnerRow.name == owner), CorrectionRow.state == "succeeded"
-        )
-        unfinished, stored, count = session.execute(
-            select(
-                func.count().filter(PhotoRow.state.in_(WORKED_ON)),
-                func.coalesce(func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None)), 0),
-                func.count(),
-            )
-            .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
-            .where(OwnerRow.name == owner, PhotoRow.deleted_at.is_(None))
-        ).one()
-        return int(unfinished), int(stored) + int(session.scalar(results) or 0), int(count)
-
-    @reads
     def unneeded(self, session: Session, policy: str, limit: int = 100) -> list[str]:
-        """Return photos whose file is to be given up, as the setting `keep_photos` says.
-
-        Never one that is being worked on, waits for its lens, or failed in an outage and may be retried.
-        """
+        """Return photos whose file is to be given up, as the setting `keep_photos` says."""
+        # Never one that is being worked on, waits for its lens, or failed in an outage and may be retried
         if policy == "always":
             return []
         jobs = select(CorrectionRow.id).where(CorrectionRow.photo_id == PhotoRow.id)
-        busy = jobs.where(CorrectionRow.state.in_(("queued", "running"))).exists()
+        busy = jobs.where(CorrectionRow.state.in_(CORRECTION_ACTIVE)).exists()
         ended, day = PhotoRow.finished_at, now() - FILE_KEPT
         learned = PhotoRow.state.in_(("counted", "excluded", "cancelled")) | (
             (PhotoRow.state == "failed") & ((PhotoRow.error_code != "outage") | (ended < day))
@@ -177,12 +143,10 @@ class Photos(Patches):
 
     @reads
     def unsearched(self, session: Session, limit: int = 100) -> list[PhotoRow]:
-        """Return photos nobody works on whose file may still say where they were taken.
-
-        Such are those that failed before they were searched, and files that came again.
-        """
+        """Return photos nobody works on whose file may still say where they were taken."""
+        # Such are those that failed before they were searched, and files that came again
         query = select(PhotoRow).where(*_FILED, PhotoRow.location.is_(None), PhotoRow.kind != PROFILE_FILE)
-        return list(session.scalars(query.where(PhotoRow.state.not_in(WORKED_ON)).limit(limit)))
+        return list(session.scalars(query.where(PhotoRow.state.not_in(PHOTO_WORKED_ON)).limit(limit)))
 
     @reads
     def is_live(self, session: Session, photo_id: str, epoch: int) -> bool:
@@ -192,10 +156,14 @@ class Photos(Patches):
         return session.scalar(select(PhotoRow.id).where(*of_epoch, *wanted)) is not None
 
     @reads
-    def failed_by(self, session: Session, owner: str, code: str, limit: int) -> list[str]:
-        """Return the photos that ended with a code, oldest first."""
-        query = owned(PhotoRow, owner).where(PhotoRow.state == "failed", PhotoRow.error_code == code)
-        return [row.public_id for row in session.scalars(query.order_by(PhotoRow.id).limit(limit))]
+    def siblings(self, session: Session, photo: PhotoRow, limit: int) -> list[PhotoRow]:
+        """Return the newest other RAW photos of the same owner and body whose file is kept."""
+        if photo.body_key is None:
+            return []
+        same = (PhotoRow.owner_id == photo.owner_id, PhotoRow.body_key == photo.body_key)
+        raw = (PhotoRow.id != photo.id, PhotoRow.kind.in_(("raw", "dng")))
+        query = select(PhotoRow).where(*same, *raw, *_FILED).order_by(PhotoRow.id.desc())
+        return list(session.scalars(query.limit(limit)))
 
     @reads
     def existing(self, session: Session, photo_ids: Iterable[str]) -> set[str]:
@@ -226,11 +194,9 @@ class Photos(Patches):
         given: Mapping[str, Any],
         may_be_new: bool = True,
     ) -> Received:
-        """Store an upload that was announced by `expect`, or find the photo with the same bytes.
-
-        A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
-        calibrate its lens and was not before, or it waited for settings that are now given.
-        """
+        """Store an upload that was announced by `expect`, or find the photo with the same bytes."""
+        # A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
+        # calibrate its lens and was not before, or it waited for settings that are now given
         fresh = {
             "public_id": public_id,
             "owner_id": ensure_owner(session, owner, may_be_new=may_be_new),
@@ -246,7 +212,10 @@ class Photos(Patches):
             "stage_at": now(),
             **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
         }
-        known, created = _insert_or_find(session, fresh)
+        of_bytes = (PhotoRow.owner_id == fresh["owner_id"], PhotoRow.sha256 == sha256)
+        same = select(PhotoRow).where(*of_bytes, PhotoRow.deleted_at.is_(None))
+        query = same.options(joinedload(PhotoRow.lens)).with_for_update(of=PhotoRow)
+        known, created = insert_or_find(session, PhotoRow, fresh, query, "photo of the same bytes")
         if created:
             _keep_announced(session, known.folder)
             return Received(known, fresh=True)
@@ -266,14 +235,12 @@ class Photos(Patches):
 
     @writes
     def give_up_file(self, session: Session, photo_id: str, names: Sequence[str]) -> bool:
-        """Give up the file of a photo and pictures of it; False if it is still needed, or gone already.
-
-        The row says so before the blobs are deleted, and their keys become garbage: no blob is left behind.
-        """
+        """Give up the file of a photo and pictures of it; False if it is still needed, or gone already."""
+        # The row says so before the blobs are deleted, and their keys become garbage: no blob is left behind
         photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-        if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
+        if photo is None or photo.file_gone_at is not None or photo.state in PHOTO_UNFINISHED:
             return False
-        busy = CorrectionRow.state.in_(("queued", "running"))
+        busy = CorrectionRow.state.in_(CORRECTION_ACTIVE)
         unfinished = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
         if session.scalar(unfinished.limit(1)) is not None:
             return False
@@ -306,11 +273,9 @@ class Photos(Patches):
         epoch: int | None = None,
         **fields: object,
     ) -> bool:
-        """Move a photo from one of `from_states` to `to`; False where it was in none of them.
-
-        With `epoch` only if the photo was not started anew since: a worker that lost its lease changes
-        nothing.
-        """
+        """Move a photo from one of `from_states` to `to`; False where it was in none of them."""
+        # With `epoch` only if the photo was not started anew since: a worker that lost its lease changes
+        # nothing
         return change_state(session, photo_id, from_states, to, epoch=epoch, **fields)
 
     @writes
@@ -347,11 +312,9 @@ class Photos(Patches):
         key: str | None = None,
         digest: str | None = None,
     ) -> bool:
-        """Record whether the file of a photo said where it was taken; False if it has another file by now.
-
-        With `key` and `digest` a file without the place, of that SHA-256, is stored there: it becomes the
-        file of the photo, and the one before garbage once nobody reads it any more.
-        """
+        """Record whether the file of a photo said where it was taken; False if it has another file by now."""
+        # With `key` and `digest` a file without the place, of that SHA-256, is stored there: it becomes the
+        # file of the photo, and the one before garbage once nobody reads it any more
         current = (PhotoRow.public_id == photo.public_id, PhotoRow.blob_key == photo.blob_key)
         values = {"location": location, **({} if key is None else {"blob_key": key, "file_sha256": digest})}
         statement = update(PhotoRow).where(*current, PhotoRow.deleted_at.is_(None)).values(**values)
@@ -363,12 +326,10 @@ class Photos(Patches):
 
     @writes
     def assign_lens(self, session: Session, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
-        """Return the lens of an inspected photo, created if need be; None if its copy is unknown.
-
-        Order: the lens that the owner named, then the serial (given by the owner, else of the file), then,
-        only with `single_copy`, the model alone. Photos that are merely stored join a lens that exists
-        but create none.
-        """
+        """Return the lens of an inspected photo, created if need be; None if its copy is unknown."""
+        # Order: the lens that the owner named, then the serial (given by the owner, else of the file), then,
+        # only with `single_copy`, the model alone. Photos that are merely stored join a lens that exists but
+        # create none.
         photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
         if photo is None:
             return None
@@ -384,18 +345,16 @@ class Photos(Patches):
     def fail(self, session: Session, photo_id: str, epoch: int, code: str, detail: str) -> bool:
         """End a photo that is being worked on with a reason; its samples never count."""
         fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-        failed = change_state(session, photo_id, WORKED_ON, "failed", epoch=epoch, **fields)
+        failed = change_state(session, photo_id, PHOTO_WORKED_ON, "failed", epoch=epoch, **fields)
         if failed:
             _let_go(session, photo_id)
         return failed
 
     @writes
     def finish(self, session: Session, photo_id: str, epoch: int) -> int | None:
-        """Count a photo: its samples join the model and the lens's version grows by one.
-
-        Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
-        transaction: it happens entirely and once, however often it is tried.
-        """
+        """Count a photo: its samples join the model and the lens's version grows by one."""
+        # Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
+        # transaction: it happens entirely and once, however often it is tried.
         done = {"finished_at": now(), "counted_at": now()}
         if not change_state(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
             return None
@@ -418,13 +377,10 @@ class Photos(Patches):
         excluded: bool | None = None,
         calibrate: bool = False,
     ) -> bool:
-        """Apply what the owner changes: settings, the lens or its id, whether the photo counts.
-
-        With `calibrate` a photo that was merely stored starts again, to teach its lens.
-
-        All of it or nothing; False where the photo cannot be excluded or included. A photo that has a
-        result changes its lens's model at once, any other starts again.
-        """
+        """Apply what the owner changes: settings, the lens or its id, whether the photo counts."""
+        # With `calibrate` a photo that was merely stored starts again, to teach its lens. All of it or
+        # nothing; False where the photo cannot be excluded or included. A photo that has a result changes its
+        # lens's model at once, any other starts again.
         photo = find_to_change(session, PhotoRow, photo_id, owner)
         if photo is None:
             return False
@@ -447,17 +403,15 @@ class Photos(Patches):
         given: Mapping[str, Any],
         lens: str | NewCopy | None,
     ) -> None:
-        """Apply the same settings and lens to several photos: to all or, where one refuses, to none.
-
-        A new copy becomes the lens of them all.
-        """
+        """Apply the same settings and lens to several photos: to all or, where one refuses, to none."""
+        # A new copy becomes the lens of them all
         # always locked in the same order: two such changes must not wait for each other
         rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
         chosen: LensRow | None = None
         for key in photo_ids:
             photo = rows[key]
             if photo is None:
-                raise UnknownPhotoError(f"there is no photo {key[:60]}: nothing was changed")
+                raise UnknownError("photo", key)
             if chosen is None and isinstance(lens, NewCopy):
                 name = LensName(photo.lens_maker, photo.lens_model, None, label=lens.label)
                 chosen = _chosen(session, photo, name, owner)
@@ -480,12 +434,12 @@ class Photos(Patches):
 
     @writes
     def cancel(self, session: Session, photo_id: str, owner: Owner) -> bool:
-        """Cancel an unfinished photo; False if it was finished already.
-
-        Work that still runs sees the state and changes nothing.
-        """
+        """Cancel an unfinished photo; False if it was finished already."""
+        # Work that still runs sees the state and changes nothing
         photo = find_to_change(session, PhotoRow, photo_id, owner)
-        if photo is None or not change_state(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
+        if photo is None or not change_state(
+            session, photo_id, PHOTO_UNFINISHED, "cancelled", finished_at=now()
+        ):
             return False
         session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
         _let_go(session, photo_id)
@@ -493,10 +447,8 @@ class Photos(Patches):
 
     @writes
     def delete(self, session: Session, photo_id: str, owner: Owner) -> str | None:
-        """Forget a photo, its patches, samples and corrections; return the prefix of its blobs.
-
-        The row stays, emptied, because the lens's history refers to it.
-        """
+        """Forget a photo, its patches, samples and corrections; return the prefix of its blobs."""
+        # The row stays, emptied, because the lens's history refers to it
         photo = find_to_change(session, PhotoRow, photo_id, owner)
         if photo is None:
             return None
@@ -507,7 +459,7 @@ class Photos(Patches):
         discard(session, photo.folder, *(row.folder for row in corrections))
         session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
         photo.deleted_at = now()
-        photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
+        photo.state = "cancelled" if photo.state in PHOTO_UNFINISHED else photo.state
         photo.given, photo.filename, photo.sha256 = {}, "", ""
         for column in DESCRIPTION:
             setattr(photo, column, None)
@@ -520,12 +472,10 @@ class Photos(Patches):
     def take_in(
         self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
     ) -> int | None:
-        """Let the samples of a profile join its lens; return the number of their photos.
-
-        None where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of the
-        profile becomes a counted photo without a file, which can be excluded or deleted as any other. What
-        was imported before is not imported again.
-        """
+        """Let the samples of a profile join its lens; return the number of their photos."""
+        # None where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of the
+        # profile becomes a counted photo without a file, which can be excluded or deleted as any other. What
+        # was imported before is not imported again.
         groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
         for sample in samples:
             groups[sample.photo, sample.settings.with_channel("g")].append(sample)
@@ -547,8 +497,8 @@ class Photos(Patches):
         return imported
 
 
+# Conditions of photos whose file is kept
 _FILED: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
-"""Conditions of photos whose file is kept."""
 
 
 def _keep_announced(session: Session, prefix: str) -> None:
@@ -556,25 +506,6 @@ def _keep_announced(session: Session, prefix: str) -> None:
     announced = (GarbageRow.prefix == prefix, GarbageRow.claimed.is_(False))
     if session.scalar(delete(GarbageRow).where(*announced).returning(GarbageRow.prefix)) is None:
         raise BusyError("the upload took too long, and what had come of it was deleted: send it again")
-
-
-def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
-    """Insert a photo, or find the one with the same bytes; True if inserted.
-
-    On PostgreSQL another transaction may delete that one after it blocked our insert and before our select.
-    """
-    for _ in range(TRIES):
-        created = insert_new(session, PhotoRow, [fresh]) == 1
-        known = _known(session, fresh["owner_id"], fresh["sha256"])
-        if known is not None:
-            return known, created
-    raise BusyError(f"{TRIES} times the photo of the same bytes came and went: send it again")
-
-
-def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
-    same = (PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
-    query = select(PhotoRow).options(joinedload(PhotoRow.lens)).where(*same)
-    return session.scalar(query.with_for_update(of=PhotoRow))
 
 
 def _changed(

@@ -24,13 +24,10 @@ from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.model.samples import entry_of, sample_of
 
 DTYPE: Final = "<f4"
-FORMAT_VERSION: Final = 2
-"""Raised when samples of before mean nothing to the model any more."""
-
+FORMAT_VERSION: Final = 2  # raised when samples of before mean nothing to the model any more
+# Characters kept of an estimator's name, which profiles and own estimators choose (chosen: every name of
+# ours fits, and no other fills the table)
 MAX_ESTIMATOR: Final = 60
-"""Characters kept of an estimator's name, which profiles and own estimators choose (chosen: every name of
-ours fits, and no other fills the table)."""
-
 _Columns = Mapping[str, InstrumentedAttribute[Any]]
 _OWN: Final[_Columns] = {
     "r": SampleRow.r,
@@ -52,14 +49,12 @@ _BESIDE: Final = (
     *(PatchRow.encoded, PhotoRow.width, PhotoRow.height),
 )
 
+# What `sample_in` reads: of samples joined with their patches and photos
 COLUMNS: Final = (
     *(column.label(name) for name, column in {**_OWN, **_OF_PHOTO, **_SETTINGS}.items()),
     *_BESIDE,
 )
-"""What `sample_in` reads: of samples joined with their patches and photos."""
-
-PROFILE: Final = "profile"
-"""Kind of a photo of which a profile has told: its file was never here."""
+PROFILE: Final = "profile"  # kind of a photo of which a profile has told: its file was never here
 
 
 class OutdatedSampleError(NoSamplesError):

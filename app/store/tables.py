@@ -34,9 +34,11 @@ from app.schemas import CorrectionState, PhotoState
 
 PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
+PHOTO_WORKED_ON: Final = ("received", *PHOTO_RUNNING)  # costs computing time; one that waits costs space only
+PHOTO_UNFINISHED: Final = (*PHOTO_WORKED_ON, "needs_lens")
+CORRECTION_ACTIVE: Final = ("queued", "running")
+# Kind of a photo that is none: a file of samples for a lens, which a worker reads like a photo
 PROFILE_FILE: Final = "lensprofile"
-"""Kind of a photo that is none: a file of samples for a lens, which a worker reads like a photo."""
-
 PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
 PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
@@ -98,13 +100,11 @@ class OwnerRow(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(String(200), unique=True)
+    # Limit of the bytes of photos; None where the setting applies, as for `quota_photos`
     quota_bytes: Mapped[int | None] = mapped_column(BigInteger)
-    """Limit of the bytes of photos; None where the setting applies, as for `quota_photos`."""
-
     quota_photos: Mapped[int | None]
     created_at: Mapped[datetime]
-    erased_at: Mapped[datetime | None]
-    """When erasure of everything was requested; the row is deleted last."""
+    erased_at: Mapped[datetime | None]  # when erasure of everything was requested; the row is deleted last
 
 
 class LensRow(Base):
@@ -126,9 +126,8 @@ class LensRow(Base):
     serial_source: Mapped[str] = mapped_column(String(20))
     identity_key: Mapped[str]
     label: Mapped[str | None]
+    # How its photos are learned from, fixed when it is founded: a value of `PsfModel`
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """How its photos are learned from, fixed when it is founded: a value of `PsfModel`."""
-
     version: Mapped[int] = mapped_column(default=0)
     rebuild_epoch: Mapped[int] = mapped_column(default=0)
     photo_count: Mapped[int] = mapped_column(default=0)
@@ -163,39 +162,32 @@ class PhotoRow(Base):
     byte_size: Mapped[int] = mapped_column(BigInteger)
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
+    # What the owner said about the photo; goes before what the file says, except `photos.FALLBACKS`
     given: Mapped[dict[str, Any]]
-    """What the owner said about the photo; goes before what the file says, except `photos.FALLBACKS`."""
-
     width: Mapped[int | None]
     height: Mapped[int | None]
     orientation: Mapped[int | None]
     camera_maker: Mapped[str | None]
     camera_model: Mapped[str | None]
+    # Digest of the camera and its serial: distinguishes bodies without identifying one
     body_key: Mapped[str | None] = mapped_column(String(16))
-    """Digest of the camera and its serial: distinguishes bodies without identifying one."""
-
     lens_maker: Mapped[str | None]
     lens_model: Mapped[str | None]
     lens_serial: Mapped[str | None]
     lens_serial_source: Mapped[str | None] = mapped_column(String(20))
     aperture: Mapped[float | None]
     focal_mm: Mapped[float | None]
-    focus_m: Mapped[float | None]
-    """As `app.distances` writes it."""
-
+    focus_m: Mapped[float | None]  # as `app.distances` writes it
     pixel_pitch_um: Mapped[float | None]
     iso: Mapped[float | None]
     exposure_s: Mapped[float | None]
+    # By the camera's clock, whose zone is unknown
     taken_at: Mapped[datetime | None] = mapped_column(DateTime())
-    """By the camera's clock, whose zone is unknown."""
-
+    # Lateral colour that this photo shows: radial polynomials of red and blue
     lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
-    """Lateral colour that this photo shows: radial polynomials of red and blue."""
-
     epoch: Mapped[int] = mapped_column(default=1)
+    # The way of its lens when this epoch began
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """The way of its lens when this epoch began."""
-
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     error_code: Mapped[str | None] = mapped_column(String(40))
@@ -203,32 +195,23 @@ class PhotoRow(Base):
     patches_total: Mapped[int] = mapped_column(default=0)
     patches_done: Mapped[int] = mapped_column(default=0)
     patches_rejected: Mapped[int] = mapped_column(default=0)
+    # How many windows were rejected before anything was estimated in them
     windows_rejected: Mapped[int] = mapped_column(default=0)
-    """How many windows were rejected before anything was estimated in them."""
-
+    # Those windows, as `app.store.patches` writes them: thousands, never queried one by one
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
-    """Those windows, as `app.store.patches` writes them: thousands, never queried one by one."""
-
     received_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
-    stage_at: Mapped[datetime]
-    """When `state` last changed."""
-
+    stage_at: Mapped[datetime]  # when `state` last changed
     finished_at: Mapped[datetime | None]
     counted_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
+    # Whether the file said where it was taken: none, removed, or unknown; None until it was searched
     location: Mapped[str | None] = mapped_column(String(10))
-    """Whether the file said where it was taken: none, removed, or unknown; None until it was searched."""
-
+    # Hash of the stored file where it differs from what was sent, whose hash is `sha256`
     file_sha256: Mapped[str | None] = mapped_column(String(64))
-    """Hash of the stored file where it differs from what was sent, whose hash is `sha256`."""
-
-    file_gone_at: Mapped[datetime | None]
-    """When the file was deleted, see the setting `keep_photos`."""
-
+    file_gone_at: Mapped[datetime | None]  # when the file was deleted, see the setting `keep_photos`
     owner: Mapped[OwnerRow] = relationship()
-    lens: Mapped[LensRow | None] = relationship()
-    """The lens that it was taken with, where that is known."""
+    lens: Mapped[LensRow | None] = relationship()  # the lens that it was taken with, where that is known
 
     @property
     def folder(self) -> str:
@@ -260,16 +243,15 @@ class PatchRow(Base):
     reason: Mapped[str | None] = mapped_column(String(60))
     attempts: Mapped[int] = mapped_column(default=0)
     finished_at: Mapped[datetime | None]
+    # What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`
     encoded: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
-    """What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`."""
 
 
 class SampleRow(Base):
-    """One PSF estimate: the kernel of one channel of one patch.
+    """One PSF estimate: the kernel of one channel of one patch."""
 
-    `lens_id` and `version_added` are set together when the photo is counted, and cleared when
-    it is excluded: the model reads exactly the samples that have them.
-    """
+    # `lens_id` and `version_added` are set together when the photo is counted, and cleared when it is
+    # excluded: the model reads exactly the samples that have them
 
     __tablename__ = "psf_sample"
     __table_args__ = (
@@ -348,9 +330,7 @@ class CorrectionRow(Base):
     lens_version: Mapped[int]
     params: Mapped[dict[str, Any]]
     params_hash: Mapped[str] = mapped_column(String(64))
-    epoch: Mapped[int] = mapped_column(default=1)
-    """Grows when it is started anew after its end."""
-
+    epoch: Mapped[int] = mapped_column(default=1)  # grows when it is started anew after its end
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     stage: Mapped[str | None] = mapped_column(String(20))
@@ -391,14 +371,12 @@ class WorkerRow(Base):
     id: Mapped[str] = mapped_column(String(40), primary_key=True)
     host: Mapped[str]
     pid: Mapped[int]
-    pid_started: Mapped[float]
-    """When the process began: a pid alone may belong to another process by now."""
-
+    pid_started: Mapped[float]  # when the process began: a pid alone may belong to another process by now
     state: Mapped[str] = mapped_column(String(10))
     started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
+    # Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces
     confined: Mapped[str] = mapped_column(String(200), server_default="")
-    """Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces."""
 
 
 class GarbageRow(Base):
@@ -408,8 +386,8 @@ class GarbageRow(Base):
 
     prefix: Mapped[str] = mapped_column(primary_key=True)
     not_before: Mapped[datetime]
+    # Whether a worker has begun to delete them: from then on no upload may keep them
     claimed: Mapped[bool] = mapped_column(default=False, server_default=false())
-    """Whether a worker has begun to delete them: from then on no upload may keep them."""
 
 
 class KeyRow(Base):
@@ -423,9 +401,8 @@ class KeyRow(Base):
     prefix: Mapped[str] = mapped_column(String(20), unique=True)
     key_hash: Mapped[str] = mapped_column(String(200), unique=True)
     label: Mapped[str | None]
+    # Words of `app.store.accounts.SCOPES`, separated by spaces
     scopes: Mapped[str] = mapped_column(String(60))
-    """Words of `app.store.accounts.SCOPES`, separated by spaces."""
-
     created_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]
     expires_at: Mapped[datetime | None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -49,7 +48,7 @@ def correct(
         typer.Option(
             metavar="auto|ID",
             help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
-            "correct those that visibly gain. With --server, also the id of a lens there.",
+            "correct those that visibly gain.",
         ),
     ] = None,
     output: Annotated[
@@ -136,14 +135,6 @@ def correct(
             WRITING, "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
         ),
     ] = False,
-    server: Annotated[
-        str | None,
-        rare(
-            RUNNING,
-            metavar="URL",
-            help="Have a service do the work on another machine; its key is read from LENS_API_KEY.",
-        ),
-    ] = None,
     workers: Annotated[int | None, rare(RUNNING, WORKERS)] = None,
     json_output: Annotated[bool, rare(RUNNING, JSON)] = False,
     quiet: Annotated[bool, rare(RUNNING, QUIET)] = False,
@@ -169,8 +160,6 @@ def correct(
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
-        lensmodel correct holiday --server http://127.0.0.1:8000 -o corrected
-
     Exit status: 0 all photos are corrected, 1 some are not, 2 wrong usage.
     """
     del help_all
@@ -188,13 +177,6 @@ def correct(
         force=force,
         keep_location=keep_location,
     )
-    if server is not None:
-        if profile is not None:
-            raise UsageError("--server has lenses of its own; leave out --profile, or give --lens ID")
-        # the client stands beside the service, above this package
-        remote = import_module("app.commands.remote")
-        remote.run(photos, server, lens or remote.AUTO, output, options, shown, as_json=json_output)
-        return
     if (profile is None) == (lens is None):
         raise UsageError(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"

@@ -99,7 +99,7 @@ class Commands(OnDemand):
         ),
         "keys": CommandEntry(
             "app.commands.keys:keys",
-            "Make, list, renew and end the keys of a service that others can reach.",
+            "Make, list and end the keys of a service that others can reach.",
             panel=ADMINISTRATION,
         ),
     }

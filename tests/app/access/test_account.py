@@ -237,7 +237,8 @@ def test_a_photo_whose_file_is_gone_takes_no_room(client: TestClient, store: Sto
     store.photos.give_up_file(sent["id"], ())
 
     assert (before, client.get("/v1/account").json()["stored_bytes"]) == (len(JPEG), 0)
-    assert store.photos.load_of("local") == (0, 0, 1)
+    usage = store.accounts.usage("local")
+    assert (usage.working_photos, usage.stored_bytes, usage.photos) == (0, 0, 1)
 
 
 def test_garbage_of_an_erased_owner_is_deleted_once_more_later(store: Store, steps: Any) -> None:

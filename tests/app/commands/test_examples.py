@@ -274,7 +274,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
     "line",
-    marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and "--server" not in k and k not in NOT_RUN),
+    marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and k not in NOT_RUN),
 )
 def test_example_runs(
     line: str,

@@ -11,6 +11,7 @@ own modules is built upon (coverage by `sys.settrace`).
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import random
 import sys
@@ -25,10 +26,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser
+from starlette.requests import Request
 
-from app.http.upload import _Form
+from app.http import upload
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import EncodedPatch, PsfSample, gaussian
@@ -45,15 +45,19 @@ Reader = Callable[[Path], object]
 
 
 def _multipart(path: Path) -> object:
-    form = _Form()
-    callbacks: Any = {name: getattr(form, name) for name in vars(_Form) if name.startswith("on_")}
-    parser = MultipartParser(b"lens", callbacks)
-    try:
-        parser.write(path.read_bytes())
-        parser.finalize()
-    except FormParserError as error:
-        raise LensModelError(str(error)) from error
-    return form.fields
+    body = path.read_bytes()
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    headers = [(b"content-type", b"multipart/form-data; boundary=lens")]
+    scope = {"type": "http", "method": "POST", "headers": headers, "app": None}
+
+    async def read() -> dict[str, str]:
+        async with upload.read_form(Request(scope, receive)) as (_, fields):
+            return fields
+
+    return asyncio.run(read())
 
 
 READERS: dict[str, tuple[str, Reader]] = {

@@ -237,21 +237,6 @@ def test_an_unknown_job_cannot_be_retried(client: TestClient) -> None:
     assert client.post("/v1/jobs/nothing/retry").status_code == 404
 
 
-def test_all_that_an_outage_ended_is_retried_by_one_call(
-    client: TestClient, store: Store, steps: Any
-) -> None:
-    photos = [failed_photo(store, steps) for _ in range(3)]
-    other = failed_photo(store, steps, "no_usable_patches")
-    correction = failed_correction(store, steps)
-
-    answers = [client.post("/v1/jobs/retry", params={"limit": 2}).json() for _ in range(3)]
-
-    assert answers == [{"retried": 2}, {"retried": 2}, {"retried": 0}]
-    subjects = {job.arguments[0] for job in store.jobs.to_do() if job.kind != "measure"}
-    assert subjects == {photo.public_id for photo in photos} | {correction}
-    assert steps.fresh(other).state == "failed"
-
-
 # --- real workers -----------------------------------------------------------------------------
 
 

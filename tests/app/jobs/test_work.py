@@ -7,6 +7,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -112,10 +113,7 @@ class Scripted:
         self.seen: dict[str, dict[str, Any]] = {}
         self.files: set[str] = set()
         self.answers: dict[str, list[Answer]] = {
-            "location": [ok("none")],
             "inspect": [ok(INFO)],
-            "thumbnail": [refused("unsupported_format")],  # a photo without a small picture goes on
-            "report": [refused("no_samples")],  # and so does a lens without a report
             "develop": [develop],
             "select": [ok({"patches": [patch(0), patch(1)], "rejected": [], "lateral": None})],
             "estimate": [estimate],
@@ -415,7 +413,7 @@ def test_a_photo_without_serial_waits_for_its_owner(
     waiting = steps.fresh(photo)
     assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
     assert "choose a lens" in waiting.error_detail
-    assert sandbox.ran == ["location", "inspect", "thumbnail"]
+    assert sandbox.ran == ["inspect"]
 
 
 def test_a_photo_without_aperture_waits_and_says_so(
@@ -438,7 +436,7 @@ def test_a_photo_to_be_stored_only_is_not_developed(
     work.photo(photo.public_id, 1)
 
     assert steps.fresh(photo).state == "stored"
-    assert sandbox.ran == ["location", "inspect", "thumbnail"]
+    assert sandbox.ran == ["inspect"]
 
 
 @pytest.mark.parametrize(
@@ -592,6 +590,20 @@ def test_an_unforeseen_exception_is_not_tried_again(context: JobContext, sandbox
     assert sandbox.ran == ["task"]
 
 
+def test_what_needs_compiled_loops_waits_while_they_are_compiled_for_all(
+    context: JobContext, sandbox: Scripted
+) -> None:
+    sandbox.answers["task"] = [ok("done")]
+    context.warmed.clear()
+    with ThreadPoolExecutor() as pool, context.sandbox.folder() as folder:
+        waits = {"folder": folder, "limits": TaskLimits(500, 10), "wanted": lambda: True}
+        computed = pool.submit(context.attempt, "task", {}, compiles_for=1, **waits)
+        assert context.attempt("task", {}, **waits) == "done"  # that only decodes
+        assert (computed.done(), sandbox.ran) == (False, ["task"])
+        context.warmed.set()
+        assert computed.result(60) == "done"
+
+
 def test_too_little_memory_is_doubled_once_within_the_budget(context: JobContext, sandbox: Scripted) -> None:
     sandbox.answers["task"] = [ended(MEMORY)]
 
@@ -705,7 +717,7 @@ def test_the_model_of_a_lens_decides_how_it_is_measured_and_its_photos_are_corre
     CorrectionWork(context).measure(steps.lens_id(photo), 1)
     CorrectionWork(context).correction(ask(context, photo, steps, method="paper"))
 
-    assert [sandbox.seen[task]["mode"] for task in ("measure", "report", "correct")] == ["paper"] * 3
+    assert [sandbox.seen[task]["mode"] for task in ("measure", "correct")] == ["paper"] * 2
     assert sandbox.seen["correct"]["photo"] == photo.public_id
 
 
@@ -845,11 +857,11 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(
     with context.store.database.writing() as session:
         session.execute(update(PhotoRow).values(byte_size=len(sent)))
     context.storage.put(photo.blob_key, sent)
-    sandbox.answers["location"] = [
-        lambda arguments, folder: Outcome("ok", value=tasks.location(arguments, folder, ignore_step))
+    sandbox.answers["inspect"] = [
+        lambda arguments, folder: Outcome("ok", value=tasks.inspect(arguments, folder, ignore_step))
     ]
 
-    cleaned = remove_location(context, steps.fresh(photo), lambda: True)
+    cleaned = remove_location(context, steps.fresh(photo))
 
     kept = context.storage.get(cleaned.blob_key)
     read = Image.open(io.BytesIO(kept))
@@ -859,7 +871,7 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(
     assert cleaned.file_sha256 == hashlib.sha256(kept).hexdigest()
     due = datetime.now(UTC) + timedelta(hours=1)
     assert photo.blob_key in context.store.jobs.garbage(at=due)
-    assert remove_location(context, cleaned, lambda: True) is cleaned  # once
+    assert remove_location(context, cleaned) is cleaned  # once
 
 
 def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
@@ -867,9 +879,9 @@ def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
 ) -> None:
     photo = steps.receive()
     context.storage.put(photo.blob_key, b"the file")
-    sandbox.answers["location"] = [refused("time_limit")]
+    sandbox.answers["inspect"] = [refused("time_limit")]
 
-    searched = remove_location(context, photo, lambda: True)
+    searched = remove_location(context, photo)
 
     assert (searched.location, searched.blob_key) == ("unknown", photo.blob_key)
 

@@ -16,6 +16,7 @@ from PIL import Image
 from sqlalchemy import event
 from starlette.testclient import TestClient
 
+from app.blobs import small_pictures
 from app.blobs.storage import Storage
 from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
@@ -319,9 +320,8 @@ def test_a_photo_has_a_thumbnail_before_it_is_developed(
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
-    arguments = {"path": str(tmp_path / "p.jpg"), "kind": "jpeg", "orientation": 6}
-    tasks.thumbnail(arguments, tmp_path, ignore_step)
-    Storage(settings.storage).put_file(f"{photo.folder}{THUMBNAIL}", tmp_path / THUMBNAIL)
+    picture = small_pictures.thumbnail(tmp_path / "p.jpg", "jpeg", 6)
+    Storage(settings.storage).put(f"{photo.folder}{THUMBNAIL}", picture)
 
     assert opened(client, address).size == (258, 480)
 
@@ -336,9 +336,7 @@ def test_every_kind_of_photo_has_a_thumbnail(kind: str, tmp_path: Path) -> None:
     else:
         write_bayer_dng(path, np.full((64, 96), 3000, np.uint16), black=512, white=15512)
 
-    tasks.thumbnail({"path": str(path), "kind": kind, "orientation": 1}, tmp_path, ignore_step)
-
-    with Image.open(tmp_path / THUMBNAIL) as picture:
+    with Image.open(io.BytesIO(small_pictures.thumbnail(path, kind, 1))) as picture:
         assert picture.width > picture.height > 16
 
 

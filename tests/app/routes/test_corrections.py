@@ -260,7 +260,7 @@ def test_the_result_is_the_file_that_was_made(client: TestClient, finished: str)
     assert answer.headers["etag"] == f'"{hashlib.sha256(FILE).hexdigest()}"'
     assert answer.headers["content-length"] == str(len(FILE))
     assert answer.headers["content-disposition"] == (
-        "attachment; filename=\"Gr__e_p1-corrected.tif\"; filename*=UTF-8''Gr%C3%B6%C3%9Fe%20p1-corrected.tif"
+        "attachment; filename=\"Gr-e-p1-corrected.tif\"; filename*=UTF-8''Gr%C3%B6%C3%9Fe%20p1-corrected.tif"
     )
 
 

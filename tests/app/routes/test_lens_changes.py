@@ -90,7 +90,7 @@ def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, sto
     lens = steps.lens_id(steps.counted(patches=4))
     other = steps.named(LensName(None, None, None, label="Another"))
     sent = client.get(f"/v1/lenses/{lens}/profile")
-    assert sent.headers["content-disposition"].endswith('.lensprofile"')
+    assert sent.headers["content-disposition"].endswith(".lensprofile")
 
     taken = client.put(f"/v1/lenses/{other}/profile", content=sent.content)
     again = client.put(f"/v1/lenses/{other}/profile", content=sent.content)

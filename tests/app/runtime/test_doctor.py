@@ -1,4 +1,4 @@
-"""The examination of an installation: sound ones pass, each kind of damage is found, some of it mended."""
+"""The examination of an installation: sound ones pass, each kind of damage is found."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_sound_installation_passes_every_check(
     report = examined()
 
     assert report.findings == ()
-    assert len(report.checks) == len(INVARIANTS) + 2
+    assert len(report.checks) == len(INVARIANTS) + 3
 
 
 def test_an_empty_installation_is_sound(store: Store, examined: Callable[..., DoctorReport]) -> None:
@@ -101,11 +101,10 @@ DAMAGES: dict[str, tuple[str, Any]] = {
         lambda photo: update(LensRow).where(LensRow.id == photo.lens_id).values(deleted_at=now()),
     ),
 }
-MENDED = {"totals", "votes", "progress"}
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_damage_to_the_tables_is_found_and_what_can_be_is_mended(
+def test_damage_to_the_tables_is_found(
     name: str, sound: list[PhotoRow], store: Store, examined: Callable[..., DoctorReport]
 ) -> None:
     check, damage = DAMAGES[name]
@@ -113,25 +112,6 @@ def test_damage_to_the_tables_is_found_and_what_can_be_is_mended(
         session.execute(damage(sound[0]))
 
     assert check in {finding.check for finding in examined().open}
-    if check in MENDED:
-        assert {finding.check for finding in examined(repair=True).findings if finding.mended} >= {check}
-        assert examined().findings == ()
-
-
-def test_a_sample_of_an_excluded_photo_is_taken_out_and_the_model_learns_anew(
-    sound: list[PhotoRow], store: Store, steps: Any, examined: Callable[..., DoctorReport]
-) -> None:
-    lens_id = steps.lens_id(sound[0])
-    before = store.lenses.samples_of(lens_id)
-    with store.database.writing() as session:  # as if the samples had stayed when it was excluded
-        session.execute(update(PhotoRow).where(PhotoRow.id == sound[0].id).values(state="excluded"))
-
-    assert "votes" in {finding.check for finding in examined(repair=True).findings}
-
-    state, samples = store.lenses.samples_of(lens_id)
-    assert state.rebuild_epoch > before[0].rebuild_epoch
-    assert {stored.sample.photo for stored in samples} == {sound[1].public_id}
-    assert examined().findings == ()
 
 
 def test_a_missing_or_torn_photo_is_found(

@@ -26,7 +26,7 @@ from app.runtime.settings import Settings
 from app.sandbox import confine
 from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
-from app.sandbox.runner import MAX_SAID, Budget, Sandbox
+from app.sandbox.runner import COMMON, MAX_SAID, Budget, Sandbox
 from lensmodel.cli.ending import UsageError
 
 OWN = Path(__file__).parent
@@ -557,6 +557,19 @@ def test_compiled_code_of_one_owner_is_out_of_reach_of_another(
 
     assert first == ["compiled", str(own), f"reads {own}"]  # it reads its own and changes nothing there
     assert again == ["loaded", str(own), f"reads {own}"]
+
+
+def test_each_owner_begins_with_what_was_compiled_for_all(run: Run, tmp_path: Path) -> None:
+    in_force("files")
+    common, own = (tmp_path / "shared" / owner for owner in (COMMON, "3"))
+    caches = {"caches": [str(common), str(own)]}
+    limits = TaskLimits(memory_mb=2048, wall_s=stretched(60))
+
+    first = run("compile_one", arguments=caches, limits=limits, compiles=COMMON).value
+    again = run("compile_one", arguments=caches, limits=limits, compiles="3").value
+
+    assert first[0] == "compiled"
+    assert again == ["loaded", str(own), f"reads {own}"]  # a copy: that of all is out of reach
 
 
 @pytest.mark.parametrize("missing", ["account", "files"])

@@ -29,10 +29,6 @@ METADATA = {
 }
 
 
-def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> str:
-    return "none"
-
-
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     return {"kind": "dng", "width": 64, "height": 48, "metadata": METADATA}
 
@@ -76,4 +72,8 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return {"error": {}, "coverage": {}}
 
 
-TASKS = {f.__name__: f for f in (location, inspect, develop, select, estimate, measure)}
+def warm(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    return {}
+
+
+TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure, warm)}

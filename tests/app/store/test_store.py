@@ -18,7 +18,7 @@ from uploads import receive
 
 from app.errors import BusyError
 from app.runtime.settings import Settings, table
-from app.store import LensName, NewPatch, Store, jobs, lenses
+from app.store import LensName, NewPatch, Store, database
 from app.store.database import Database
 from app.store.jobs import Result
 from app.store.migrate import current, downgrade, head, upgrade
@@ -565,7 +565,7 @@ def test_a_correction_whose_twin_ends_meanwhile_is_created(
     photo = steps.counted()
     lens = photo.lens
     assert lens is not None
-    blocked_once(monkeypatch, jobs)
+    blocked_once(monkeypatch, database)
 
     row, created = store.jobs.correct(photo, lens, 1, {"method": "fast"})
 
@@ -576,7 +576,7 @@ def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
     store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo = steps.counted()
-    blocked_once(monkeypatch, lenses)
+    blocked_once(monkeypatch, database)
 
     assert store.photos.change(photo.public_id, OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
 

@@ -14,6 +14,8 @@ from lensmodel.core.errors import RawDecodeError, TruncatedImageError, Unsupport
 from lensmodel.core.types import BayerPattern, Plane
 from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_defects, suspects
 
+_XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
+_GREEN: Final = 1  # the number of green among the colours of a mosaic
 _BAND: Final = 16
 """Rows that are judged together by `Mosaic.check`."""
 
@@ -74,6 +76,12 @@ class Mosaic:
 
     def check(self) -> None:
         """Refuse numbers that no sensor gives, although the decoder was content."""
+        height, width = self.values.shape
+        if not self.is_bayer and min(height, width) < _XTRANS_SIDE:
+            raise UnsupportedFormatError(
+                f"{width} x {height} pixels of an X-Trans mosaic are too few to be demosaiced: give the "
+                f"whole frame, at least {_XTRANS_SIDE} pixels high"
+            )
         low, high = self.values.min(axis=1), self.values.max(axis=1)
         if low.min() == high.max():
             raise RawDecodeError(f"every pixel of the RAW data is {int(low[0])}; the file holds no picture")
@@ -93,15 +101,20 @@ class Mosaic:
         """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels.
 
         Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average; in
-        photographs of that contrast it is below 0.5.
+        photographs of that contrast it is below 0.5. Of X-Trans, greens that touch are compared.
         """
         starts = range(0, len(self.values), _BAND)
         scale = max(self.white - min(self.black), 1.0)
         random = 0
         for row in starts:
             band = self.values[row : row + _BAND].astype(np.float32)
-            deviation = float(band.std())
-            step = float(np.abs(band[:, 2:] - band[:, :-2]).mean())
+            if self.is_bayer:
+                deviation, steps = float(band.std()), band[:, 2:] - band[:, :-2]
+            else:
+                colours = self.colours[row : row + _BAND]
+                deviation = float(band[colours == _GREEN].std())
+                steps = np.diff(band, axis=1)[colours[:, 1:] == colours[:, :-1]]
+            step = float(np.abs(steps).mean()) if steps.size else 0.0
             random += deviation > 0.15 * scale and step > 0.9 * deviation
         return random / len(starts)
 

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from lab.images import gains, to_srgb
 from lensmodel import calibrate, correct, photo, simulate
+from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
 from lensmodel.photo.defects import Neighbours, defects_of, suspects
 from lensmodel.photo.dng import write_bayer_dng
@@ -170,15 +171,27 @@ def test_defects_of_xtrans_are_replaced_too(tmp_path: Path) -> None:
     assert damage < 0.3 * UNSEEN
 
 
+def test_the_fine_detail_of_an_xtrans_photo_is_no_damage(tmp_path: Path) -> None:
+    fine = mosaic("tea-gardens", xtrans=True, height=600).astype(np.float64)
+    bright = np.uint16(np.clip(CAMERA.black + 1.6 * (fine - CAMERA.black), 0, CAMERA.white))
+    noise = np.random.default_rng(0).integers(CAMERA.black, CAMERA.white, bright.shape).astype(np.uint16)
+
+    assert photo.develop(write_xtrans(tmp_path / "fine.dng", bright)).pipeline.startswith("raw/xtrans")
+    with pytest.raises(RawDecodeError, match="random numbers"):
+        photo.develop(write_xtrans(tmp_path / "noise.dng", noise))
+    with pytest.raises(UnsupportedFormatError, match="600 x 400 pixels of an X-Trans mosaic are too few"):
+        photo.develop(write_xtrans(tmp_path / "small.dng", bright[:400]))
+
+
 @pytest.mark.slow
 def test_defects_of_xtrans_cost_the_whole_chain_nothing(tmp_path: Path) -> None:
-    camera = simulate.SimulatedCamera(height=480, width=720, full_well_electrons=20_000.0)
+    camera = simulate.SimulatedCamera(height=576, width=720, full_well_electrons=20_000.0)
     lens = simulate.draw_lens(1001)
     settings = LensSettings(aperture=lens.widest())
-    filters = colours_of(XTRANS, (480, 720)).astype(np.intp)[None]
+    filters = colours_of(XTRANS, (576, 720)).astype(np.intp)[None]
     balance = np.reshape(camera.white_balance, (3, 1, 1))
     shots = [
-        simulate.photograph(simulate.demo_scene(scene)[:, 40:584, 100:884], lens, settings, camera, None)
+        simulate.photograph(simulate.demo_scene(scene)[:, 40:680, 100:884], lens, settings, camera, None)
         for scene in ("city", "tea-gardens", "colosseum")
     ]
     truth = np.moveaxis(to_srgb(shots[-1].sharp * balance), 0, -1)

@@ -31,6 +31,7 @@ from lensmodel.core.types import (
     Zone,
     ignore_step,
 )
+from lensmodel.measured import is_measured
 from lensmodel.model import LensModel
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
@@ -188,6 +189,8 @@ class ApertureReport:
     spots: tuple[Spot, ...]  # the centre and the four corners
     sides: tuple[Spot, ...]  # left, right, top and bottom, at four fifths of the way to the edge
     centring: Centring
+    # whether photos of charts or targets alone tell of the lens: what lies between their places is known
+    measured: bool = False
 
     @property
     def mean(self) -> tuple[float, ...]:
@@ -199,7 +202,7 @@ class ApertureReport:
     def unknown(self) -> tuple[bool, ...]:
         """Whether too little is known of a place to draw it as if it were the lens."""
         known = zip(self.predicted_error, self.extrapolated, strict=True)
-        return tuple(gone or not error < UNKNOWN for error, gone in known)
+        return tuple(gone or not (self.measured or error < UNKNOWN) for error, gone in known)
 
     @property
     def zones(self) -> dict[Zone, float]:
@@ -269,6 +272,8 @@ class LensReport:
     @property
     def advice(self) -> str:
         """Which photo would help most: of the place and aperture whose blur is known least."""
+        if self.tested[0].measured and any(self.tested[0].unknown):
+            return "Nothing is known beyond the outermost places of the chart: let it fill the frame."
         green = [one for one in self.tested if one.settings.channel == self.tested[0].settings.channel]
         spots = [(spot, one) for one in green for spot in (*one.spots, *one.sides)]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
@@ -416,6 +421,7 @@ def _tested(
         spots=tuple(_spot(model, words, place, settings, size) for words, place in corners),
         sides=tuple(_spot(model, words, place, settings, size) for words, place in sides),
         centring=centring(model, settings),
+        measured=all(is_measured(sample) for sample in model.samples),
     )
 
 
@@ -537,8 +543,12 @@ def _shared(values: object) -> float | None:
 
 
 def filled_aspect(model: LensModel) -> float:
-    """Aspect of common sensors whose sides the samples reach alike; 3:2 where they leave its sides free."""
-    reached = np.abs([s.position.xy for s in model.samples]).max(axis=0, initial=0.0)
+    """Aspect of common sensors whose sides the samples reach alike; 3:2 where they leave its sides free.
+
+    A chart has a shape of its own, and says nothing of the frame's.
+    """
+    places = [s.position.xy for s in model.samples if not is_measured(s)] or [(0.0, 0.0)]
+    reached = np.abs(places).max(axis=0)
     shares = {aspect: reached / half_sides(aspect) for aspect in _ASPECTS}
     inside = {
         aspect: share for aspect, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED

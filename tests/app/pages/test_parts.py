@@ -485,8 +485,8 @@ def test_the_page_of_a_lens_says_which_model_it_has(client: TestClient, steps: S
         client.get(f"/lenses/{steps.lens_id(one)}/tests").text for one in (steps.counted(), photo)
     )
 
-    assert ("Model: default" in plain, "guards photos" in plain) == (True, False)
-    assert ("Model: paper" in paper, "guards photos" in paper) == (True, True)
+    assert ("Model: default" in plain, "without the safeguards" in plain) == (True, False)
+    assert ("Model: paper" in paper, "without the safeguards" in paper) == (True, True)
     photo_page = client.get(f"/photos/{photo.public_id}").text
     assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
 

@@ -290,11 +290,6 @@ class Client:
         kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
         return kernel
 
-    def field_png(self, /, lens_id: str, **query: str | float | None) -> bytes:
-        """Return the map of PSFs over the field as a PNG; the parameters are those of the endpoint."""
-        address = f"/v1/lenses/{lens_id}/field.png"
-        return _require_success(self._http.get(address, params=_present(query))).content
-
     def delete_lens(self, lens_id: str) -> None:
         """Delete a lens with all that was learned of it."""
         _require_success(self._http.delete(f"/v1/lenses/{lens_id}"))

@@ -10,6 +10,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from app.blobs.storage import Storage
+from app.blobs.zipped import packed, zipped
 from app.store import Store
 from app.store.accounts import Accounts
 from app.store.tables import Base, CorrectionRow, EventRow, KeyRow, LensRow, PatchRow, PhotoRow, SampleRow
@@ -36,79 +37,37 @@ corrections/   corrected photos.
 """
 
 
-class _Pipe:
-    """Buffers what a ZIP file writes until it is fetched."""
-
-    def __init__(self) -> None:
-        self._pieces: list[bytes] = []
-
-    def write(self, data: bytes) -> int:
-        self._pieces.append(bytes(data))
-        return len(data)
-
-    def flush(self) -> None:
-        """Do nothing: the buffer is fetched soon."""
-
-    def fetch(self) -> bytes:
-        joined = b"".join(self._pieces)
-        self._pieces.clear()
-        return joined
-
-
 def exported(store: Store, storage: Storage, owner: str) -> Iterator[bytes]:
     """Yield the ZIP file of an owner piece by piece."""
-    pipe = _Pipe()
-    missing: list[str] = []
-    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:  # type: ignore[call-overload]  # it only writes
-        for name, pieces, method in _files(store, storage, owner, missing):
-            with archive.open(_named(name, method), "w", force_zip64=True) as file:
-                for piece in pieces:
-                    file.write(piece)
-                    yield pipe.fetch()
-        if missing:
-            archive.writestr("missing.txt", "\n".join(missing) + "\n")
-    yield pipe.fetch()
+    return zipped(_files(store, storage, owner))
 
 
-def _named(name: str, method: int) -> zipfile.ZipInfo:
-    info = zipfile.ZipInfo(name)
-    info.compress_type = method
-    return info
-
-
-def _files(
-    store: Store, storage: Storage, owner: str, missing: list[str]
-) -> Iterator[tuple[str, Iterable[bytes], int]]:
-    packed, as_is = zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED  # photos are compressed already
-    yield "README.txt", [README.encode()], packed
+def _files(store: Store, storage: Storage, owner: str) -> Iterator[tuple[zipfile.ZipInfo, Iterable[bytes]]]:
+    yield packed("README.txt"), [README.encode()]
+    rows, missing = store.accounts.rows, list[str]()
     for name, table in TABLES.items():
-        lines = (_line(row) for row in store.accounts.rows(table, owner))
-        yield f"{name}.jsonl", lines, packed
+        yield packed(f"{name}.jsonl"), (_line(row) for row in rows(table, owner))
     kept = [
         *(
             (f"originals/{row['public_id']}/{row['filename']}", row["blob_key"])
-            for row in store.accounts.rows(PhotoRow, owner)
+            for row in rows(PhotoRow, owner)
             if row["file_gone_at"] is None
         ),
         *(
             (f"corrections/{row['public_id']}/{row['result_name']}", row["result_key"])
-            for row in store.accounts.rows(CorrectionRow, owner)
+            for row in rows(CorrectionRow, owner)
             if row["result_key"] is not None
         ),
     ]
     for name, key in kept:
-        yield from _blob(storage, name, key, missing, as_is)
-
-
-def _blob(
-    storage: Storage, name: str, key: str, missing: list[str], method: int
-) -> Iterator[tuple[str, Iterable[bytes], int]]:
-    try:
-        size = storage.info(key).size
-    except FileNotFoundError:  # deleted meanwhile
-        missing.append(name)
-        return
-    yield name, storage.stream(key, 0, size), method
+        try:
+            size = storage.info(key).size
+        except FileNotFoundError:  # deleted meanwhile
+            missing.append(name)
+        else:
+            yield zipfile.ZipInfo(name), storage.stream(key, 0, size)  # photos are compressed already
+    if missing:
+        yield packed("missing.txt"), ["\n".join([*missing, ""]).encode()]
 
 
 def _line(row: Mapping[str, Any]) -> bytes:

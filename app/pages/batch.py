@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse, StreamingResponse
 
+from app.blobs.zipped import zipped
 from app.errors import NotReadyError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
@@ -60,46 +60,22 @@ def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
         "Content-Disposition": 'attachment; filename="corrected.zip"',
         "X-Content-Type-Options": "nosniff",
     }
-    return StreamingResponse(_zipped(call, plans), media_type="application/zip", headers=headers)
+    return StreamingResponse(zipped(_files(call, plans)), media_type="application/zip", headers=headers)
 
 
 def _plans(call: Call, ids: str) -> list[CorrectionRow]:
     return [find_correction(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
 
 
-class _Sent(io.RawIOBase):
-    """Keeps what is written until it is taken."""
-
-    def __init__(self) -> None:
-        self._kept = bytearray()
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:  # noqa: ANN401 - any buffer
-        self._kept += data
-        return len(data)
-
-    def take(self) -> bytes:
-        taken, self._kept = bytes(self._kept), bytearray()
-        return taken
-
-
-def _zipped(call: Call, plans: Sequence[CorrectionRow]) -> Iterator[bytes]:
-    """Yield an archive of files that are compressed already, part by part: none is held as a whole."""
-    sent, used = _Sent(), set[str]()
-    with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
-        for row in plans:
-            assert row.result_key is not None
-            assert row.result_bytes is not None
-            entry = zipfile.ZipInfo(
-                unused_name(row.result_name or row.public_id, used), row.photo.received_at.timetuple()[:6]
-            )
-            with archive.open(entry, "w", force_zip64=True) as file:
-                for part in call.storage.stream(row.result_key, 0, row.result_bytes):
-                    file.write(part)
-                    yield sent.take()
-    yield sent.take()
+def _files(call: Call, plans: Sequence[CorrectionRow]) -> Iterator[tuple[zipfile.ZipInfo, Iterable[bytes]]]:
+    """Yield the files of corrections, which are compressed already."""
+    used = set[str]()
+    for row in plans:
+        assert row.result_key is not None
+        assert row.result_bytes is not None
+        name = unused_name(row.result_name or row.public_id, used)
+        entry = zipfile.ZipInfo(name, row.photo.received_at.timetuple()[:6])
+        yield entry, call.storage.stream(row.result_key, 0, row.result_bytes)
 
 
 def unused_name(name: str, used: set[str]) -> str:

@@ -40,6 +40,7 @@ def _arguments() -> argparse.Namespace:
         "--plain", action="store_true", help="held out, with five RAW photos that nothing spoils"
     )
     lenses.add_argument("--through", type=Path, help="take other photos through the lenses of this folder")
+    lenses.add_argument("--rescaled", action="store_true", help="before pixels of another size then")
     lenses.add_argument("--processes", type=int, default=2)
     train = commands.add_parser("train", help="train the network; goes on where it was ended")
     train.add_argument("--minutes", type=float, default=60.0, help="of this sitting")
@@ -165,6 +166,7 @@ def main() -> None:
     order = library.Order(
         asked.folder / name, asked.folder / "scenes", asked.family,
         held_out=asked.held_out or asked.plain, plain=asked.plain, through=asked.through,
+        rescaled=asked.rescaled,
     )  # fmt: skip
     shards = range(asked.first, asked.first + asked.shards)
     for made in library.generate(order, shards, asked.processes):

@@ -16,6 +16,7 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from lensmodel.core.types import Channel
@@ -308,3 +309,16 @@ def fine_of(kernels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Inner part: (..., SIDE, SIDE) to (..., FINE, FINE)."""
     margin = (SIDE - FINE) // 2
     return kernels[..., margin : SIDE - margin, margin : SIDE - margin]
+
+
+def scaled(kernels: NDArray[np.floating], scale: float) -> NDArray[np.float64]:
+    """Kernels (..., SIDE, SIDE) drawn out by a factor about their middle; sum 1.
+
+    The square pixel that they hold is drawn out with them: less than a tenth of a squared pixel at 1.4.
+    """
+    at = (np.arange(SIDE) - SIDE // 2) / scale + SIDE // 2
+    columns = [scipy.ndimage.map_coordinates(row, [at], order=3, mode="constant") for row in np.eye(SIDE)]
+    weights = np.stack(columns, 1)  # of each pixel in each drawn one, by cubic splines
+    drawn = np.maximum(weights @ np.asarray(kernels, np.float64) @ weights.T, 0.0)
+    total: NDArray[np.float64] = drawn / drawn.sum((-2, -1), keepdims=True)
+    return total

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.population import traced
-from lab.population.kernels import PopulationLens, behind_sensor, coarse_of, fine_of, kernels_of
+from lab.population.kernels import PopulationLens, behind_sensor, coarse_of, fine_of, kernels_of, scaled
 from lab.population.photos import KINDS, Camera, Kind, Scenes
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
@@ -33,6 +33,7 @@ _KIND_SHARES: Final = (0.64, 0.12, 0.24)
 _PHOTO_COUNTS: Final = ((1, 2, 3, 5), (0.3, 0.2, 0.2, 0.3))
 _PLAIN_PATCHES: Final = 72  # of each photo
 _OPENED: Final = 0.35  # share of traced lenses of training that are opened far beyond their design
+_RESCALED: Final = (0.72, 1.4)  # range of the pixels of before over those of a rescaled lens (chosen)
 _OFF_CENTRE: Final = 0.08  # share of lenses whose pictures are cut out of a larger one
 
 
@@ -137,14 +138,25 @@ def make_lens(
 
 
 def retake(
-    stored: Mapping[str, NDArray[Any]], scenes: Scenes, rng: np.random.Generator, *, plain: bool = False
+    stored: Mapping[str, NDArray[Any]],
+    scenes: Scenes,
+    rng: np.random.Generator,
+    *,
+    plain: bool = False,
+    rescaled: bool = False,
 ) -> dict[str, Any] | None:
-    """Take other photos through a lens of the library; None where its kernels hold a file's processing."""
+    """Take other photos through a lens of the library; None where its kernels hold a file's processing.
+
+    Rescaled, it stands before a sensor of other pixels.
+    """
     pitch, kind = stored["facts"]
     if KINDS[int(kind)] != "raw":
         return None
     outer = stored["coarse"][..., outer_cells()]
     kernels = assembled(np.concatenate([stored["fine"].reshape(*outer.shape[:3], -1), outer], -1))
+    if rescaled:
+        scale = float(np.exp(rng.uniform(*np.log(_RESCALED))))
+        kernels, pitch = scaled(kernels, scale), pitch / scale
     states = stored["states"].astype(np.float32)
     if states.shape[1] < 3:  # shards of lenses that were focused far away, all of them
         states = np.column_stack([states, np.full(len(states), FAR_M, np.float32)])
@@ -202,6 +214,8 @@ class Order:
         See `make_lens`.
     through : Path, optional
         A folder of shards: other photos are taken through its lenses, and no lens is drawn.
+    rescaled : bool
+        Whether they stand before other pixels then, see `retake`.
     """
 
     folder: Path
@@ -210,6 +224,7 @@ class Order:
     held_out: bool = False
     plain: bool = False
     through: Path | None = None
+    rescaled: bool = False
 
     def lenses(self, shard: int) -> Iterator[dict[str, Any] | None]:
         """Make the lenses of a shard."""
@@ -220,8 +235,8 @@ class Order:
         elif (path := _path(self.through, self.family, shard)).exists():
             crops = Scenes(self.scenes, held_out=self.held_out)
             for number, stored in enumerate(load_shard(path)):
-                rng = np.random.default_rng([number, shard, FAMILIES.index(self.family)])
-                yield retake(stored, crops, rng, plain=self.plain)
+                rng = np.random.default_rng([number, shard, FAMILIES.index(self.family), int(self.rescaled)])
+                yield retake(stored, crops, rng, plain=self.plain, rescaled=self.rescaled)
 
     def make(self, shard: int) -> int:
         """Write a shard that is not there yet; return how many lenses it has got."""

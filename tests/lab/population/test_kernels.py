@@ -12,6 +12,7 @@ from lab.population.kernels import (
     basis,
     behind_sensor,
     kernels_of,
+    scaled,
     spots,
     stopped_down,
 )
@@ -91,3 +92,13 @@ def test_a_sensor_adds_the_variances_of_its_filter_and_its_diffusion(
     assert after - before == pytest.approx(separation**2 / 4 + diffusion**2, abs=2e-3)
     assert blurred.sum() == pytest.approx(1.0, abs=1e-5)
     assert np.abs(blurred[0] - blurred[0, ::-1, ::-1]).max() < 1e-6
+
+
+@pytest.mark.parametrize("scale", [0.75, 1.0, 1.35])
+def test_a_scaled_kernel_is_as_much_wider(scale: float) -> None:
+    at = np.arange(SIDE) - SIDE // 2
+    kernel = np.exp(-0.5 * (at[:, None] ** 2 / 4.0 + at[None] ** 2 / 9.0))
+    drawn = scaled(kernel / kernel.sum(), scale)
+    assert drawn.sum() == pytest.approx(1.0)
+    for axis, variance in ((1, 4.0), (0, 9.0)):
+        assert float(drawn.sum(axis) @ at**2) == pytest.approx(variance * scale**2, rel=0.01)

@@ -20,7 +20,7 @@ from lensmodel.neural.statistics import group
 from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image
 
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
-_POWERS: Final = np.arange(0.84, 1.05, 0.02)
+_POWERS: Final = np.arange(0.84, 1.15, 0.02)
 
 
 @dataclass(slots=True)

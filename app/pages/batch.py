@@ -18,11 +18,9 @@ from app.pages.rendering import page
 from app.routes.corrections import find_correction
 from app.store.tables import CorrectionRow
 
+# Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have
 MAX_LENGTH: Final = 4000
-"""Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have."""
-
 Ids = Annotated[str, Query(max_length=MAX_LENGTH)]
-
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 

@@ -28,14 +28,10 @@ from lensmodel.report.tables import place_table
 if TYPE_CHECKING:
     from lensmodel.report.plots import Chart
 
-SHOWN_VERSIONS: Final = 200
-"""Versions of the history on the page (chosen): the newest of them."""
-
+SHOWN_VERSIONS: Final = 200  # Versions of the history on the page (chosen): the newest of them
+# Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm
 DEFAULT_ASPECT: Final = 1.5
-"""Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm."""
-
 _APERTURE: Final = TypeAdapter[float](Aperture)
-
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 

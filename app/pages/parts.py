@@ -18,7 +18,6 @@ from app.routes import photos as photo_routes
 from app.routes.common import matches_tag
 
 router = APIRouter(include_in_schema=False, route_class=OneSession)
-
 Page = Literal["home", "photo", "correction", "batch", "lens"]
 
 
@@ -40,8 +39,8 @@ def parts(
     return Response(body, media_type="text/html", headers=headers)
 
 
+# Template, what it shows, and whether the page has to be made anew
 Part = tuple[str, Mapping[str, Any], bool]
-"""Template, what it shows, and whether the page has to be made anew."""
 
 
 def home(call: Call, _: str = "") -> Part:

@@ -23,16 +23,15 @@ from app.schemas import CorrectionIn, Id, PhotoOut, Region
 from app.store.tables import PhotoRow
 from lensmodel.workflow.correcting import SEEN_DB
 
+# Of the nine places of a picture
 NAMES: Final = (
     *("upper left", "upper middle", "upper right"),
     *("left", "centre", "right"),
     *("lower left", "lower middle", "lower right"),
 )
-"""Of the nine places of a picture."""
 
+# Pixels of a preview at most (chosen): a second or two of work while the user waits
 MAX_PREVIEW_PIXELS: Final = 1_500_000
-"""Pixels of a preview at most (chosen): a second or two of work while the user waits."""
-
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 

@@ -24,14 +24,13 @@ Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than 
 Number = Annotated[int, Path(ge=0, le=10_000)]
 Which = Literal["before", "after"]
 
+# Placeholder until there is a picture
 NOTHING: Final = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 3 2">'
     '<rect width="3" height="2" fill="#8882"/></svg>'
 )
-"""Placeholder until there is a picture."""
 
 N = TypeVar("N", int, float)
-
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
@@ -158,8 +157,7 @@ def _turned(row: N, col: N, last_row: int, last_col: int, orientation: int) -> t
     }.get(orientation, (row, col))
 
 
-_BACK: Final = {6: 8, 8: 6}
-"""EXIF orientations whose inverse differs from them, with that inverse."""
+_BACK: Final = {6: 8, 8: 6}  # EXIF orientations whose inverse differs from them, with that inverse
 
 
 def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:

@@ -21,10 +21,9 @@ from app.pages.rendering import page
 from lensmodel.core.errors import LensModelError
 
 HERE: Final = Path(__file__).parent
-
 router = APIRouter(include_in_schema=False, route_class=OneSession)
+# What whoever is not signed in yet may see
 strangers = APIRouter(include_in_schema=False, route_class=OneSession)
-"""What whoever is not signed in yet may see."""
 
 
 def include(site: APIRouter) -> None:

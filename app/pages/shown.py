@@ -16,14 +16,9 @@ from app.schemas import LensOut, PhotoOut
 from app.store.tables import PhotoRow
 from lensmodel.core.names import camera_name, full_name
 
-PHOTOS: Final = 60
-"""Photos and lenses of a list (chosen): the newest of them."""
-
-HOPELESS: Final = frozenset({"failed", "cancelled"})
-"""States of photos without a result."""
-
-MAX_WAITING: Final = 1000
-"""Waiting photos on the page at most: as many as one request can change."""
+PHOTOS: Final = 60  # Photos and lenses of a list (chosen): the newest of them
+HOPELESS: Final = frozenset({"failed", "cancelled"})  # States of photos without a result
+MAX_WAITING: Final = 1000  # Waiting photos on the page at most: as many as one request can change
 
 
 def photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:

@@ -51,15 +51,11 @@ CHECKS: Final[Mapping[str, str]] = {
     "re-blur": "detail that does not match the photo",
     "spectrum": "finer contrast than the photo can have held",
 }
-LEAST: Final = 0.005
-"""Share below which a check is not mentioned (chosen): less than can be seen."""
-
-MAX_PLACES: Final = 6
-"""Places that are listed (chosen): the worst ones."""
-
+LEAST: Final = 0.005  # Share below which a check is not mentioned (chosen): less than can be seen
+MAX_PLACES: Final = 6  # Places that are listed (chosen): the worst ones
+# Side of a square in photo pixels for audits without `tile_side` (chosen): large enough to find in the
+# picture
 SQUARE: Final = 96
-"""Side of a square in photo pixels for audits without `tile_side` (chosen): large enough to
-find in the picture."""
 
 REASONS: Final[Mapping[str, str]] = {
     "clipped": "too bright: the sensor was saturated",

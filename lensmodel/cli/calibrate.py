@@ -109,8 +109,7 @@ def calibrate(
     )
 
 
-_ZIP: Final = b"PK"
-"""First bytes of a profile, damaged or not: the signature of a ZIP file."""
+_ZIP: Final = b"PK"  # First bytes of a profile, damaged or not: the signature of a ZIP file
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,8 +268,8 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
+# Seconds to reach the scheduler of a cluster (chosen): one in the same network answers at once
 CONNECT_S = 10.0
-"""Seconds to reach the scheduler of a cluster (chosen): one in the same network answers at once."""
 
 
 @contextmanager

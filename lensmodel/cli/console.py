@@ -36,11 +36,8 @@ from rich.text import Text
 
 from lensmodel.core.codec import to_json
 
-REMARKS = "lensmodel.remarks"
-"""Logs what was left out of a photo or replaced in it."""
-
-COMPILING = "lensmodel.correction.engine.first_use"
-"""Logs when loops are compiled, once on a machine."""
+REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced in it
+COMPILING = "lensmodel.correction.engine.first_use"  # Logs when loops are compiled, once on a machine
 
 
 class _Lines(logging.Formatter):
@@ -142,18 +139,15 @@ class Display:
             yield
 
 
+# At most one line in so many seconds (chosen): a night's log stays readable, and quick commands silent
 EVERY_S: Final = 10.0
-"""At most one line in so many seconds (chosen): a night's log stays readable, and quick commands silent."""
-
 SURE_AFTER_S: Final = 4.0  # of work (chosen): before, what is read and compiled once hides the pace
+# Ratio of the paces of the earlier and the later half of the time from which on nothing is told: one of them
+# is wrong by as much
 AGREE: Final = 2.0
-"""Ratio of the paces of the earlier and the later half of the time from which on nothing is told: one of them
-is wrong by as much."""
-
+# Of a task, whichever comes first, before its pace is believed (chosen): of one photo what comes before its
+# tiles, of many the first ones
 LEAST_SHARE, LEAST_COUNT = 0.05, 3.0
-"""Of a task, whichever comes first, before its pace is believed (chosen): of one photo what comes before its
-tiles, of many the first ones."""
-
 _MARKS: Final = 512  # of a task's past (chosen): enough to halve any time
 
 
@@ -261,8 +255,7 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Cont
     )
 
 
-NYQUIST: Final = 0.5
-"""Cycles/pixel: the Nyquist frequency, the finest detail that a grid of pixels can hold."""
+NYQUIST: Final = 0.5  # Cycles/pixel: the Nyquist frequency, the finest detail that a grid of pixels can hold
 
 
 def mtf50_words(frequency: float) -> str:

@@ -33,8 +33,8 @@ from lensmodel.patches import selectors
 from lensmodel.photo import OutputFormat
 from lensmodel.workflow.lens import Lens
 
+# Panels of the options that --help-all adds
 LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting", "Writing", "Running"
-"""Panels of the options that --help-all adds."""
 
 
 def correct(

@@ -34,8 +34,7 @@ class InterruptedByUser(BaseException):
 
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-_PATIENCE_S: Final = 10.0
-"""Cleaning up takes far less; after this the process ends all the same."""
+_PATIENCE_S: Final = 10.0  # Cleaning up takes far less; after this the process ends all the same
 
 
 def workers_ignore_it() -> None:
@@ -67,6 +66,7 @@ def _end_workers(number: int) -> None:
     os._exit(128 + number)
 
 
+# Modules by extra, as far as commands import them
 EXTRAS: Final = {
     "service": (
         "alembic",
@@ -87,7 +87,6 @@ EXTRAS: Final = {
     ),
     "report": ("matplotlib",),
 }
-"""Modules by extra, as far as commands import them."""
 
 _WHAT: Final = {"service": "the service", "report": "drawing"}
 

@@ -14,8 +14,8 @@ from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
 
+# What phones add to the names of the files of one shot
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
-"""What phones add to the names of the files of one shot."""
 
 
 def photos(names: Iterable[str]) -> list[Path]:

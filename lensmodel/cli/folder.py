@@ -36,15 +36,12 @@ from lensmodel.workflow.calibrating import Identity
 from lensmodel.workflow.correcting import SEEN_DB
 from lensmodel.workflow.lens import Lens
 
+# Photos that a group is learned from: five are the advice (docs/guide.md), three more for other apertures
+# (chosen); each takes about a minute
 LEARN_FROM: Final = 8
-"""Photos that a group is learned from: five are the advice (docs/guide.md), three more for other
-apertures (chosen); each takes about a minute."""
-
+# Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)
 _UNSURE: Final = 0.5
-"""Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)."""
-
 _SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
-
 PROFILES: Final = "lenses"
 ENDING: Final = ".lensprofile"
 
@@ -369,15 +366,13 @@ def _table(rows: Sequence[GroupResult]) -> str:
     return aligned(head, lines, numbers=range(3, 9))
 
 
+# Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
+# (`focal_octaves` in `lensmodel.model.variables`)
 SAME_FOCAL: Final = 1.19
-"""Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
-(`focal_octaves` in `lensmodel.model.variables`)."""
-
+# Photos at the same settings that follow each other within this time show the same (chosen)
 BURST: Final = timedelta(seconds=2)
-"""Photos at the same settings that follow each other within this time show the same (chosen)."""
-
+# Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some
 MOST_IN_NAME: Final = 80
-"""Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some."""
 
 
 @dataclass(frozen=True, slots=True)

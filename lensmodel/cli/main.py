@@ -24,8 +24,7 @@ from lensmodel.core.errors import LensModelError
 ending.workers_ignore_it()
 
 RESEARCH: Final = "Research"
-ADMINISTRATION: Final = "Administration"
-"""Panels of what few people need, after the commands of everyone."""
+ADMINISTRATION: Final = "Administration"  # Panels of what few people need, after the commands of everyone
 
 
 class Commands(OnDemand):

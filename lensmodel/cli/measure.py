@@ -26,8 +26,8 @@ from lensmodel.workflow.lens import Lens
 KINDS: Final = ("target", "pair", "points", "edges")
 EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
 PAPERS: Final = ("a2", "a3", "a4")
+# Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
 USUAL_DETAIL: Final = 4000
-"""Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo."""
 
 
 @dataclass(frozen=True, slots=True)

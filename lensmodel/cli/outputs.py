@@ -33,8 +33,7 @@ EXTENSION: Final[dict[OutputFormat | None, str]] = {
     "dng": ".dng",
 }
 
-FOLDER: Final = "corrected"
-"""Default folder of results, beside the photos."""
+FOLDER: Final = "corrected"  # Default folder of results, beside the photos
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,32 +48,27 @@ from lensmodel.photo import LinearPhoto
 from lensmodel.quality.edge import OVERSAMPLING, EdgeResponse, crossing, slanted_edge
 from lensmodel.quality.edge_finder import FoundEdge, find_edges
 
+# Error that no square shows of itself: what lies between two directions. Chosen: an even mixture of a core
+# and its aberrations differs by that much from its own two slices' Gaussian
 FLOOR: Final = 0.15
-"""Error that no square shows of itself: what lies between two directions. Chosen: an even mixture of
-a core and its aberrations differs by that much from its own two slices' Gaussian."""
-
+# The same of one edge alone: across it only the other edges of the chart say anything (chosen)
 _LONE_FLOOR: Final = 0.3
-"""The same of one edge alone: across it only the other edges of the chart say anything (chosen)."""
-
 # Cycles/pixel: steps far below what a kernel resolves (chosen)
 _FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)
-_SCALED: Final = np.linspace(0.0, 3.0, 61)
-"""Frequencies over that at which the contrast is a half."""
+_SCALED: Final = np.linspace(0.0, 3.0, 61)  # Frequencies over that at which the contrast is a half
 _FEW: Final = 3  # edges that must reach a frequency of the profile (chosen)
 _SLICE_ERROR: Final = 0.01  # s: of an edge of 64 lines at 1 percent noise, demosaiced
+# Light differs from g by so much of its peak in the middle; further out by less, as a Gaussian of so many
+# times the variance falls (chosen on traced lenses)
 _SPREAD, _ENVELOPE = 0.1, 4.0
-"""Light differs from g by so much of its peak in the middle; further out by less, as a Gaussian of so many
-times the variance falls (chosen on traced lenses)."""
 _ROUNDS: Final = 40  # of ADMM: later ones change nothing that is measured (chosen)
+# Edges closer in direction say nearly the same of a kernel; those of a square cross at 90 degrees (chosen)
 _CROSSING: Final = math.radians(45.0)
-"""Edges closer in direction say nearly the same of a kernel; those of a square cross at 90 degrees
-(chosen)."""
+# A corner of a square lies at most so much further out than the middles of windows that hold one edge and
+# nothing else: a side of the smallest (chosen)
 _CORNER_PX: Final = 64.0
-"""A corner of a square lies at most so much further out than the middles of windows that hold one edge and
-nothing else: a side of the smallest (chosen)."""
+# Pixels from an edge that its line spread is read at: further out is noise; nearer, halos are cut (chosen)
 _REACH_PX: Final = 16.0
-"""Pixels from an edge that its line spread is read at: further out is noise; nearer, halos are cut
-(chosen)."""
 _TAPER_PX: Final = 4.0  # pixels over which it fades: a sudden end would ring (chosen)
 _LEAST_VARIANCE: Final = 0.05  # pixels^2, of a kernel along any direction: a pixel's own box has 1/12
 _RIDGE: Final = 0.05  # of the variances: what nothing speaks for stays small (chosen)

@@ -11,8 +11,7 @@ from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto
 
-PREFIX = "measured-"
-"""How the names of measuring estimators begin: blind ones never do."""
+PREFIX = "measured-"  # How the names of measuring estimators begin: blind ones never do
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,28 +30,21 @@ from scipy import fft, ndimage
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 
-DOTS: Final = 2
-"""Printed dots a sample along each axis."""
-
-ASPECT: Final = 2**0.5
-"""Long side over short side, as A4 and A3 have it."""
-
+DOTS: Final = 2  # Printed dots a sample along each axis
+ASPECT: Final = 2**0.5  # Long side over short side, as A4 and A3 have it
+# Samples along the long side that pages are made with; a photo is compared with each of them (chosen:
+# factors of the root of two)
 DETAILS: Final = (1000, 1400, 2000, 2800, 4000, 5600)
-"""Samples along the long side that pages are made with; a photo is compared with each of them
-(chosen: factors of the root of two)."""
-
 PAPER: Final = 1.0  # reflectance, that of white by definition
 INK: Final = 0.0  # reflectance, that of black by definition
 MEAN: Final = 0.5  # of the noise: halfway between ink and paper
+# Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper
 CONTRAST: Final = 0.17
-"""Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper."""
-
 _SEED: Final = 20120  # any number: printed pages depend on it, so it stays
+# Samples along the long side: 0.07 mm each on the largest paper, about as fine as greys are printed (chosen)
 _LARGEST: Final = 8000
-"""Samples along the long side: 0.07 mm each on the largest paper, about as fine as greys are printed
-(chosen)."""
+# Samples along the long side: coarser noise holds no frequency that a lens takes away (chosen)
 _SMALLEST: Final = 200
-"""Samples along the long side: coarser noise holds no frequency that a lens takes away (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -168,11 +161,9 @@ def _finer(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(fft.irfft2(whole, s=(height * DOTS, width * DOTS)) * DOTS**2, dtype=np.float32)
 
 
+# Width and height in millimetres, lying (ISO 216)
 PAPERS: Final = {"a2": (594.0, 420.0), "a3": (420.0, 297.0), "a4": (297.0, 210.0)}
-"""Width and height in millimetres, lying (ISO 216)."""
-
 SUFFIXES: Final = (".pdf", ".png")
-
 _GREYS: Final = 64  # levels of print: finer than a printer renders, and a small file (chosen)
 
 

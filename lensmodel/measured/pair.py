@@ -41,34 +41,29 @@ from lensmodel.measured.solve import measured_pixels, quadratic, window_corners,
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
+# Error that no window shows of itself; chosen: a lens at f/8 is that far from diffraction at pixels of 4.5
+# um
 FLOOR: Final = 0.05
-"""Error that no window shows of itself; chosen: a lens at f/8 is that far from
-diffraction at pixels of 4.5 um."""
-
-USUAL_F_NUMBER: Final = 8.0
-"""Aperture of the closed photo where it does not say: the sharpest of most lenses."""
-
+USUAL_F_NUMBER: Final = 8.0  # Aperture of the closed photo where it does not say: the sharpest of most lenses
 _USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
 _CLEAR: Final = 8.0  # standard deviations, as in `target`, for the same reason
+# Pixels of a window: the kernel changes within a larger one, a smaller one determines it too badly (chosen)
 _SIDE: Final = 160
-"""Pixels of a window: the kernel changes within a larger one, a smaller one determines it too badly
-(chosen)."""
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
+# Least difference of the apertures: blur that both photos share is missing in the kernel (chosen)
 _STOPS_APART: Final = 2.0
-"""Least difference of the apertures: blur that both photos share is missing in the kernel (chosen)."""
+# Expected relative L2 from which on a window is dropped: a blind kernel is as good (chosen)
 _SURE: Final = 0.3
-"""Expected relative L2 from which on a window is dropped: a blind kernel is as good (chosen)."""
+# Photos are shrunk so far for the first match: a nudged tripod is within reach, the blur is gone (chosen)
 _COARSE: Final = 4
-"""Factor by which photos are shrunk for the first match: a nudged tripod is within reach, and the blur is
-gone (chosen)."""
+# Frequencies along an axis: its lags have to hold two kernels, and the spectra are smooth (chosen)
 _NOISE_GRID: Final = 128
-"""Frequencies along an axis: its lags have to hold two kernels, and the spectra are smooth (chosen)."""
+# Of frequency, 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)
 _RINGS: Final = 16
-"""Of frequency, 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)."""
+# Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
+# error for the lens of development (third order, 4). Measured once, no command repeats it
 _ALIASED: Final = 0.03
-"""Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
-error for the lens of development (third order, 4). Measured once, no command repeats it."""
 _SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
 _FEWEST: Final = 64  # points that a fit of brightness takes: some ten for each of its six terms (chosen)
 
@@ -354,12 +349,10 @@ def diffraction_otf(
     return np.asarray(round_pupil * np.sinc(rows) * np.sinc(cols), dtype=np.float64)
 
 
+# Pixels, side of a place: a larger one is nowhere without detail, a smaller one by chance too quiet (chosen)
 _BLOCK: Final = 64
-"""Pixels, side of a place: a larger one is nowhere without detail, a smaller one by chance too quiet
-(chosen)."""
+# Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more
 _FINE: Final = (0.4, 0.5)
-"""Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more."""
-
 _DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
 
 

@@ -37,18 +37,15 @@ from lensmodel.measured.measurer import MeasuredPsf, require_photos
 from lensmodel.measured.solve import NEAR_CLIP, Solved, measured_pixels, photo_noise, solve
 from lensmodel.photo import LinearPhoto
 
+# Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by over a
+# dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals
 FLOOR: Final = 0.1
-"""Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by
-over a dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals."""
-
-_FEWEST: Final = 2
-"""Lights a cell must have: one alone may be a double star."""
+_FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
+# Of stacking at improved centres: each stack is sharper by those before it, and soon they rest (chosen)
 _ROUNDS: Final = 3
-"""Of stacking at improved centres: each stack is sharper by the centres before it, and soon they rest
-(chosen)."""
+# Expected relative error beyond which a kernel helps no model, whose blind ones are no worse (chosen)
 _SURE: Final = 0.45
-"""Expected relative error beyond which a kernel helps no model, whose blind ones are no worse (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,11 +218,9 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
 
 
 logger = logging.getLogger(__name__)
-
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
+# Of its flux, that another light beside it may have: a fainter one is an error like those of noise (chosen)
 _NEIGHBOUR: Final = 0.1
-"""Of its flux, that another light beside it may have: a fainter one is an error like those of noise
-(chosen)."""
 _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
 
 

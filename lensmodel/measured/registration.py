@@ -23,14 +23,12 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
-
+# Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle
 DEGREE: Final = 5
-"""Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle."""
-
 _FEWEST_MATCHES: Final = 6  # points, twice as many as a polynomial of first order needs (chosen)
+# Matches that lie so far from the smooth field of all others are wrong, those within a tenth pass in any
+# case: less would drop good ones where nearly all are (chosen)
 _TRUSTED_PX: Final = 1.0
-"""Matches that lie so far from the smooth field of all others are wrong, those within a tenth pass in any
-case: less would drop good ones where nearly all are (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,8 +153,8 @@ def match(photo: NDArray[np.floating], reference: NDArray[np.floating]) -> Match
     return Match((shift[0], shift[1]), clarity)
 
 
+# `render(warp, corner, shape)`: what a window of the photo shows, without blur
 Render = Callable[[Warp, tuple[int, int], tuple[int, int]], NDArray[np.floating]]
-"""`render(warp, corner, shape)`: what a window of the photo shows, without blur."""
 
 
 def matched(
@@ -189,18 +187,17 @@ def matched(
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
 # Of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
 _DARK: Final = 0.45
+# Area over that of the ellipse of the same second moments, 1 of an ellipse: noise frays discs, letters and
+# corners have less (chosen)
 _ROUND: Final = 0.85
-"""Area over that of the ellipse of the same second moments, 1 of an ellipse: noise frays discs, letters and
-corners have less (chosen)."""
 _LEAST_PX: Final = 20  # area of a disc: below it no shape is seen (chosen)
 _MOST_SHARE: Final = 0.004  # same, of the picture: a page that fills it has less than a tenth (chosen)
+# Clearest discs that are looked at for the four marks: ten others in the picture do no harm, and their
+# thousand choices of four are still quick (chosen)
 _CANDIDATES: Final = 14
-"""Clearest discs that are looked at for the four marks: ten others in the picture do no harm, and their
-thousand choices of four are still quick (chosen)."""
 _ALIKE: Final = 4.0  # the largest disc over the smallest in area: a page seen very much aslant
+# Least ratio of the light of paper and print: far more on any print, less on shadows and patterns (chosen)
 _PAPER_OVER_DISC: Final = 2.0
-"""Least ratio of the light of paper and print: far more on any print, less on shadows and patterns
-(chosen)."""
 
 
 def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -130,15 +130,13 @@ class Smooth:
         return np.asarray(rows - self.basis[part] @ self.of_x.astype(np.float32), dtype=np.float32)
 
 
+# T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light
 PEAK: Final = 0.5
-"""T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light."""
+# D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have
 REACH: Final = 2.5
-"""D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have."""
-
 _ROWS: Final = 2048  # of the design matrix at once: a whole window would take hundreds of megabytes (chosen)
+# Of the projected gradient, whose error falls with the square of their number: more only cost time (chosen)
 _STEPS: Final = 300
-"""Of the projected gradient, whose error falls with the square of their number: more only cost time
-(chosen)."""
 _STILL: Final = 1e-7  # of the light: no value moves by more
 _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 
@@ -365,22 +363,20 @@ def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
     return min(math.sqrt(variance / float(k @ k)), _WORST)
 
 
+# Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed; measured
+# once, no command repeats it)
 CHANGE: Final = 0.3
-"""Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed;
-measured once, no command repeats it)."""
-
+# How far from the middle the centre of mass is expected, where the misfit does not tell: the match before it
+# is as sure; much more and the phase is left open (chosen)
 CENTRED_PX: Final = 0.3
-"""How far from the middle the centre of mass is expected, where the misfit does not tell: the match before it
-is as sure; much more and the phase is left open (chosen)."""
-
+# Of the search for the phase, coarse to fine: the first crosses a pixel in four, each next one looks around
+# where the last ended (chosen)
 _STEPS_PX: Final = (0.25, 0.1, 0.04)
-"""Of the search for the phase, coarse to fine: the first crosses a pixel in four, each next one looks around
-where the last ended (chosen)."""
+# Largest phase along an axis: kernels come here centred, a whole pixel is another match (chosen)
 _MOST_PX: Final = 1.0
-"""Largest phase along an axis: kernels come here centred, a whole pixel is another match (chosen)."""
 _MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
+# Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)
 _SEARCHED: Final = 100
-"""Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -462,15 +458,11 @@ def _sinc(by: float, size: int) -> NDArray[np.float64]:
     return np.asarray(np.sinc(t[:, None] - t[None, :] - by))
 
 
+# `latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels
 Latent = Callable[[tuple[float, float], int], NDArray[np.floating]]
-"""`latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels."""
-
-SMALL: Final = 15
-"""Side of the kernel by which the middle is found: its wings hardly move it."""
-
+SMALL: Final = 15  # Side of the kernel by which the middle is found: its wings hardly move it
+# Share of the clipping level above which a pixel is not believed: the sensor bends before it clips
 NEAR_CLIP: Final = 0.97
-"""Share of the clipping level above which a pixel is not believed: the sensor bends before it clips."""
-
 _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 
 

@@ -48,24 +48,20 @@ from lensmodel.measured.solve import (
 )
 from lensmodel.photo import LinearPhoto
 
+# Error that no window shows of itself: what the smooth models of light, tones and place leave out (chosen)
 FLOOR: Final = 0.02
-"""Error that no window shows of itself: what the smooth models of light, tones and place leave out
-(chosen)."""
-
+# Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
+# too low is no reason to cut it (chosen)
 EXPLAINED: Final = 1.15
-"""Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
-too low is no reason to cut it (chosen)."""
-
 _CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
 # Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
 _SIDE: Final = 144
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
+# Shares of the side, tried where whole windows do not fit: the kernel changes less in them (chosen)
 _SMALLER: Final = (2 / 3, 1 / 2)
-"""Shares of the side, tried where whole windows do not fit: a change of the kernel falls with the side
-(chosen)."""
 _LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
+# In the middle of the frame, where the lens is sharpest: more lie further out (chosen)
 _TONE_WINDOWS: Final = 6
-"""In the middle of the frame, where the lens is sharpest: more lie further out (chosen)."""
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 
 
@@ -233,20 +229,19 @@ def _parts(count: int) -> NDArray[np.float64]:
     return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
 
 
+# Standard deviation of q and c, see `tones_of`: what tones a print of unknown making may have (chosen: a
+# gamma of 1.3 has a q of 0.3)
 TONE_SPREAD: Final = 0.3
-"""Standard deviation of q and c, see `tones_of`: what tones a print of unknown making may have (chosen:
-a gamma of 1.3 has a q of 0.3)."""
-
+# z, z² and z³ of `tones_of` in powers of R, less their constants
 _POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
-"""z, z² and z³ of `tones_of` in powers of R, less their constants."""
 _TINY: Final = 1e-20  # keeps a division finite
+# Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies: at 1, its dots
+# would alias, more costs time (chosen)
 _FINE: Final = 2
-"""Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies: at 1, its dots
-would alias, more costs time (chosen)."""
+# Pixels around a window, where the taper is: half of the largest kernel comes nearly as far (chosen)
 _SPARE: Final = 16
-"""Pixels around a window, where the taper is: half of the largest kernel comes nearly as far (chosen)."""
+# Of fitting light and tones in turn: the second corrects what the first took for the other (chosen)
 _LIGHT_ROUNDS: Final = 2
-"""Of fitting light and tones in turn: the second corrects what the first took for the other (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

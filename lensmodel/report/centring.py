@@ -35,19 +35,17 @@ from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report.places import direction_in_words
 
+# Field radius at which opposite sides are compared (chosen: the short sides of a 3:2 frame are at 0.83)
 EDGE_R: Final = 0.85
-"""Field radius at which opposite sides are compared (chosen: the short sides of a 3:2 frame are at 0.83)."""
-
 _MIDDLE_R: Final = 0.5  # half-diagonals: inside, opposite sides are next to each other (chosen)
 _NEAR_STOPS: Final = 0.7  # stops: photos of one aperture as far as blur is concerned (chosen)
 _FEWEST: Final = 12  # patches: a plane through fewer is chance (chosen)
 _SOFTER: Final = 0.10  # of the width: less is not seen between two sides of a print (chosen)
 _COMATIC: Final = 0.15  # third moment over width cubed, in the middle: a shorter tail is not seen (chosen)
 _UNSURE: Final = 0.4  # sides that may differ by more, error and all, are not called alike (chosen)
+# One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)
 _CHANCE: Final = 0.01
-"""One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)."""
 _WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
-
 _Array = NDArray[np.float64]
 _Fit = Callable[[NDArray[np.intp]], _Array]
 

@@ -27,9 +27,8 @@ from lensmodel.model import LensModel
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.places import DEFAULT_ASPECT, grid
 
+# Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)
 FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
-"""Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)."""
-
 _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
 
 
@@ -161,10 +160,10 @@ def to_mtf_table(psfs: PsfGrid) -> bytes:
     return out.getvalue().encode()
 
 
+# Formats by name, each of which turns `psfs` into the bytes of a file; names of files end in it
 exporters: Registry[bytes] = Registry(
     "export format", {"csv": to_mtf_table, "fits": to_fits, "json": to_json, "npz": to_npz}
 )
-"""Formats by name, each of which turns `psfs` into the bytes of a file; names of files end in it."""
 
 
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:

@@ -21,8 +21,9 @@ _PAGE: Final = Template("""<!doctype html>
 body { font: 1rem/1.5 system-ui, sans-serif; color: #191a1c; max-width: 76rem; margin: 0 auto;
   padding: 1rem 1.5rem; }
 .charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 34rem), 1fr)); }
-img { width: 100%; height: auto; }
-.scroll { overflow-x: auto; }
+figure { margin: 0; }
+img { width: 100%; min-width: 34rem; height: auto; }
+figure, .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .2rem .8rem .2rem 0; text-align: left; border-bottom: 1px solid #dcdcd8; }
 .notes { color: #55585d; font-size: .9rem; }
@@ -71,4 +72,7 @@ def to_html(report: LensReport) -> bytes:
 
 
 def _images(drawn: Iterable[Chart]) -> str:
-    return "\n".join(f"<img src='{chart.source}' alt='{escape(chart.title)}'>" for chart in drawn)
+    return "\n".join(
+        f"<figure tabindex='0'><img src='{chart.source}' alt='{escape(chart.title)}'></figure>"
+        for chart in drawn
+    )

@@ -49,34 +49,26 @@ from lensmodel.report.places import (
 
 Unit = Literal["c/px", "lp/ph", "lp/mm"]
 UNIT_NAMES: Final[dict[Unit, str]] = {"c/px": "c/px", "lp/ph": "LP/PH", "lp/mm": "lp/mm"}
-
+# Cycles/pixel: beyond it a sensor shows no finer lines, and a measured MTF50 says only "at least"
 NYQUIST: Final = 0.5
-"""Cycles/pixel: beyond it a sensor shows no finer lines, and a measured MTF50 says only "at least"."""
-
 MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
 ROWS: Final = 7  # of the grid of places: zones have some each, and their figures are still readable (chosen)
-
+# Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
+# with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)
 _STEPS_MM: Final = (50.0, 20.0, 10.0)
-"""Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
-with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)."""
-
+# Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres (chosen)
 _FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
-"""Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres (chosen)."""
-
 # Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
 RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
 _ROUND: Final = 1.05  # of the hull of measured places, which a figure may lie beyond (chosen)
 _RING: Final = 2  # places in each quarter of a ring whose mean is its value (chosen: for time)
 _LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals (chosen: curves are smooth)
-
+# Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
+# (chosen: a fifth less is hardly seen in a print, half as much at a glance)
 _EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
-"""Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
-(chosen: a fifth less is hardly seen in a print, half as much at a glance)."""
-
+# MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and a
+# little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)
 _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
-"""MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and
-a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
-
 _ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
 _FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
 _ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
@@ -87,12 +79,10 @@ _ZONE_WORDS: Final[dict[Zone, str]] = {
 }
 
 _NAMED: Final = 8  # photos that a report names (chosen: two lines)
+# Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)
 _WELL_KNOWN: Final = 0.1
-"""Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)."""
-
+# Expected relative L2 of a kernel from which on a place is drawn as unknown (chosen: half may be wrong)
 UNKNOWN: Final = 0.5
-"""Expected relative L2 of a kernel from which on a place is drawn as unknown (chosen: half may be wrong)."""
-
 _Pairs: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 
 

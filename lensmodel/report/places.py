@@ -9,8 +9,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, field_grid
 from lensmodel.core.types import FieldPosition
 
+# Width over height of a 35 mm frame; a profile does not say how wide its photos were
 DEFAULT_ASPECT: Final = 1.5
-"""Width over height of a 35 mm frame; a profile does not say how wide its photos were."""
 
 _DIRECTIONS: Final = (
     *("right", "upper right", "top", "upper left"),

@@ -37,11 +37,11 @@ try:
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
+# From soft to sharp, palest where a photo is a little soft; lightness rises and falls once, for the colour-
+# blind and for print (chosen)
 _SHARPNESS: Final = LinearSegmentedColormap.from_list(
     "sharpness", [(0.0, "#7f1d1d"), (0.35, "#fdf6e3"), (0.7, "#0b6e99"), (1.0, "#083d56")]
 )
-"""From soft to sharp, palest where a photo is a little soft; lightness rises and falls once, for the
-colour-blind and for print (chosen)."""
 _CHANGES: Final = LinearSegmentedColormap.from_list("changes", ["#7f1d1d", "#fdf6e3", "#0b6e99"])
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
 _CHANNELS: Final[dict[Channel, tuple[str, str]]] = {
@@ -94,8 +94,7 @@ class Chart:
 
 
 Place = Figure | SubFigure
-Panel = tuple[str, Callable[[Place], None]]
-"""Title of a drawing, and what draws it."""
+Panel = tuple[str, Callable[[Place], None]]  # Title of a drawing, and what draws it
 
 
 def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:

@@ -81,40 +81,17 @@ def write_image(
     lens: str = "",
     gps: Directory | None = None,
 ) -> None:
-    """Write planes as a file that shows the picture as its input did.
+    """Write planes as a file that shows the picture as its input did, complete or not at all.
 
-    The file appears complete or not at all. It carries an ICC profile, and of the metadata camera, lens,
-    exposure, time, maker, rights, rating and keywords; never maker notes or serials.
+    It carries an ICC profile, and of the metadata camera, lens, exposure, time, maker, rights, rating
+    and keywords; never maker notes or serials, and the place only where its owner wants it (`gps`).
+    Light is clipped to 0..1 but in "tiff32", which holds floating-point numbers. TIFF, JPEG and DNG
+    keep the sensor orientation and say how to turn it; PNG, where programs ignore that, is written
+    upright.
 
-    Parameters
-    ----------
-    path : Path or str
-        Where to; an existing file is replaced.
-    planes : ndarray of float32, shape (3, height, width)
-        Linear light in sensor orientation; clipped to 0..1 here, but in "tiff32".
-    encoding : Encoding
-        Of the photo that the planes came from.
-    format : {"tiff16", "tiff32", "png16", "png8", "jpeg", "dng"}
-        Kind of file; "tiff32" holds floating-point numbers, and light beyond white. TIFF, JPEG and DNG keep
-        the sensor orientation and say how to turn it;
-        PNG, where programs ignore that, is written upright.
-    color_space : {"same", "srgb", "camera-linear"}
-        "same": profile and curve of the input, and for RAW sRGB with the camera's white
-        balance. "srgb": converted to sRGB. "camera-linear": the planes' own numbers and
-        primaries, with a profile that describes them. DNG is camera-linear by its nature.
-    quality : int
-        JPEG quality, 1 to 100; colour is never subsampled.
-    description : str
-        Text for the file's description tag, and for the history of its XMP packet.
-    lens : str
-        What the owner calls the lens; by default the packet names it as the photo does.
-    gps : Directory, optional
-        Where it was taken, as `location.gps_directory` reads it: kept only where its owner wants it.
-
-    Raises
-    ------
-    InvalidInputError
-        For planes of another shape, an unknown format or colour space, or a quality outside 1..100.
+    The colour space "same" is profile and curve of the input, and for RAW sRGB with the camera's white
+    balance; "srgb" is converted to sRGB; "camera-linear" is the planes' own numbers and primaries, with
+    a profile that describes them, which DNG is by its nature. `lens` is what its owner calls it.
     """
     if planes.ndim != 3 or planes.shape[0] != 3:
         raise InvalidInputError(f"planes must have the shape (3, height, width), got {planes.shape}")

@@ -67,7 +67,7 @@ def correct(
             min=0.0,
             max=1.0,
             metavar="0..1",
-            help="0: correct nothing; 1: all that the noise allows (for JPEGs, seven tenths of that).",
+            help="0: correct nothing; 1: all that the noise allows (JPEGs: less where the PSF is unsure).",
         ),
     ] = 1.0,
     file_format: Annotated[

@@ -53,6 +53,11 @@ SHARE: Final = 0.87
 with grain that the inverse of the blur amplifies it is no more than there was (chosen)."""
 
 
+HALF: Final = 0.5
+"""Error of a kernel at which half of the correction of a processed photo is made (chosen): see
+`CorrectionJob.strength_at`."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectionJob:
     """Everything that a cell needs; shared by the threads and never changed."""
@@ -71,6 +76,7 @@ class CorrectionJob:
     audited: bool
     unguarded: bool
     stored: StoredColour | None
+    processed: bool = False
     layers: tuple[Bounds, ...] = ()
 
     def __post_init__(self) -> None:
@@ -104,9 +110,19 @@ class CorrectionJob:
         origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
         return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
 
-    def weakened(self, photo: Planes, restored: Planes) -> Planes:
-        """Blend the photo with its correction by the strength."""
-        return restored if self.strength == 1.0 else photo + np.float32(self.strength) * (restored - photo)
+    def strength_at(self, error: float) -> float:
+        """Share of a correction to make where the kernel is expected to have this error.
+
+        A camera has sharpened, smoothed and compressed a processed photo: noise no longer tells where a
+        change is in vain. A share s of a change that is right gains 1 - (1 - s)² of it; of one that is not,
+        the error falls with s².
+        """
+        return self.strength / (1.0 + (error / HALF) ** 2) if self.processed else self.strength
+
+
+def _weakened(photo: Planes, restored: Planes, strength: float) -> Planes:
+    """Blend a photo with its correction."""
+    return restored if strength == 1.0 else photo + np.float32(strength) * (restored - photo)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,7 +222,8 @@ def _within(
         return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), None, left=True)
     blurs, solution = solved((1.0,) * len(CHANNELS) if job.unguarded else plans.shares)
     if job.unguarded:
-        return RestoredCell(job.weakened(tile.cell_pixels, solution.planes[tile.inner]), expected, None)
+        made = _weakened(tile.cell_pixels, solution.planes[tile.inner], job.strength)
+        return RestoredCell(made, expected, None)
     restored, audit = _checked(job, tile, bounds, blurs, solution)
     photo, least = tile.cell_pixels, WORTH_DB if bounds.denoise == 0.0 else 0.0
     changed = expected.changed(
@@ -215,8 +232,10 @@ def _within(
     if changed is None:
         # so little passed limit and audit that the rest would smooth the photo, not sharpen it
         return RestoredCell(photo, replace(expected, after=expected.before), audit, left=True)
-    changed = changed.weakened(job.strength * (2.0 - job.strength))
-    return RestoredCell(job.weakened(photo, restored), changed, audit)
+    strength = job.strength_at(expected.psf_error)
+    return RestoredCell(
+        _weakened(photo, restored, strength), changed.weakened(strength * (2.0 - strength)), audit
+    )
 
 
 def _checked(

@@ -108,6 +108,7 @@ def correct_planes(
     unguarded: bool = False,
     least_gain_db: float | None = None,
     stored: StoredColour | None = None,
+    processed: bool = False,
     roi: Roi | tuple[int, int, int, int] | None = None,
     workers: int = 1,
     pitch: int | None = None,
@@ -161,6 +162,9 @@ def correct_planes(
         corrects all.
     stored : StoredColour or None
         How the photo's file stored chroma, if not at full resolution.
+    processed : bool
+        Whether a camera sharpened, denoised and compressed the photo: then less of the correction is made the
+        larger the expected error of the PSF.
     roi : tuple of int or None
         `(top, left, height, width)`: return only this part, with the same pixels as the whole.
     workers : int
@@ -208,6 +212,7 @@ def correct_planes(
         audited,
         unguarded,
         stored,
+        processed,
         tuple(layers),
     )
     window = Roi.of(frame, roi)

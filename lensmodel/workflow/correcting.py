@@ -28,11 +28,6 @@ log = logging.getLogger(__name__)
 SEEN_DB: Final = 0.3
 """Expected gain below which a photo is left (chosen): at 0.2 dB nobody saw a difference at 3:1."""
 
-LOSSY_SHARE: Final = 0.7
-"""Share of the correction that compressed photos get (chosen). Their camera has sharpened and smoothed
-them, so that a change may be in vain. A share s of one that is right gains 1 - (1 - s)^2 of it, nine
-tenths; of one that is not, the error falls with s^2, to a half."""
-
 
 def lateral_of(developed: LinearPhoto) -> LateralColour:
     """Estimate the lateral colour of a photo from its own edges."""
@@ -68,8 +63,6 @@ def correct_photo(
     wanted, unguarded = _method_of(model, method)
     field = known or psfs_for(developed, model, settings, method=method, photo=photo)
     planes, cfa = developed.planes, developed.cfa
-    if developed.lossy and not unguarded:
-        strength *= LOSSY_SHARE
     solver = correction.deconvolvers.resolve(wanted)
     if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
@@ -88,6 +81,7 @@ def correct_photo(
         unguarded=unguarded,
         least_gain_db=least_gain_db,
         stored=correction.StoredColour.of_photo(developed),
+        processed=developed.lossy,
         roi=roi,
         workers=workers,
         on_step=on_step,

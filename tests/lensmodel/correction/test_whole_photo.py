@@ -510,6 +510,22 @@ def test_cells_follow_a_kernel_that_changes_within_them() -> None:
     assert rmse(following, truth) < rmse(fixed, truth)
 
 
+@pytest.mark.parametrize(("error", "share"), [(0.0, 1.0), (0.25, 0.8), (0.5, 0.5)])
+def test_of_a_processed_photo_the_less_is_made_the_less_sure_the_kernel_is(
+    error: float, share: float
+) -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    full, part = (
+        correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", psf_error=error, processed=processed)
+        for processed in (False, True)
+    )
+
+    np.testing.assert_allclose(part.planes - seen, share * (full.planes - seen), atol=1e-5)
+    assert np.abs(full.planes - seen).max() > 0.05
+    assert full.zones["mid"].expected_gain_db >= part.zones["mid"].expected_gain_db
+
+
 def test_one_pass_takes_larger_cells_on_a_mosaic_too() -> None:
     frame = Frame(16, 6000)
     seen = np.full((3, frame.height, frame.width), 0.3, dtype=np.float32)

@@ -53,9 +53,9 @@ SHARE: Final = 0.87
 with grain that the inverse of the blur amplifies it is no more than there was (chosen)."""
 
 
-HALF: Final = 0.5
-"""Error of a kernel at which half of the correction of a processed photo is made (chosen): see
-`CorrectionJob.strength_at`."""
+HALF, BEST = 0.5, 0.25
+"""Error of a kernel at which half of the correction of a processed photo is made, and the least that counts
+(chosen: through a camera's processing none is known better). See `CorrectionJob.strength_at`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ class CorrectionJob:
         change is in vain. A share s of a change that is right gains 1 - (1 - s)² of it; of one that is not,
         the error falls with s².
         """
-        return self.strength / (1.0 + (error / HALF) ** 2) if self.processed else self.strength
+        return self.strength / (1.0 + (max(error, BEST) / HALF) ** 2) if self.processed else self.strength
 
 
 def _weakened(photo: Planes, restored: Planes, strength: float) -> Planes:

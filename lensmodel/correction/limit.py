@@ -406,79 +406,86 @@ def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
 
 
 @jit
-def _hues(y: Real, floors: Real, number: Real, lows: Real, highs: Real) -> None:
-    """Range of each coordinate of colours around blocks of 2 x 2 pixels, but where two are clipped."""
-    rows, cols = floors.shape
-    own, here = np.empty((3, cols), np.float32), np.empty((_AXES, cols), np.float32)
-    least, most = np.empty_like(lows), np.empty_like(highs)
-    least[:] = np.float32(np.inf)
-    most[:] = np.float32(-np.inf)
-    for i in range(rows):
-        _axes(y, floors[i], i, own, here)
-        for k in range(_AXES):
-            line, low, high = here[k], least[k, i // 2], most[k, i // 2]
-            if number.size == 0:
-                for j in range(cols // 2):
-                    low[j] = min(low[j], line[2 * j], line[2 * j + 1])
-                    high[j] = max(high[j], line[2 * j], line[2 * j + 1])
-            for j in range(0 if number.size > 0 else cols - cols % 2, cols):
-                if number.size == 0 or number[i, j] <= np.float32(1.0):
-                    low[j // 2], high[j // 2] = min(low[j // 2], line[j]), max(high[j // 2], line[j])
-    for k in range(_AXES):
-        extremes(least[k], most[k], HUE_REACH, lows[k], highs[k])
-
-
-@jit
-def _hold_colour(y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number) -> None:
+def _hold_colour(  # noqa: C901 - one pass over the tile, row by row
+    y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number
+) -> None:
     """Draw the colours of `x` into the range of those of `y` nearby, in place.
 
     `most` is the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
     zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(PURER)
-    tiny, third = np.float32(1e-6), np.float32(1.0 / 3.0)
     lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
-    blocks = ((rows + 1) // 2, (cols + 1) // 2)
-    floors, unused = np.empty_like(most), np.empty_like(most)
-    extremes(most, most, 1, unused, floors)
-    for i in range(rows):
-        for j in range(cols):
-            floors[i, j] = max(dark, np.float32(3.0 * COLOURLESS) * floors[i, j] * floors[i, j])
-    lows, highs = np.empty((_AXES, *blocks), np.float32), np.empty((_AXES, *blocks), np.float32)
-    _hues(y, floors, number, lows, highs)
-    own, here = np.empty((3, cols), np.float32), np.empty((_AXES, cols), np.float32)
+    reach, side = HUE_REACH, 2 * HUE_REACH + 1
+    least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    extremes(most, most, reach - REACH, least, floors)
+    own, made = np.empty((3, cols), np.float32), np.empty((3, cols), np.float32)
+    here, there = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
+    # ranges along rows, of the rows that the next one needs: all rows at once do not fit into a cache
+    lows, highs = np.empty((side, _AXES, cols), np.float32), np.empty((side, _AXES, cols), np.float32)
     low, high = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
-    kept = np.zeros(cols, np.bool_)
-    for i in range(rows):
-        floor = floors[i]
-        for k in range(_AXES):
+    padded = np.empty((2, cols + 2 * reach), np.float32)
+    share, kept = np.empty(cols, np.float32), np.zeros(cols, np.bool_)
+    for ahead in range(rows + reach):
+        if ahead < rows:
             for j in range(cols):
-                low[k, j], high[k, j] = lows[k, i // 2, j // 2], highs[k, i // 2, j // 2]
-        _axes(y, floor, i, own, here)
+                floors[ahead, j] = max(
+                    dark, np.float32(3.0 * COLOURLESS) * floors[ahead, j] * floors[ahead, j]
+                )
+            _axes(y, floors[ahead], ahead, own, here)
+            for k in range(_AXES):
+                _along(here[k], number, ahead, padded, lows[ahead % side, k], highs[ahead % side, k])
+        i = ahead - reach
+        if i < 0:
+            continue
+        low[:] = lows[i % side]
+        high[:] = highs[i % side]
+        for row in range(max(i - reach, 0), min(i + reach + 1, rows)):
+            for k in range(_AXES):
+                for j in range(cols):
+                    low[k, j] = min(low[k, j], lows[row % side, k, j])
+                    high[k, j] = max(high[k, j], highs[row % side, k, j])
+        _axes(x, floors[i], i, made, there)
+        _axes(y, floors[i], i, own, here)
         if lost:
             _of_white(y, x, number, clip, i, low, high, own, here, kept)
+        share[:] = one
+        for k in range(_AXES):
+            for j in range(cols):
+                step = there[k, j] - here[k, j]
+                room = high[k, j] - here[k, j] if step > zero else here[k, j] - low[k, j]
+                share[j] = min(share[j], (room + purer) / max(abs(step), np.float32(1e-6)))
         for j in range(cols):
-            r, g, b = max(x[0, i, j], zero), max(x[1, i, j], zero), max(x[2, i, j], zero)
-            total, grey = r + g + b + floor[j], third * floor[j]
-            scale = one / total
-            r, g, b = (r + grey) * scale, (g + grey) * scale, (b + grey) * scale
-            share = one
-            step = r - g - here[0, j]
-            room = high[0, j] - here[0, j] if step > zero else here[0, j] - low[0, j]
-            share = min(share, (room + purer) / max(abs(step), tiny))
-            step = g - b - here[1, j]
-            room = high[1, j] - here[1, j] if step > zero else here[1, j] - low[1, j]
-            share = min(share, (room + purer) / max(abs(step), tiny))
-            step = b - r - here[2, j]
-            room = high[2, j] - here[2, j] if step > zero else here[2, j] - low[2, j]
-            share = min(share, (room + purer) / max(abs(step), tiny))
-            share = one if kept[j] else max(share, zero)
-            r = (own[0, j] + share * (r - own[0, j])) * total - grey
-            g = (own[1, j] + share * (g - own[1, j])) * total - grey
-            b = (own[2, j] + share * (b - own[2, j])) * total - grey
-            x[0, i, j] = r if share < one else x[0, i, j]
-            x[1, i, j] = g if share < one else x[1, i, j]
-            x[2, i, j] = b if share < one else x[2, i, j]
+            t = one if kept[j] else max(share[j], zero)
+            floor, grey = floors[i, j], floors[i, j] * np.float32(1.0 / 3.0)
+            total = max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero) + floor
+            r = (own[0, j] + t * (made[0, j] - own[0, j])) * total - grey
+            g = (own[1, j] + t * (made[1, j] - own[1, j])) * total - grey
+            b = (own[2, j] + t * (made[2, j] - own[2, j])) * total - grey
+            x[0, i, j] = r if t < one else x[0, i, j]
+            x[1, i, j] = g if t < one else x[1, i, j]
+            x[2, i, j] = b if t < one else x[2, i, j]
+
+
+@jit
+def _along(line: Real, number: Real, i: int, padded: Real, low: Real, high: Real) -> None:
+    """Range of a coordinate along a row; pixels of two clipped colours do not count."""
+    reach, cols = HUE_REACH, line.size
+    padded[0, reach : reach + cols] = line
+    padded[1, reach : reach + cols] = line
+    if number.size > 0:
+        for j in range(cols):
+            if number[i, j] > np.float32(1.0):
+                padded[0, reach + j], padded[1, reach + j] = np.float32(np.inf), np.float32(-np.inf)
+    for j in range(reach):
+        for k in range(2):
+            padded[k, j], padded[k, reach + cols + j] = padded[k, reach], padded[k, reach + cols - 1]
+    low[:] = padded[0, :cols]
+    high[:] = padded[1, :cols]
+    for k in range(1, 2 * reach + 1):
+        for j in range(cols):
+            low[j] = min(low[j], padded[0, j + k])
+            high[j] = max(high[j], padded[1, j + k])
 
 
 @jit

@@ -20,9 +20,8 @@ LEVEL: Final = 0.1
 LINE_SHARE, EDGE_SHARE = 0.12, 0.25
 """Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
 is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
-HUE_REACH: Final = 1
-"""Blocks of 2 x 2 pixels around that of a pixel whose colours it may have: as far as lateral colour moves
-them."""
+HUE_REACH: Final = 3
+"""Radius of the window whose colours a pixel may have: as far as lateral colour moves them."""
 PURER: Final = 0.03
 """By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
 out get purer, and three times this shows in a light grey)."""
@@ -111,10 +110,7 @@ def _colour_held(xp: Any, y: Array, x: Array, brightest: Array, dark: float) -> 
         return shares, shares - xp.roll(shares, -1, axis=0), total
 
     (own, here, _), (made, there, total) = shares_of(y), shares_of(x)
-    low, high = (
-        _doubled(xp, _around(xp, of, _pairs(xp, of, _pairs(xp, of, here, -2), -1), HUE_REACH), y.shape)
-        for of in (xp.minimum, xp.maximum)
-    )
+    low, high = (_around(xp, of, here, HUE_REACH) for of in (xp.minimum, xp.maximum))
     step = there - here
     room = xp.where(step > 0.0, high - here, here - low)
     share = xp.clip(xp.min((room + PURER) / xp.clip(xp.abs(step), 1e-6, None), axis=0), 0.0, 1.0)
@@ -136,13 +132,6 @@ def _around(xp: Any, of: Any, plane: Array, reach: int) -> Array:  # noqa: ANN40
             found = of(found, _shifted(xp, plane, by, axis))
         plane = found
     return plane
-
-
-def _pairs(xp: Any, of: Any, planes: Array, axis: int) -> Array:  # noqa: ANN401 - same
-    """Least or largest of each two pixels along an axis."""
-    size = planes.shape[axis]
-    first, second = np.arange(0, size, 2), np.minimum(np.arange(0, size, 2) + 1, size - 1)
-    return of(*(xp.take(planes, xp.asarray(at, device=planes.device), axis=axis) for at in (first, second)))
 
 
 def _doubled(xp: Any, blocks: Array, shape: tuple[int, ...]) -> Array:  # noqa: ANN401 - same

@@ -42,7 +42,8 @@ def describe(lenses: Sequence[Lens]) -> dict[str, tuple[float, ...]]:
         for colour, name in ((0, "red"), (2, "blue")):
             rows.setdefault(name, []).append(float(np.median(width[:, colour] / width[:, 1])))
         ring = width[(r > _RING[0]) & (r < _RING[1]), 1]
-        rows.setdefault("sides", []).append(float(ring.max() / ring.min()))
+        if ring.size:
+            rows.setdefault("sides", []).append(float(ring.max() / ring.min()))
         rows.setdefault("f-number", []).append(float(np.exp(lens.settings[0, 0])))
     return {
         name: tuple(float(v) for v in np.percentile(values, _PERCENTILES)) for name, values in rows.items()

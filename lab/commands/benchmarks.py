@@ -208,7 +208,7 @@ def correct(
 
         lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
 
-        lensmodel bench correct --photo large.jpg --raw --methods fast,standard --peers
+        lensmodel bench correct --photo scan.png --raw --methods fast,standard
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """

@@ -32,6 +32,7 @@ KNOWN_CODES = {
     "raw_decode_failed",
     "metadata_missing",
     "no_usable_patches",
+    "turned_pixels",
     "memory_limit",
     "time_limit",
 }

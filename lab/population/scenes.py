@@ -30,9 +30,7 @@ _LEAST_FACTOR: Final = (
 _SHARPEST: Final = 0.10  # least share of gradient energy in the finest band; below it a photograph is soft
 _SCALES: Final = (1.0, 1.5, 2.3)  # further factors that each photograph is scaled down by
 
-_SPECTRUM_SIDE: Final = (
-    128  # pixels of the windows that a scene's spectrum is taken from, as large as a patch
-)
+_SPECTRUM_SIDE: Final = 128  # pixels of windows that a scene's spectrum is of: those of a patch
 _NATURAL_SLOPE: Final = 2.0
 """Of power against frequency: D. J. Field, "Relations between the statistics of natural images and the
 response properties of cortical cells", JOSA A 4, 1987."""
@@ -133,8 +131,8 @@ def sharpness(scene: NDArray[np.float32]) -> float:
 def own_blur(scene: NDArray[np.floating], rng: np.random.Generator) -> tuple[float, float]:
     """Slope of a scene's power spectrum, and variance (px^2, per axis) of its own Gaussian blur.
 
-    Of the busiest windows, log P = a - slope log f - 4 pi^2 variance f^2, by least squares over rings. A lens
-    is blamed for what the scenes of training hide: they must be as sharp as what real lenses look at.
+    Of the busiest windows, log P = a - slope log f - 4 pi^2 variance f^2, by least squares over rings. Blur
+    that scenes of training have is learned as theirs, and kernels come out too narrow by as much.
     """
     side = _SPECTRUM_SIDE
     window = np.outer(np.hanning(side), np.hanning(side))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +25,8 @@ ORIENTATION: Final = {1: 6, 3: 8}
 """EXIF orientation of the sensor's pixels, by the quarter turns that lead from the upright ones to them."""
 
 _OFFSET, _LENGTH = 0x0201, 0x0202  # of a JPEG thumbnail in the second directory of EXIF
+_MOST_BYTES: Final = 1 << 20  # of a thumbnail: the block of EXIF in a JPEG holds 64 KiB
+_MOST_PIXELS: Final = 1 << 20
 _ROWS: Final = 48  # of both pictures when they are compared (chosen)
 _ALIKE: Final = 0.9
 """Correlation of a picture with its own thumbnail, at least (chosen: compression leaves more than .98)."""
@@ -38,10 +41,13 @@ def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int 
     if thumbnail is None or thumbnail.height >= thumbnail.width:
         return None
     try:
-        with Image.open(path) as image:
-            image.draft("L", (256, 256))
-            picture = np.asarray(image.convert("L"), dtype=np.float64)
-    except (OSError, ValueError):
+        with warnings.catch_warnings():
+            # the limit of the photo's own pixels was checked on its header
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+                image.draft("L", (256, 256))
+                picture = np.asarray(image.convert("L"), dtype=np.float64)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None
     aspect = picture.shape[0] / picture.shape[1]
     seen = _sized(_without_bars(np.asarray(thumbnail, dtype=np.float64), aspect), aspect)
@@ -67,9 +73,14 @@ def _thumbnail(header: Header) -> Image.Image | None:
             if start is None or length is None:
                 continue
             begin = reader.base + start
+            data = bytes(reader.buffer[begin : begin + min(length, _MOST_BYTES)])
             try:
-                return Image.open(io.BytesIO(bytes(reader.buffer[begin : begin + length]))).convert("L")
-            except (OSError, ValueError):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                    image = Image.open(io.BytesIO(data), formats=("JPEG",))
+                if image.width * image.height <= _MOST_PIXELS:
+                    return image.convert("L")
+            except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
                 continue
     return None
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +65,42 @@ def exif(small: bytes | None, orientation: int | None = 1) -> bytes:
 def written(path: Path, picture: Picture, block: bytes) -> photo.PhotoInfo:
     Image.fromarray(picture).save(path, exif=block, **({"quality": 95} if path.suffix == ".jpg" else {}))
     return photo.inspect(path)
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG that claims so many pixels, black ones."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1 + width))), (b"IEND", b""))
+    parts = [
+        struct.pack(">I", len(v)) + name + v + struct.pack(">I", zlib.crc32(name + v)) for name, v in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def large_jpeg() -> bytes:
+    """A JPEG of 24 megapixels in few bytes."""
+    out = io.BytesIO()
+    Image.new("L", (6000, 4000)).save(out, "JPEG", quality=20)
+    return out.getvalue()[:60_000]
+
+
+@pytest.mark.parametrize(
+    "small",
+    [
+        large_jpeg(),
+        bomb(30_000, 20_000),
+        bomb(13_000, 8_000),
+        b"\x89PNG\r\n\x1a\n\0\0",
+        b"\xff\xd8\xff\xd9",
+        b"",
+    ],
+)
+def test_a_hostile_thumbnail_tells_nothing_and_is_not_unpacked(small: bytes, tmp_path: Path) -> None:
+    upright = np.ascontiguousarray(np.rot90(scene(), -1))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert written(tmp_path / "x.jpg", upright, exif(small)).turns is None
 
 
 @pytest.mark.parametrize("name", ["x.png", "x.jpg"])

@@ -25,6 +25,7 @@ from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matr
 from lensmodel.photo.defects import Suspects
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.rendition import balance_of_rendition
 from lensmodel.photo.values import LensIdentity, Matrix3, PhotoMetadata, PlaneNoise
 
 log = logging.getLogger(__name__)
@@ -134,7 +135,7 @@ def develop_raw(
         white, clip = mosaic.saturation()
     sensor_noise = _sensor_noise(mosaic, white)
     defects = 0 if mosaic is None else mosaic.repair(others)
-    balance = _white_balance(raw)
+    balance = _white_balance(raw, mosaic)
     spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
     planes = _developed(raw, white, balance, spans)
     to_srgb, xyz_to_camera = _colour(raw, balance)
@@ -249,11 +250,15 @@ def stored_levels(plane: Plane) -> NDArray[np.floating] | None:
     return levels if 2 < levels.size <= _FEW_CODES else None
 
 
-def _white_balance(raw: rawpy.RawPy) -> tuple[float, float, float]:
-    """Multipliers of the camera, green 1: as written, else daylight."""
+def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:
+    """Multipliers of the camera, green 1: as written, else as its own JPEG shows, else daylight."""
     r, g, b = (float(v) for v in raw.camera_whitebalance[:3])
     if _sound(r, g, b):
         return r / g, 1.0, b / g
+    table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
+    balance = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
+    if balance is not None and _sound(balance[0], 1.0, balance[1]):
+        return balance[0], 1.0, balance[1]
     r, g, b = (float(v) for v in raw.daylight_whitebalance[:3])
     if _sound(r, g, b):
         log.info("the RAW file does not say its white balance; daylight is assumed")

@@ -76,8 +76,11 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     word = _without_place(path, folder / CLEANED)
     (folder / PLACE).write_text(word, encoding="ascii")
     info = photo.inspect(path, photo.Limits(max_megapixels=arguments["max_megapixels"]))
-    with contextlib.suppress(Exception):  # a photo without a small picture goes on
+    try:
         picture = small_pictures.thumbnail(path, info.kind, info.metadata.orientation or 1)
+    except Exception as error:  # noqa: BLE001 - decoders of hostile files raise all kinds; the photo goes on without
+        log.warning("no small picture: %s: %s", type(error).__name__, error)
+    else:
         (folder / THUMBNAIL).write_bytes(picture)
     header: dict[str, Any] = codec.to_json(info)
     header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
@@ -231,7 +234,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     """
     model, about = _model(folder, arguments["mode"]), arguments["about"]
     lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
-    with contextlib.suppress(LensModelError):  # a lens without a report goes on
+    try:
         report = lens_report(
             model,
             about["name"],
@@ -240,6 +243,9 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
             lateral=lateral,
             on_step=progress,
         )
+    except LensModelError as refusal:
+        log.info("a lens without a report: %s", refusal)
+    else:
         (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(report))), encoding="utf-8")
     error = codec.to_json(model.expected_errors())
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
@@ -274,7 +280,11 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     """Read the lens profile at `path`; its samples go to the folder."""
     del progress
     path, most = Path(arguments["path"]), arguments["max_unpacked"]
-    with contextlib.suppress(zipfile.BadZipFile, ValueError), zipfile.ZipFile(path) as archive:
+    # what cannot be opened is named by `read_profile`
+    with (
+        contextlib.suppress(zipfile.BadZipFile, ValueError, NotImplementedError),
+        zipfile.ZipFile(path) as archive,
+    ):
         unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > most:
             raise ImageTooLargeError(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from app.jobs import sample_files
+from app.jobs import sample_files, tasks
 from app.jobs.sample_files import DAMAGED, MAX_SIDE, read_samples, returned_samples, write_samples
 from app.jobs.task_files import ENCODED, KERNELS, SAMPLES
 from lensmodel.core.errors import InvalidInputError
@@ -125,3 +127,17 @@ def test_entries_that_are_too_long_to_read_are_not_read(
 
     with pytest.raises(InvalidInputError, match="larger than 100 bytes"):
         returned_samples(tmp_path, count=1)
+
+
+@pytest.mark.parametrize("version", [20, 99])
+def test_a_zip_that_is_no_profile_is_refused_whatever_version_it_claims(version: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.lensprofile"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("profile.json", "{}")
+    data = bytearray(path.read_bytes())
+    entry = data.find(b"PK\x01\x02")
+    data[entry + 6 : entry + 8] = struct.pack("<H", version)  # that is needed to unpack it
+    path.write_bytes(data)
+
+    with pytest.raises(InvalidInputError, match="no lens profile"):
+        tasks.profile({"path": str(path), "max_unpacked": 1 << 20}, tmp_path, lambda *_: None)

@@ -474,7 +474,13 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
         arguments = {"path": str(path), "max_unpacked": MAX_UNPACKED}
         try:
             answer = context.attempt(
-                "profile", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
+                "profile",
+                arguments,
+                folder=folder,
+                limits=limits,
+                wanted=wanted,
+                reads=[path],
+                compiles_for=file.owner_id,
             )
         except JobFailedError as error:
             if error.code != "invalid_parameter":

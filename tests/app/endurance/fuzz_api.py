@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -70,9 +71,11 @@ def main() -> int:
             "LENSMODEL_FUZZ_PROFILE": str(profile),
         }
         status = subprocess.run(command, env=environment, cwd=folder, check=False).returncode
-        lost = [line for line in service.log.read_text().splitlines() if " ERROR " in line]
+        # a record begins with its time; the traceback of an error follows on lines of its own
+        records = re.split(r"\n(?=\d{4}-\d\d-\d\d )", service.log.read_text())
+        lost = [record for record in records if " ERROR " in record]
         print("\n".join(lost[:20]))
-        print(f"schemathesis ended with {status}; {len(lost)} lines of errors in the service's log")
+        print(f"schemathesis ended with {status}; {len(lost)} errors in the service's log")
     return status
 
 

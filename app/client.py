@@ -119,10 +119,8 @@ class Client:
 
         `fields` are those of `UploadFields`, such as `lens_id` or `aperture`; `on_progress(sent, total)` is
         called in bytes after each mebibyte. Settings are those of a file that does not say its own:
-        `change_photo` corrects one that says them wrongly. With `model` the photo founds a lens that is
-        learned so; of a lens that is there and has another it is refused. With `kind` it was made to measure
-        the lens; of a pair it is the open photo, and `reference_id` is the closed one, sent before with
-        `calibrate=False`.
+        `change_photo` corrects one that says them wrongly. With `kind` it was made to measure the lens; of a
+        pair it is the open photo, and `reference_id` is the closed one, sent before with `calibrate=False`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""How the service learns lenses of each model; the settings define the default one."""
+"""How the service learns lenses: the default preset, as far as the settings do not change it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from app.runtime.settings import Settings
 from lensmodel.workflow.sampling import KERNEL_PATCHES, PRESETS, Preset
 
 
-def configured_preset(settings: Settings, name: str) -> Preset:
-    """Return estimator, kernel size, patches, model mode and correction method of a model."""
-    # The settings of the service choose the estimator of the model `default`, and the patches of both
-    preset = PRESETS[name]
-    if name == "default":
-        own = settings.estimator != preset.estimator
-        patches = KERNEL_PATCHES if own else preset.patches
-        preset = replace(preset, estimator=settings.estimator, patches=patches)
-    return replace(preset, patches=settings.patches or preset.patches)
+def configured_preset(settings: Settings) -> Preset:
+    """Return estimator, kernel size, patches, model mode and correction method."""
+    preset = PRESETS["default"]
+    own = settings.estimator != preset.estimator
+    patches = settings.patches or (KERNEL_PATCHES if own else preset.patches)
+    return replace(preset, estimator=settings.estimator, patches=patches)

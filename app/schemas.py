@@ -43,8 +43,6 @@ def _odd(value: int) -> int:
     return value
 
 
-# How a lens is learned and its photos are corrected: names of `lensmodel.workflow.sampling`
-PsfModel = Literal["default", "paper"]
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
 OptionalName = Annotated[Name | None, BeforeValidator(blank_is_none)]
 Id = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")]
@@ -134,11 +132,6 @@ class UploadFields(Question):
         default=None, description="what a photo made to measure the lens shows; nothing for ordinary photos"
     )
     reference_id: Id | None = Field(default=None, description="of a pair: the photo closed to about f/8")
-    model: PsfModel | None = Field(
-        default=None,
-        description="of a new lens: how it is learned, default or the paper's own way; a lens that is there "
-        "must have it already",
-    )
     selector: Name | None = Field(
         default=None, description="who chooses its patches, one of GET /v1/formats; r-map by default"
     )
@@ -285,12 +278,7 @@ class CorrectionIn(Question):
     lens_id: Id | None = Field(None, description="default: the lens of the photo")
     lens_version: int | None = Field(None, ge=1, le=MAX_VERSION, description="default: the newest")
     any_lens: bool = Field(default=False, description="also where the photo seems to be of another lens")
-    method: str | None = Field(
-        None,
-        min_length=1,
-        max_length=60,
-        description="default: standard, and paper where the model of the lens is that of the paper",
-    )
+    method: str = Field("standard", min_length=1, max_length=60)
     strength: float = Field(1.0, ge=0, le=1)
     halo: float | None = Field(
         None,
@@ -381,10 +369,6 @@ class LensOut(Model):
     serial: str | None
     serial_source: SerialSource
     label: str | None
-    psf_model: PsfModel = Field(
-        default="default",
-        description="how it is learned and its photos are corrected, as its first photo was sent",
-    )
     version: int
     photos: int
     samples: int
@@ -486,10 +470,9 @@ class Support(Model):
         default_factory=list, description="in which variables it lies outside the samples"
     )
     predicted_error: float | None
-    model: PsfModel = Field(default="default", description="the model of the lens that answered")
     answered_by: str = Field(
-        description="what made the answer: network, regression, network and regression, or paper; the "
-        "numbers here are of that"
+        description="what made the answer: network, regression, or network and regression; the numbers here "
+        "are of that"
     )
     weights: str = Field(default="", description="fingerprint of the network's weights")
     nearest: float = Field(

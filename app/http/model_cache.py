@@ -15,13 +15,11 @@ from typing import Final, TypeAlias
 
 from app.errors import ConflictError, UnknownError
 from app.runtime import metrics
-from app.schemas import PsfModel
 from app.store import Store, StoredSample
 from app.store.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.model import LensModel, ModelSettings
-from lensmodel.workflow.sampling import PRESETS
+from lensmodel.model import LensModel
 
 log = logging.getLogger(__name__)
 
@@ -37,11 +35,6 @@ class Fitted:
     lens_id: str
     state: LensState
     model: LensModel
-
-    @property
-    def way(self) -> PsfModel:
-        """The way of the answers."""
-        return "paper" if self.model.settings.mode == PRESETS["paper"].mode else "default"
 
 
 class ModelCache:
@@ -75,7 +68,7 @@ class ModelCache:
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
         if old is not None:
             state, samples = self._store.lenses.samples_of(lens_id, after_version=old.state.version)
-            if (state.rebuild_epoch, state.way) == (old.state.rebuild_epoch, old.state.way):
+            if state.rebuild_epoch == old.state.rebuild_epoch:
                 return Fitted(lens_id, state, old.model.added([stored.sample for stored in samples]))
         return _fit(lens_id, *self._store.lenses.samples_of(lens_id))
 
@@ -119,8 +112,7 @@ def _fit(lens_id: str, state: LensState, samples: list[StoredSample]) -> Fitted:
             f"lens {lens_id} has no samples yet (version {state.version}): "
             "upload photos taken with it and wait until they are counted"
         )
-    settings = ModelSettings(mode=PRESETS[state.way].mode)
-    return Fitted(lens_id, state, LensModel.fit([stored.sample for stored in samples], settings))
+    return Fitted(lens_id, state, LensModel.fit([stored.sample for stored in samples]))
 
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:

@@ -52,7 +52,6 @@ def describe(
             extrapolated=answer.extrapolated,
             beyond=list(answer.beyond),
             predicted_error=error if np.isfinite(error) else None,
-            model=fitted.way,
             answered_by=answer.answered_by,
             weights=answer.weights,
             nearest=answer.nearest,

@@ -152,7 +152,6 @@ def lens_out(row: LensRow, apertures: list[float], focals: list[float]) -> s.Len
         s.LensOut,
         row,
         id=row.public_id,
-        psf_model=row.way,
         photos=row.photo_count,
         samples=row.sample_count,
         apertures=apertures,

@@ -27,7 +27,6 @@ from app.store.tables import CorrectionRow, LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
 from lensmodel.correction import Bounds
-from lensmodel.workflow.sampling import PRESETS
 
 log = logging.getLogger(__name__)
 
@@ -97,8 +96,7 @@ class CorrectionWork:
         }
         with self._context.sandbox.folder() as folder:
             lens_id, version = row.lens.public_id, row.lens_version
-            state = self._samples(lens_id, version, folder)
-            arguments["mode"] = PRESETS[state.way].mode
+            self._samples(lens_id, version, folder)
             done = self._context.attempt(
                 "correct",
                 arguments,
@@ -173,7 +171,7 @@ class CorrectionWork:
                 state = self._samples(lens_id, version, folder)
                 metrics = self._context.attempt(
                     "measure",
-                    {"mode": PRESETS[state.way].mode, "about": self._about(lens)},
+                    {"about": self._about(lens)},
                     folder=folder,
                     limits=limits,
                     wanted=wanted,

@@ -27,13 +27,12 @@ from app.store import NewPatch, NewSample, Store
 from app.store.jobs import Job
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
-from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, LensRow, PatchRow, PhotoRow
+from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, PatchRow, PhotoRow
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
-from lensmodel.workflow.sampling import Preset
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +106,7 @@ class PhotoWork:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
         settings = self._context.settings
-        way = configured_preset(settings, photo.way)
+        preset = configured_preset(settings)
         developed = self._context.developed(photo, wanted)
         arguments = {
             "developed": str(developed),
@@ -115,8 +114,8 @@ class PhotoWork:
             "patches": [codec.to_json(_patch_of(row)) for row in rows],
             "numbers": [row.idx for row in rows],
             "settings": stored_settings(photo),
-            "estimator": way.estimator,
-            "size": way.kernel_size,
+            "estimator": preset.estimator,
+            "size": preset.kernel_size,
         }
         limits = self._context.limits(photo, settings.patch_seconds, 24)
         with self._context.sandbox.folder() as folder:
@@ -139,11 +138,8 @@ class _Steps:
     def __init__(self, context: JobContext, engine: DbosEngine, photo: PhotoRow) -> None:
         self._context, self._engine, self._photo = context, engine, photo
         self._store = context.store
+        self._preset = configured_preset(context.settings)
         self._developed = Path()
-
-    @property
-    def _preset(self) -> Preset:
-        return configured_preset(self._context.settings, self._photo.way)
 
     def _wanted(self) -> bool:
         return self._store.photos.is_live(self._photo.public_id, self._photo.epoch)
@@ -166,20 +162,14 @@ class _Steps:
             return True
         inspection.inspect(self._context, self._photo, self._wanted)
         self._photo = _row(self._store, self._photo.public_id)
-        goes_on = self._identify()
-        self._photo = _row(self._store, self._photo.public_id)  # the way of its lens decides what follows
-        return goes_on
-
-    def _identify(self) -> bool:
-        photo = self._photo
-        photos, single = self._store.photos, self._context.settings.assume_single_copy
+        photo, photos = self._photo, self._store.photos
+        single = self._context.settings.assume_single_copy
         lens = photos.assign_lens(photo.public_id, single_copy=single)
         if not photo.calibrate:
             photos.set_state(
                 photo.public_id, ("inspecting",), "stored", epoch=photo.epoch, finished_at=datetime.now(UTC)
             )
             return False
-        _require_model(photo, lens)
         missing = _missing(photo, lens_known=lens is not None)
         if missing:
             photos.set_state(
@@ -380,17 +370,6 @@ def _checked(listed: Any, folder: Path, places: Mapping[int, FieldPosition]) -> 
         raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
 
 
-def _require_model(photo: PhotoRow, lens: LensRow | None) -> None:
-    """Refuse a photo that was sent for another model than its lens has."""
-    requested = photo.given.get("model")
-    if lens is not None and requested not in {None, lens.way}:
-        text = (
-            f"the photo was sent with model={requested}, and its lens has the model {lens.way}: send it "
-            f"again with model={lens.way}, or name a new lens for it"
-        )
-        raise JobFailedError("conflict", text)
-
-
 def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     """Return what the owner must supply before the photo can count; empty if nothing."""
     if not lens_known:
@@ -494,9 +473,10 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     lens = store.lenses.get(file.given["lens_id"], ANY_OWNER)
     if lens is None:
         raise JobFailedError("unknown_lens", "the lens was deleted meanwhile: send the profile to another")
-    if configured_preset(settings, lens.way).mode != read["mode"]:
-        text = f"the profile was learned with the model {read['mode']}, lens {lens.public_id} with {lens.way}"
-        raise JobFailedError("conflict", f"{text}: send it to a lens of that model")
+    mode = configured_preset(settings).mode
+    if read["mode"] != mode:
+        text = f"the profile was learned with the model {read['mode']}, and the service uses {mode}"
+        raise JobFailedError("conflict", f"{text}: use it on the command line")
     if not file.given.get("any_lens"):
         focals = store.lenses.coverage_of([lens])[lens.id][1]
         named = {name: read["lens"].get(name) for name in ("maker", "model", "serial")}

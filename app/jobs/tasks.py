@@ -35,7 +35,7 @@ from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.correction.engine import first_use
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch, selectors
@@ -178,7 +178,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
     output = arguments["output"]
     roi = arguments["roi"]
-    model = _model(folder, arguments["mode"])
+    model = LensModel.fit(read_samples(folder))
     settings = _settings(arguments["settings"])
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
@@ -232,7 +232,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
     `about` has the name of the lens and the shape of its photos.
     """
-    model, about = _model(folder, arguments["mode"]), arguments["about"]
+    model, about = LensModel.fit(read_samples(folder)), arguments["about"]
     lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
     try:
         report = lens_report(
@@ -341,11 +341,6 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
     except LensModelError as error:
         log.info("corrected without lateral colour: %s", error)
         return None
-
-
-def _model(folder: Path, mode: str) -> LensModel:
-    """Build the model of the samples in a folder."""
-    return LensModel.fit(read_samples(folder), ModelSettings(mode=mode))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

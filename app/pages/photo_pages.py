@@ -91,7 +91,7 @@ class PreviewIn(Region):
     With `layers` it is also wanted as the sliders of texture and grain need it.
     """
 
-    method: str | None = Field(default=None, max_length=40)
+    method: str = Field(default="standard", max_length=40)
     lens_id: Id | None = None
     layers: bool = False
 

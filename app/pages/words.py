@@ -220,14 +220,6 @@ def event_words(event: CalibrationOut) -> str:
     return EVENTS.get(event.kind, event.kind)
 
 
-def model_words(lens: LensOut) -> str:
-    """Say what the model of a lens is where it is not the usual one."""
-    return {
-        "paper": 'Its model is "paper", for comparison: the kernels and the correction of the paper that '
-        "this program follows, without the safeguards."
-    }.get(lens.psf_model, "")
-
-
 def centring_verdict(centring: Centring) -> str:
     """Say in a word or two whether a lens is centred."""
     return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Not known yet."}[
@@ -391,7 +383,6 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         event_words,
         sharpness,
         plain,
-        model_words,
         unit_name,
         photo_state,
         state_class,

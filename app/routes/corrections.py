@@ -13,7 +13,6 @@ from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
 from app.other_lens import REMEDY, Described, difference
-from app.presets import configured_preset
 from app.routes.common import (
     NOT_CHANGED,
     Cursor,
@@ -56,7 +55,7 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
 def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     """Create a correction, or return the one of the same request."""
     photo = find_photo(call, options.photo_id)
-    if options.method is not None and options.method not in deconvolvers:
+    if options.method not in deconvolvers:
         raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
     _check_read(photo)
     _check_region(photo, options)
@@ -66,8 +65,7 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     version = _version_for(call, lens, options.lens_version)
     usage = call.store.accounts.usage(call.owner)
     check_usage(call.settings, usage, usage.working_corrections, "corrections")
-    params = options.model_dump(mode="json", include={"strength", "output", "roi"})
-    params["method"] = options.method or configured_preset(call.settings, lens.way).method
+    params = options.model_dump(mode="json", include={"method", "strength", "output", "roi"})
     # with other settings of the photo the same request is a new correction
     params["settings"] = stored_settings(photo)
     # only values other than the defaults: requests stored before there were bounds stay the same

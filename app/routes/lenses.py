@@ -77,11 +77,6 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
         target = find_lens(call, change.merge_into)
         if target.id == lens.id:
             raise InvalidParameterError("merge_into names the lens itself: name the other one")
-        if lens.way != target.way:
-            raise ConflictError(
-                f"lens {lens_id} has the model {lens.way}, and {change.merge_into} {target.way}: only lenses "
-                "of one model can be merged"
-            )
         why = (
             None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
         )

@@ -33,7 +33,7 @@ from app.store import LensName
 from app.store.accounts import Usage
 from app.store.database import new_id
 from app.store.photos import GIVEN_SETTINGS, NewCopy, Received
-from app.store.tables import LensRow, PhotoRow
+from app.store.tables import PhotoRow
 from lensmodel.patches import selectors
 
 router = APIRouter(tags=["photos"], route_class=OneSession)
@@ -85,8 +85,6 @@ async def create_photo(call: CallDep) -> PhotoOut:
 
     With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
     photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
-    With `model` it founds a lens that is learned so; of a lens with another model it is refused, or fails
-    with `conflict` where only the file says which lens it was.
     `selector` names who chooses its patches, of those that `GET /v1/formats` lists; bytes that are known keep
     the patches they have.
     """
@@ -167,15 +165,6 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         raise InvalidParameterError(f"no selector {fields.selector[:60]!r}; known: {known}")
 
 
-def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
-    """Refuse a photo that was sent for another model than its lens has."""
-    if lens is not None and fields.model not in {None, lens.way}:
-        raise ConflictError(
-            f"model={fields.model}: lens {lens.public_id} has the model {lens.way}, which was chosen by its "
-            "first photo: leave model out, or name a new lens"
-        )
-
-
 def _admit(call: Call) -> None:
     """Refuse an upload before its body is read: no disk space, or a quota is used up."""
     limits = call.settings
@@ -218,7 +207,7 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None:
-        _check_model(fields, find_lens(call, fields.lens_id))
+        find_lens(call, fields.lens_id)
     received = recorded(
         call,
         public_id,
@@ -230,8 +219,6 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
         calibrate=fields.calibrate,
         given=given,
     )
-    if received.photo.public_id != public_id and not received.fresh:
-        _check_model(fields, received.photo.lens)
     return described_photo(call, received.photo), received.fresh
 
 
@@ -333,8 +320,6 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         photo_id, call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
     )
     photo = find_photo(call, photo_id)
-    if not done and lens is not None:
-        raise ConflictError(f"photo {photo_id} was learned from for another model than that of the lens")
     if not done:
         raise ConflictError(
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
@@ -363,7 +348,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
 def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 
-    Each photo changes as by itself; where one is gone or refuses nothing changes.
+    Each photo changes as by itself; where one is gone nothing changes.
     """
     if (change.lens_id is None) == (change.new_lens is None) and not change.model_fields_set & {
         *GIVEN_SETTINGS

@@ -116,7 +116,7 @@ class Settings(BaseSettings):
         default=0,
         ge=0,
         le=1000,
-        description="Patches that are used of one photo; 0: as the model of its lens.",
+        description="Patches that are used of one photo; 0: as many as the estimator needs.",
     )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
     assume_single_copy: bool = Field(

@@ -106,13 +106,6 @@ INVARIANTS: Final = (
         )""",
     ),
     Invariant(
-        "models",
-        "photos count for lenses of their model",
-        """
-        SELECT photo.public_id FROM photo JOIN lens ON lens.id = photo.lens_id
-        WHERE photo.deleted_at IS NULL AND state IN ('counted', 'excluded') AND photo.way <> lens.way""",
-    ),
-    Invariant(
         "forgotten photos",
         "nothing is kept of deleted photos",
         """

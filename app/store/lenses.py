@@ -45,7 +45,7 @@ NO_RESULT: Final = ("failed", "cancelled")
 
 # How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
-_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch, LensRow.way).where(
+_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
 _KNOWN: Final = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
@@ -243,12 +243,11 @@ class Lenses(Repository):
     @writes
     def merge(self, session: Session, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along."""
-        # False if one of the two does not exist, photos of the first are still being learned from, or the two
-        # have different models
-        # always locked in the same order: two merges at once must not wait for each other
+        # False if one of the two does not exist, or photos of the first are still being learned from. Always
+        # locked in the same order: two merges at once must not wait for each other
         rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
         lens, target = rows[lens_id], rows[into]
-        if lens is None or target is None or lens.id == target.id or lens.way != target.way:
+        if lens is None or target is None or lens.id == target.id:
             return False
         query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
         photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
@@ -310,14 +309,12 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
         return None
     name = LensName(photo.lens_maker, photo.lens_model, photo.lens_serial, photo.lens_serial_source or "none")
-    way = photo.given.get("model")
-    return _found(session, photo.owner_id, name, way=way, creates=photo.calibrate)
+    return _found(session, photo.owner_id, name, creates=photo.calibrate)
 
 
-def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
+def named(session: Session, owner_id: int, name: LensName) -> LensRow:
     """Return the lens of a serial, creating it if need be; a label always creates a new lens."""
-    # `way` is how a new lens is learned
-    lens = _found(session, owner_id, name, way=way, creates=True)
+    lens = _found(session, owner_id, name, creates=True)
     assert lens is not None
     return lens
 
@@ -326,9 +323,7 @@ def _same(owner_id: int, key: str) -> tuple[Any, ...]:
     return LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
 
 
-def _found(
-    session: Session, owner_id: int, name: LensName, *, way: str | None, creates: bool
-) -> LensRow | None:
+def _found(session: Session, owner_id: int, name: LensName, *, creates: bool) -> LensRow | None:
     key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
     fresh = {
         "public_id": new_id(),
@@ -339,7 +334,6 @@ def _found(
         "serial": name.serial,
         "serial_source": "user" if name.label else name.serial_source if name.serial else "none",
         "label": name.label,
-        "way": way or "default",
         "created_at": now(),
         **dict.fromkeys(("version", "rebuild_epoch", "photo_count", "sample_count"), 0),
     }
@@ -381,13 +375,8 @@ def switch(session: Session, photo: PhotoRow, after: Literal["counted", "exclude
     return True
 
 
-def may_move(photo: PhotoRow, lens: LensRow) -> bool:
-    """Whether a photo can be given to a lens: its samples mean nothing to a lens of another model."""
-    return photo.state not in {"counted", "excluded"} or photo.way == lens.way
-
-
 def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
-    """Give a finished photo that `may_move` to another lens; both get a new version if it counts."""
+    """Give a finished photo to another lens; both get a new version if it counts."""
     if photo.lens_id == lens.id:
         return
     if photo.state == "counted":

@@ -13,10 +13,10 @@ from sqlalchemy import case, delete, select, update
 from sqlalchemy.orm import Session, joinedload
 
 from app import distances
-from app.errors import BusyError, ConflictError, UnknownError
+from app.errors import BusyError, UnknownError
 from app.store import lenses
 from app.store.database import changed, insert_new, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.lenses import LensName, forget_if_empty, forget_patches, give_back, join, may_move
+from app.store.lenses import LensName, forget_if_empty, forget_patches, give_back, join
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, owned
 from app.store.patches import Patches
 from app.store.samples import PROFILE, columns_of
@@ -335,10 +335,8 @@ class Photos(Patches):
             return None
         lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
         if lens is not None:
-            photo.lens_id, photo.way = lens.id, lens.way
+            photo.lens_id = lens.id
             lens.complete(photo.lens_maker, photo.lens_model)
-            if photo.calibrate and photo.given.get("model") == lens.way:  # the request is fulfilled
-                photo.given = {name: value for name, value in photo.given.items() if name != "model"}
         return lens
 
     @writes
@@ -392,7 +390,8 @@ class Photos(Patches):
         begins = calibrate and not photo.calibrate
         if begins and photo.file_gone_at is not None:
             return False
-        return _changed(session, photo, given, chosen, begins=begins)
+        _change(session, photo, given, chosen, begins=begins)
+        return True
 
     @writes
     def change_several(
@@ -403,7 +402,7 @@ class Photos(Patches):
         given: Mapping[str, Any],
         lens: str | NewCopy | None,
     ) -> None:
-        """Apply the same settings and lens to several photos: to all or, where one refuses, to none."""
+        """Apply the same settings and lens to several photos: to all or, where one is gone, to none."""
         # A new copy becomes the lens of them all
         # always locked in the same order: two such changes must not wait for each other
         rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
@@ -417,11 +416,7 @@ class Photos(Patches):
                 chosen = _chosen(session, photo, name, owner)
             elif chosen is None and isinstance(lens, str):
                 chosen = _chosen(session, photo, lens, owner)
-            if not _changed(session, photo, given, chosen):
-                raise ConflictError(
-                    f"photo {key} was learned from for another model than that of the lens: leave it "
-                    "out; nothing was changed"
-                )
+            _change(session, photo, given, chosen)
 
     @writes
     def retry(self, session: Session, photo_id: str, owner: Owner) -> bool:
@@ -508,17 +503,15 @@ def _keep_announced(session: Session, prefix: str) -> None:
         raise BusyError("the upload took too long, and what had come of it was deleted: send it again")
 
 
-def _changed(
+def _change(
     session: Session,
     photo: PhotoRow,
     given: Mapping[str, Any],
     chosen: LensRow | None,
     *,
     begins: bool = False,
-) -> bool:
-    """Change the settings and the lens of a photo; False where it cannot be given to that lens."""
-    if chosen is not None and not may_move(photo, chosen):
-        return False
+) -> None:
+    """Change the settings and the lens of a photo."""
     columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
     photo.calibrate |= begins
     if photo.state in {"counted", "stored", "excluded"} and not begins:
@@ -528,11 +521,9 @@ def _changed(
             lenses.move_photo(session, photo, chosen)
     elif begins or given or chosen is not None:
         photo.given = {**photo.given, **given}
-        if chosen is not None:  # the lens has its model: an earlier request for one no longer applies
-            kept = {name: value for name, value in photo.given.items() if name != "model"}
-            photo.given = {**kept, "lens_id": chosen.public_id}
+        if chosen is not None:
+            photo.given = {**photo.given, "lens_id": chosen.public_id}
         restart(session, photo)
-    return True
 
 
 def _correct_settings(
@@ -552,7 +543,7 @@ def _correct_settings(
 def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
     """Return the lens that an owner describes or whose id is given; None where neither is."""
     if isinstance(lens, LensName):
-        return lenses.named(session, photo.owner_id, lens, way=photo.given.get("model", photo.way))
+        return lenses.named(session, photo.owner_id, lens)
     return None if lens is None else find_owned(session, LensRow, lens, owner)
 
 
@@ -633,7 +624,6 @@ def _imported(
         "blob_key": f"photos/{public_id}/original",
         "calibrate": True,
         "given": {"lens_id": lens.public_id},
-        "way": lens.way,
         "aperture": settings.aperture,
         "focal_mm": settings.focal_mm,
         "focus_m": distances.written(settings.focus_m),

@@ -69,11 +69,10 @@ class CorruptSampleError(LensModelError):
 
 @dataclass(frozen=True, slots=True)
 class LensState:
-    """Version of a lens: shows whether a fitted model is up to date, and in which way it was learned."""
+    """Version of a lens: shows whether a fitted model is up to date."""
 
     version: int
     rebuild_epoch: int
-    way: str = "default"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -126,8 +126,6 @@ class LensRow(Base):
     serial_source: Mapped[str] = mapped_column(String(20))
     identity_key: Mapped[str]
     label: Mapped[str | None]
-    # How its photos are learned from, fixed when it is founded: a value of `PsfModel`
-    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
     version: Mapped[int] = mapped_column(default=0)
     rebuild_epoch: Mapped[int] = mapped_column(default=0)
     photo_count: Mapped[int] = mapped_column(default=0)
@@ -186,8 +184,6 @@ class PhotoRow(Base):
     # Lateral colour that this photo shows: radial polynomials of red and blue
     lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
     epoch: Mapped[int] = mapped_column(default=1)
-    # The way of its lens when this epoch began
-    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     error_code: Mapped[str | None] = mapped_column(String(40))

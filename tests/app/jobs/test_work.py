@@ -677,50 +677,6 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
     assert given[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
 
 
-def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
-) -> None:
-    used = []
-    for photo in (received(context, steps), received(context, steps, model="paper", lens_serial="other")):
-        work.photo(photo.public_id, 1)
-        assert steps.fresh(photo).state == "counted"
-        chosen, estimated = sandbox.seen["select"], sandbox.seen["estimate"]
-        used.append((chosen["estimator"], chosen["count"], estimated["estimator"], estimated["size"]))
-
-    assert [one[0] for one in used] == [one[2] for one in used] == ["default", "michaeli-irani"]
-    assert [one[3] for one in used] == [55, 55]
-
-
-def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
-) -> None:
-    work.photo(photo.public_id, 1)
-    asking = received(context, steps, model="paper")
-    work.photo(asking.public_id, 1)
-
-    refused = steps.fresh(asking)
-    assert (refused.state, refused.error_code) == ("failed", "conflict")
-    assert "its lens has the model default" in refused.error_detail
-
-
-def test_the_model_of_a_lens_decides_how_it_is_measured_and_its_photos_are_corrected(
-    context: JobContext, sandbox: Scripted, steps: Any
-) -> None:
-    photo = received(context, steps, model="paper")
-    steps.inspect(photo)
-    steps.plan(photo)
-    steps.estimate(photo)
-    assert context.store.photos.finish(photo.public_id, 1) == 1
-    sandbox.answers["measure"] = [ok({"error": {}, "coverage": {}})]
-    sandbox.answers["correct"] = [write_result]
-
-    CorrectionWork(context).measure(steps.lens_id(photo), 1)
-    CorrectionWork(context).correction(ask(context, photo, steps, method="paper"))
-
-    assert [sandbox.seen[task]["mode"] for task in ("measure", "correct")] == ["paper"] * 2
-    assert sandbox.seen["correct"]["photo"] == photo.public_id
-
-
 def test_a_correction_with_a_version_without_samples_fails(
     context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:

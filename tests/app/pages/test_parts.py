@@ -475,22 +475,6 @@ def test_a_photographer_reads_no_figures_in_a_verdict() -> None:
     )
 
 
-def test_the_page_of_a_lens_says_which_model_it_has(client: TestClient, steps: Steps) -> None:
-    photo = steps.receive(model="paper")
-    steps.inspect(photo, serial="2")
-    steps.plan(photo)
-    steps.estimate(photo)
-    steps.store.photos.finish(photo.public_id, 1)
-    plain, paper = (
-        client.get(f"/lenses/{steps.lens_id(one)}/tests").text for one in (steps.counted(), photo)
-    )
-
-    assert ("Model: default" in plain, "without the safeguards" in plain) == (True, False)
-    assert ("Model: paper" in paper, "without the safeguards" in paper) == (True, True)
-    photo_page = client.get(f"/photos/{photo.public_id}").text
-    assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
-
-
 def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_sections(
     client: TestClient, steps: Steps
 ) -> None:

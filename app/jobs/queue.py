@@ -44,7 +44,7 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
 MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
 _DEATHS: Final = "deaths"  # attribute of a job: how many workers have died of it, or while it ran
 # Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core
-POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
+POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.1}
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
 
 

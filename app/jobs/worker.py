@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 # Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)
 EXIT_FENCED: Final = 70
 # seconds between two rounds of a duty, all chosen
-SWEEP_S: Final = 0.5  # of the tables for new work: a read of two indexes
+SWEEP_S: Final = 0.1  # of the tables for new work, which people wait for: a read of two indexes
 RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
 # How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into

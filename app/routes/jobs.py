@@ -24,7 +24,7 @@ router = APIRouter(tags=["jobs"], route_class=OneSession)
 # Longest that a question for a job waits for a change of it (chosen): proxies end requests after 30 s
 LONG_POLL_S: Final = 20.0
 # Seconds between two looks at a job that somebody waits for (chosen): each is one or two reads
-LOOK_S: Final = 0.2
+LOOK_S: Final = 0.1
 FINAL = {"succeeded", "failed", "cancelled"}
 
 

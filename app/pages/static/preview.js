@@ -116,11 +116,11 @@ export function setUpPreview(viewer) {
   };
   const look = () => {
     clearTimeout(timer);
-    if (!wanted || fields.lens_id?.value === "") return;
+    if (!wanted || !viewer.viewport || fields.lens_id?.value === "") return;
     timer = setTimeout(() => {
       const region = seenWhole() ? viewer.region : lowerRight();
       if (!aim || aim.method !== fields.method.value || !covers(aim, region) || (layered() && !aim.layered)) compute(region);
-    }, PAUSE_MS);
+    }, aim ? PAUSE_MS : 0); // the first look waits for nothing
   };
   viewer.onChange(look);
   form.addEventListener("input", () => {

@@ -444,8 +444,9 @@ def shown(page: Page) -> bytes:
 
 
 def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effect_on_the_part_that_is_seen(
-    page: Page, learned: dict[str, Any]
+    page: Page, service: Service, learned: dict[str, Any]
 ) -> None:
+    logged = len(service.log.read_text())
     page.goto(f"/photos/{learned['id']}")
     with page.expect_response(lambda answer: answer.url.endswith("/preview")) as begun:
         page.get_by_role("button", name="upper left").click()
@@ -459,6 +460,7 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
     expect(page.locator("#viewer")).to_have_attribute("data-previewed", "fast")  # the quick one first
     expect(page.locator("#viewer")).to_have_attribute("data-shown", "split")
     expect(page.locator("#viewer")).to_have_attribute("data-previewed", "standard")
+    assert "compiling" not in service.log.read_text()[logged:]  # the worker has done that at its start
     expect(page.locator("#preview-words")).to_contain_text("This is what you get")
     page.get_by_role("button", name="After", exact=True).click()
     page.get_by_text("More", exact=True).click()

@@ -39,8 +39,10 @@ from lensmodel.core.types import Kernel, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 
-PROTOCOL = 2
-"""Part of every cache key; raised when cases or metrics change."""
+PROTOCOL = 3
+"""Part of every cache key; raised when cases, their windows or metrics change."""
+
+KERNEL_SIZE: Final = 31  # pixels of an estimate: odd
 
 UNTOUCHED = "none"
 """The method that does nothing: the baseline of every table."""
@@ -56,10 +58,8 @@ class BlindBenchmark:
     methods: tuple[str, ...] = ("default",)  # names of blind estimators; "none" is always added
     half: Half = "test"  # which half of photos and PSFs
     cases: int | None = None  # at most so many, spread over photos and PSFs
-    patch: int = 256  # sides in pixels; the kernel's is odd
-    kernel_size: int = 31
+    patch: int = 256  # sides in pixels
     judge: str = "hyper-laplacian"  # non-blind deconvolution: "hyper-laplacian" or "epll"
-    seed: int = 0  # for noise and the choice of cases
     scenes: int | None = None  # so many windows of the photographs in turn; None means one of each
 
     def __post_init__(self) -> None:
@@ -67,8 +67,6 @@ class BlindBenchmark:
             f"half must be one of {', '.join(HALVES)}, got {self.half!r}": self.half in HALVES,
             f"patch must be a multiple of 4 of at least 128, got {self.patch}": self.patch >= 128
             and self.patch % 4 == 0,
-            f"kernel size must be odd and at least 5, got {self.kernel_size}": self.kernel_size >= 5
-            and self.kernel_size % 2 == 1,
             f"noise must lie in 0.0001..0.2, got {self.noise}": all(1e-4 <= s <= 0.2 for s in self.noise),
         }
         for text, holds in checks.items():
@@ -186,11 +184,9 @@ def plain(row: Mapping[str, object]) -> dict[str, object]:
 class ResultStore:
     """Finished results by the content they came from; one file of JSON lines, only ever appended."""
 
-    def __init__(
-        self, folder: Path | None, photos: Sequence[Path], settings: BlindBenchmark, judge: Judge
-    ) -> None:
+    def __init__(self, folder: Path | None, photos: Sequence[Path], judge: Judge) -> None:
         self._content = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
-        self._settings, self._judge = settings, judge
+        self._judge = judge
         self._known: dict[str, CaseResult] = {}
         self._file: Path | None = None
         if folder is not None:
@@ -213,19 +209,22 @@ class ResultStore:
                 out.write(json.dumps({"key": key, **plain(asdict(result))}) + "\n")
 
     def _key(self, case: BlindCase, kernel: Kernel, name: str, method: BlindMethod | None) -> str:
-        described = repr(method) if is_dataclass(method) else type(method).__qualname__
         parts = (
             PROTOCOL,
-            [self._content[case.photo]],
-            [case.photo.stem],  # of which the noise is drawn
+            self._content[case.photo],
+            case.photo.stem,  # of which the noise is drawn
             hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
-            (case.psf_number, case.noise, case.patch, "gaussian", case.seed),
-            (name, getattr(method, "version", 0), described, self._settings.kernel_size),
-            repr(self._judge),
-            "r-map",  # of the windows: part of the keys of stored cases
-            *((case.window,) if case.window else ()),
+            (case.psf_number, case.noise, case.patch, case.seed, case.window),
+            (name, getattr(method, "version", 0), changed(method), KERNEL_SIZE),
+            (type(self._judge).__name__, self._judge.version, changed(self._judge)),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+
+
+def changed(method: object) -> dict[str, object]:
+    """Settings of a method that are not its defaults; so results outlive a setting that is taken away."""
+    own = fields(method) if is_dataclass(method) else ()
+    return {f.name: value for f in own if f.repr and (value := getattr(method, f.name)) != f.default}
 
 
 def _stored(file: Path) -> Iterator[tuple[str, CaseResult]]:
@@ -262,12 +261,12 @@ def run_blind_benchmark(
             half=settings.half,
             noise=noise,
             patch=settings.patch,
-            seed=settings.seed,
+            seed=0,
             limit=settings.cases,
             scenes=settings.scenes,
         )
     ]
-    store = ResultStore(cache, photos, settings, judge)
+    store = ResultStore(cache, photos, judge)
     jobs = []
     for case in cases:
         kernel = kernels[case.psf_number]
@@ -277,7 +276,7 @@ def run_blind_benchmark(
             if store.find(case, kernel, name, method) is None
         }
         if missing:
-            jobs.append(_Job(case, kernel, missing, judge, settings.kernel_size))
+            jobs.append(_Job(case, kernel, missing, judge))
     done = len(cases) - len(jobs)
     for job, fresh in _run(jobs, workers):
         for result in fresh:
@@ -301,7 +300,6 @@ class _Job:
     kernel: Kernel
     methods: Mapping[str, BlindMethod | None]
     judge: Judge
-    kernel_size: int
 
 
 def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, list[CaseResult]]]:
@@ -331,7 +329,7 @@ def _run_job(job: _Job) -> list[CaseResult]:
                 estimate = method.estimate(
                     [seen.patch],
                     [seen.noise],
-                    size=job.kernel_size,
+                    size=KERNEL_SIZE,
                 )
             except NotEnoughEvidenceError as error:
                 logger.info("%s declined %s: %s", name, job.case.name, error)

@@ -9,7 +9,6 @@ does. So there is a second shrinkage here, a table in float64 beside the polynom
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Protocol
 
@@ -31,6 +30,10 @@ Spectrum = NDArray[np.complex128]
 
 class Judge(Protocol):
     """Non-blind deconvolution of one patch by one kernel."""
+
+    @property
+    def version(self) -> int:
+        """Grows when results change."""
 
     def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
         """Return the sharp patch, same shape; `shift` (row, col) moves the kernel first, sub-pixel."""
@@ -71,7 +74,15 @@ def tapered(patch: Plane, margin: int) -> NDArray[np.float64]:
     return padded
 
 
-@dataclass(frozen=True, slots=True)
+_WEIGHT: Final = 0.06  # over the variance of the noise: lambda (chosen)
+_BETAS: Final = (
+    1.0,
+    256.0,
+    2.0 * math.sqrt(2.0),
+)  # from, to, and by which factor: as in the paper of the prior
+_EXPONENT: Final = 2.0 / 3.0
+
+
 class HyperLaplacian:
     """Deconvolution under a hyper-Laplacian prior on gradients, by half-quadratic splitting.
 
@@ -79,7 +90,7 @@ class HyperLaplacian:
 
         lambda/2 |k * x - y|² + sum |w|^(2/3) + beta/2 |grad x - w|²,   lambda = weight / sigma²
 
-    with beta growing from `first` to `last`.
+    with beta growing from 1 to 256.
 
     References
     ----------
@@ -87,12 +98,7 @@ class HyperLaplacian:
        NIPS 2009, eq. (3) to (5).
     """
 
-    weight: float = 0.06
-    first: float = 1.0
-    last: float = 256.0
-    factor: float = 2.0 * math.sqrt(2.0)
-    exponent: float = 2.0 / 3.0
-    version: int = 1
+    version = 1
 
     def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
         """Return the sharp patch; see `Judge`."""
@@ -101,17 +107,17 @@ class HyperLaplacian:
         fr, fc = fft.fftfreq(y.shape[0])[:, None], fft.rfftfreq(y.shape[1])[None, :]
         # Forward differences on the torus.
         dr, dc = np.exp(2j * np.pi * fr) - 1.0, np.exp(2j * np.pi * fc) - 1.0
-        lam = self.weight / (sigma * sigma)
+        lam = _WEIGHT / (sigma * sigma)
         data, power = lam * np.conj(otf) * fft.rfft2(y), lam * np.square(np.abs(otf))
         laplacian = np.square(np.abs(dr)) + np.square(np.abs(dc))
-        betas = growing(self.first, self.last, self.factor)
+        betas = growing(*_BETAS)
 
         def led_back(x: NDArray[np.float64], turn: int) -> Spectrum:
             spectrum = fft.rfft2(x)
             total = np.zeros_like(spectrum)
             for d in (dr, dc):
                 gradient = fft.irfft2(d * spectrum, s=x.shape)
-                total += np.conj(d) * fft.rfft2(_tabled_shrinkage(gradient, betas[turn], self.exponent))
+                total += np.conj(d) * fft.rfft2(_tabled_shrinkage(gradient, betas[turn]))
             return total
 
         return _inner(half_quadratic(y, data, power, betas, led_back, curvature=laplacian, floor=1e-12))
@@ -121,29 +127,29 @@ _TABLE_REACH: Final = 1.5  # where tables end at least: gradients of scenes in 0
 
 
 @lru_cache(maxsize=32)
-def _shrinkage_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _shrinkage_table(beta: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Minimiser of |w|^a + beta/2 (w - v)² where it is not 0: from the jump upwards.
 
     With s = beta^(-1 / (2 - a)), both minima cost the same at w = s (2 - 2a)^(1 / (2 - a)). Nothing may be
     interpolated across the jump: between 0 and that w lies no minimum.
     """
-    scale = beta ** (-1.0 / (2.0 - exponent))
-    least = scale * (2.0 - 2.0 * exponent) ** (1.0 / (2.0 - exponent))
-    jump = least + exponent / beta * least ** (exponent - 1.0)
+    scale = beta ** (-1.0 / (2.0 - _EXPONENT))
+    least = scale * (2.0 - 2.0 * _EXPONENT) ** (1.0 / (2.0 - _EXPONENT))
+    jump = least + _EXPONENT / beta * least ** (_EXPONENT - 1.0)
     v = np.linspace(jump, max(_TABLE_REACH, 2.0 * jump), 3001)
     w = v.copy()
     for _ in range(30):
-        slope = exponent * w ** (exponent - 1.0) + beta * (w - v)
-        curvature = exponent * (exponent - 1.0) * w ** (exponent - 2.0) + beta
+        slope = _EXPONENT * w ** (_EXPONENT - 1.0) + beta * (w - v)
+        curvature = _EXPONENT * (_EXPONENT - 1.0) * w ** (_EXPONENT - 2.0) + beta
         w = np.clip(w - slope / curvature, least, v)
     return v, w
 
 
-def _tabled_shrinkage(v: NDArray[np.float64], beta: float, exponent: float) -> NDArray[np.float64]:
-    grid, value = _shrinkage_table(beta, exponent)
+def _tabled_shrinkage(v: NDArray[np.float64], beta: float) -> NDArray[np.float64]:
+    grid, value = _shrinkage_table(beta)
     size = np.abs(v)
     # Beyond the table the power hardly moves the minimum.
-    beyond = size - exponent / beta * np.maximum(size, grid[-1]) ** (exponent - 1.0)
+    beyond = size - _EXPONENT / beta * np.maximum(size, grid[-1]) ** (_EXPONENT - 1.0)
     inside = np.where(size < grid[0], 0.0, np.interp(size, grid, value))
     return np.copysign(np.where(size > grid[-1], beyond, inside), v)
 
@@ -152,7 +158,10 @@ def _inner(x: NDArray[np.float64]) -> Plane:
     return x[BORDER:-BORDER, BORDER:-BORDER].astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+_EPLL_BETAS: Final = (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0)
+_EPLL_STEP: Final = 3  # pixels between windows (chosen): all of them take nine times as long
+
+
 class Epll:
     """Expected patch log likelihood [1]_ of one patch, see `PatchMixture.restored`.
 
@@ -164,15 +173,13 @@ class Epll:
        restoration", ICCV 2011, eq. (4) to (6).
     """
 
-    betas: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0)
-    step: int = 3
-    version: int = 1
+    version = 1
 
     def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
         """Return the sharp patch; see `Judge`."""
         y = tapered(patch, BORDER)
         otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
-        return _inner(shipped_mixture().restored(y, otf, 1.0 / (sigma * sigma), self.betas, self.step))
+        return _inner(shipped_mixture().restored(y, otf, 1.0 / (sigma * sigma), _EPLL_BETAS, _EPLL_STEP))
 
 
 judges: Registry[Judge] = Registry("non-blind judge", {"hyper-laplacian": HyperLaplacian, "epll": Epll})

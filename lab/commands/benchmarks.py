@@ -60,7 +60,6 @@ def blind(
     methods: Annotated[
         str, typer.Option(help="Estimators, comma separated; also cho-lee, sun, xu-jia and zhang.")
     ] = ESTIMATORS,
-    patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
     scenes: Annotated[
         int | None,
@@ -68,7 +67,6 @@ def blind(
     ] = None,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
-    seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
         Path,
@@ -111,9 +109,7 @@ def blind(
             methods=_names(methods),
             half=half,  # type: ignore[arg-type]  # checked by the benchmark
             cases=cases,
-            patch=patch,
             judge=judge,
-            seed=seed,
             scenes=scenes,
         )
     with as_usage(), shown.progress() as bars:

@@ -92,7 +92,7 @@ def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
         settings, rows = stored["settings"], stored["summary"]
-        kept = {name: settings[name] for name in ("noise", "half", "patch", "judge", "seed")}
+        kept = {name: settings[name] for name in ("half", "patch", "judge")}
     except (OSError, ValueError, KeyError) as error:
         raise InvalidInputError(f"{path} is no benchmark; run `lensmodel bench blind` again") from error
     pictures.mkdir(parents=True, exist_ok=True)

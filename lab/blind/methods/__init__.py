@@ -12,19 +12,14 @@ from lab.blind.methods.xu_jia import XuJia
 from lab.blind.methods.zhang import Zhang
 from lensmodel.blind import PsfEstimate, estimators
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import NoiseModel, Plane
 
 
 class BlindMethod(Protocol):
     """What the benchmark asks of an estimator."""
 
     def estimate(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
+        self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         """Estimate the kernel of odd side `size` that all patches share."""
 

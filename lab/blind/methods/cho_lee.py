@@ -33,9 +33,9 @@ from lab.blind.steps.gradients import (
     pruned,
     shock_filtered,
 )
-from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick
+from lab.blind.steps.pyramid import Image, Latents, Level
 from lensmodel.blind import PsfEstimate
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _ORDER_WEIGHTS = (50.0, 25.0, 12.5)  # of values, first and second derivatives: as in the paper
 _ALPHA = 0.1  # as in the paper
@@ -55,22 +55,10 @@ class ChoLee:
     version = 1
 
     def estimate(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
+        self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
-        return estimate_by_edges(
-            _Rounds(self),
-            patches,
-            noise,
-            size=size,
-            iterations=self.iterations,
-            on_step=on_step,
-        )
+        return estimate_by_edges(_Rounds(self), patches, noise, size)
 
 
 @dataclass(slots=True)
@@ -79,12 +67,12 @@ class _Rounds:
 
     settings: ChoLee
 
-    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
         images = [_Quick.of(view.y, level.side) for view in level.views]
         if level.number == level.count - 1:
             latents = tuple(image.deconvolved(kernel) for image in images)
         thresholds: list[float] = []
-        for i in range(level.iterations):
+        for i in range(self.settings.iterations):
             fade = 0.9**i
             edges = [_predicted(x, fade) for x in latents]
             if i == 0:
@@ -97,8 +85,7 @@ class _Rounds:
                 pairs += _pairs(edge, view.y, fade * least_slope)
             kernel = pruned(self._solved(KernelEquations.of(pairs, level.side)), self.settings.threshold)
             latents = tuple(image.deconvolved(kernel) for image in images)
-            tick()
-        return LevelResult(kernel, latents)
+        return kernel, latents
 
     def _solved(self, equations: KernelEquations) -> NDArray[np.float64]:
         side = equations.side

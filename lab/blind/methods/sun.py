@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.cleaning import cleaned, unsure
 from lab.blind.steps.edge_patches import SIDE, EdgePatchPrior, default_prior, edge_mask, target
-from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
-from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lab.blind.steps.kernel_step import Grid, Term, cleaned, least_squares_kernel, unsure
+from lab.blind.steps.pyramid import Image, Latents, Level, View, coarse_to_fine
 from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, otf
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _INTENSITY_WEIGHT = 0.1  # w of values, of differences it is 1 (chosen): noise in values reaches far
 _LEAST_EDGE_PX = 30  # gradients on edges: of fewer a kernel is chance (chosen)
@@ -57,18 +56,12 @@ class Sun:
     version = 1
 
     def estimate(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
+        self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
         views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-        schedule = Schedule(size, self.iterations)
-        found = coarse_to_fine(views, _Alternation(self, default_prior()), schedule, on_step=on_step)
-        return unsure(cleaned(found.kernel, self.threshold, self.least_mass), size)
+        found = coarse_to_fine(views, _Alternation(self, default_prior()), size)
+        return unsure(cleaned(found, self.threshold, self.least_mass), size)
 
 
 @dataclass(slots=True)
@@ -78,9 +71,9 @@ class _Alternation:
     method: Sun
     prior: EdgePatchPrior
 
-    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
         kernel, now = centred(kernel), list(latents)
-        for _ in range(level.iterations):
+        for _ in range(self.method.iterations):
             terms: list[Term] = []
             for i, view in enumerate(level.views):
                 for beta in self.method.betas:
@@ -91,8 +84,7 @@ class _Alternation:
             if sum(np.count_nonzero(term.x) for term in terms) < _LEAST_EDGE_PX:
                 raise NotEnoughEvidenceError("the patches hold no edge; choose parts with edges")
             kernel = centred(cleaned(least_squares_kernel(terms, kernel), 0.0))
-            tick()
-        return LevelResult(kernel, tuple(now))
+        return kernel, tuple(now)
 
 
 def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Term]:

@@ -35,9 +35,9 @@ from lab.blind.steps.gradients import (
     pruned,
     shock_filtered,
 )
-from lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
+from lab.blind.steps.pyramid import Image, Latents, Level, View
 from lensmodel.blind import PsfEstimate
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _WINDOW = 5  # pixels: h of the paper
 _OFFSET = 0.5  # as in the paper: keeps flat regions from standing out
@@ -63,22 +63,10 @@ class XuJia:
     version = 1
 
     def estimate(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
+        self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
-        return estimate_by_edges(
-            _Phases(self),
-            patches,
-            noise,
-            size=size,
-            iterations=self.iterations,
-            on_step=on_step,
-        )
+        return estimate_by_edges(_Phases(self), patches, noise, size)
 
 
 @dataclass(slots=True)
@@ -87,21 +75,20 @@ class _Phases:
 
     settings: XuJia
 
-    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
         patches = [_PatchLevel.of(view, level.side) for view in level.views]
         if level.number == level.count - 1:
             edges = [(down(x), across(x)) for x in latents]
             latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
-        for i in range(level.iterations):
+        for i in range(self.settings.iterations):
             edges = [s.selected(x, _FADE**-i) for s, x in zip(patches, latents, strict=True)]
             pairs = [p for s, e in zip(patches, edges, strict=True) for p in s.pairs(e)]
             equations = KernelEquations.of(pairs, level.side)
             kernel = pruned(equations.divided(_GAMMA), self.settings.threshold)
-            if level.number == 0 and i == level.iterations - 1:
+            if level.number == 0 and i == self.settings.iterations - 1:
                 kernel = self._refined(equations, kernel)
             latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
-            tick()
-        return LevelResult(kernel, latents)
+        return kernel, latents
 
     def _refined(self, equations: KernelEquations, coarse: Kernel) -> Kernel:
         """Phase two: detect the support, solve with |k| outside it penalised, repeat until it rests."""

@@ -3,7 +3,23 @@
 Variational Bayes on image gradients: instead of picking edges by hand, the prior variance of every
 gradient is learned, and so is the noise. What keeps the kernel from collapsing to a delta is the
 posterior variance of the gradients, which enters the kernel step as a penalty on k². Source: H. Zhang,
-D. Wipf and Y. Zhang, "Multi-image blind deblurring using a coupled adaptive sparse prior", CVPR 2013.
+D. Wipf and Y. Zhang, "Multi-image blind deblurring using a coupled adaptive sparse prior", CVPR 2013,
+eq. (8) and algorithm 1.
+
+Latent gradients x (m pixels, wider than the frame by a kernel), observed gradients y (n pixels), noise
+variance λ, a prior variance γ_i for every latent pixel, and a Gaussian posterior with means x and
+variances c. With w_i = sum_j k_j², over the kernel pixels by which i reaches the frame::
+
+    F = (|y - k * x|² + sum_i c_i w_i + d) / λ + n log λ
+        + sum_i [ (x_i² + c_i) / γ_i + log γ_i - log c_i ]
+
+Minimised over c it is the cost of the paper, whose penalty couples x, k and λ: concave in |x_i| with a
+curvature set by λ / |k|², nearly convex while the noise is thought large, like l0 once it is small::
+
+    (|y - k * x|² + d) / λ + sum_i [ x_i² / γ_i + log(λ + γ_i w_i) ] + (n - m) log λ + m
+
+Each update below minimises F over its own variable, so that F never rises. F does not change when
+k is divided and x multiplied by the same number.
 
 Departures from the paper:
 
@@ -17,18 +33,28 @@ Departures from the paper:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lab.blind.methods.zhang_model import PatchPosterior, pooled_kernel
-from lab.blind.steps.cleaning import cleaned, unsure
-from lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lab.blind.steps.kernel_step import (
+    Floats,
+    Grid,
+    Kernelish,
+    Term,
+    cleaned,
+    least_squares_kernel,
+    unsure,
+)
+from lab.blind.steps.pyramid import RATIO, Latents, Level, View, coarse_to_fine, kernel_sides
 from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.psf import centred, gaussian
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _FIRST_SIGMA_PX = 0.7  # of the first kernel, in pixels of the coarsest level (chosen)
+_TINY = 1e-12  # keeps divisions finite: far below any power of gradients
+_FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at first (chosen): nearly convex
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,42 +75,165 @@ class Zhang:
     version = 1
 
     def estimate(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
+        self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `BlindMethod`."""
         views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-        schedule = Schedule(size, self.iterations)
-        levels = len(schedule.sides(min(min(view.y.shape) for view in views)))
-        coarse = _FIRST_SIGMA_PX / schedule.ratio ** (levels - 1)
+        levels = len(kernel_sides(size, min(min(view.y.shape) for view in views)))
+        coarse = _FIRST_SIGMA_PX / RATIO ** (levels - 1)
         start = gaussian(size, coarse**2 * np.eye(2))
-        sweeps = _Sweeps(self.steps, self.floor)
-        found = coarse_to_fine(views, sweeps, schedule, start=start, on_step=on_step)
-        return unsure(cleaned(found.kernel, self.threshold), size)
+        return unsure(cleaned(coarse_to_fine(views, _Sweeps(self), size, start=start), self.threshold), size)
 
 
 @dataclass(slots=True)
 class _Sweeps:
     """The alternation on one level."""
 
-    steps: int
-    floor: float
+    method: Zhang
 
-    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
         kernel = centred(kernel)  # or it drifts, level by level, until the support cuts it
         # λ and γ start anew on each level: what was learned on the coarser one is too sure of itself.
         scenes = [
-            PatchPosterior.of(view.y, level.side, kernel, self.floor + 2.0 * view.noise**2)
+            PatchPosterior.of(view.y, level.side, kernel, self.method.floor + 2.0 * view.noise**2)
             for view in level.views
         ]
-        for _ in range(level.iterations):
-            scenes = [scene.improved(kernel, self.steps) for scene in scenes]
+        for _ in range(self.method.iterations):
+            scenes = [scene.improved(kernel, self.method.steps) for scene in scenes]
             raw = pooled_kernel([part for scene in scenes for part in scene.weighted()], kernel)
             kernel, total = cleaned(raw, 0.0), float(raw.sum())
             scenes = [scene.scaled(total).with_noise(kernel) for scene in scenes]
-            tick()
-        return LevelResult(kernel, latents)
+        return kernel, latents
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GradientPosterior:
+    """Posterior of one gradient image: x, γ, c."""
+
+    grid: Grid
+    y: Floats
+    x: Floats  # posterior means, prior variances γ, posterior variances c
+    gamma: Floats
+    variance: Floats
+
+    @classmethod
+    def first(cls, y: NDArray[np.floating], side: int, kernel: Kernelish, noise: float) -> GradientPosterior:
+        """Start with one γ for all, the mean square of y."""
+        grid = Grid((y.shape[0], y.shape[1]), side)
+        power = np.float32(max(float(np.mean(np.square(y))), _TINY))
+        gamma = np.full(grid.latent, power, dtype=np.float32)
+        half = side // 2
+        x = np.pad(y.astype(np.float32), half)
+        return cls(grid, y.astype(np.float32), x, gamma, gamma).spread(kernel, noise)
+
+    def spread(self, kernel: Kernelish, noise: float) -> GradientPosterior:
+        """Update c = 1 / (w / λ + 1 / γ)."""
+        precision = self.grid.reach_of(kernel) / np.float32(noise) + 1.0 / self.gamma
+        return replace(self, variance=(1.0 / precision).astype(np.float32))
+
+    def sharpened(self, kernel: Kernelish, noise: float, steps: int) -> GradientPosterior:
+        """Update x = argmin |y - k * x|² / λ + sum_i x_i² / γ_i by preconditioned conjugate gradients.
+
+        The preconditioner is c, the inverse of the diagonal.
+        """
+        grid, lam = self.grid, np.float32(noise)
+        spectrum = grid.spectrum(kernel)
+        precision = 1.0 / self.gamma
+        x = self.x
+        misfit = self.y - grid.valid(spectrum * grid.spectrum(x))
+        residual = grid.back(spectrum, misfit) / lam - precision * x
+        ready = self.variance * residual
+        direction = ready
+        power = float(np.vdot(residual, ready))
+        for _ in range(steps):
+            if power <= _TINY:
+                break
+            applied = grid.back(spectrum, grid.valid(spectrum * grid.spectrum(direction))) / lam
+            applied += precision * direction
+            length = np.float32(power / max(float(np.vdot(direction, applied)), _TINY))
+            x = x + length * direction
+            residual = residual - length * applied
+            ready = self.variance * residual
+            after = float(np.vdot(residual, ready))
+            direction = ready + np.float32(after / power) * direction
+            power = after
+        return replace(self, x=x)
+
+    def sparser(self) -> GradientPosterior:
+        """Update γ_i = x_i² + c_i."""
+        return replace(self, gamma=np.maximum(np.square(self.x) + self.variance, _TINY))
+
+    def scaled(self, factor: float) -> GradientPosterior:
+        """Multiply x by a factor, as k is divided by it; F stays."""
+        s, s2 = np.float32(factor), np.float32(factor * factor)
+        return replace(self, x=self.x * s, gamma=self.gamma * s2, variance=self.variance * s2)
+
+    def misfit(self, kernel: Kernelish) -> float:
+        """|y - k * x|² + sum_i c_i w_i."""
+        residual = self.y - self.grid.blurred(kernel, self.x)
+        spread = float(np.vdot(self.variance, self.grid.reach_of(kernel)))
+        return float(np.vdot(residual, residual)) + spread
+
+    def free_energy(self, kernel: Kernelish, noise: float, floor: float) -> float:
+        """F, with d = `floor` times n."""
+        inner = (np.square(self.x) + self.variance) / self.gamma + np.log(self.gamma / self.variance)
+        n = self.y.size
+        data = (self.misfit(kernel) + floor * n) / noise + n * float(np.log(noise))
+        return data + float(inner.sum(dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchPosterior:
+    """Posteriors of the two gradient images of one patch, with the noise variance λ of both."""
+
+    down: GradientPosterior  # differences between neighbouring rows and columns
+    across: GradientPosterior
+    noise: float  # λ; differences of white noise of variance σ² have 2 σ²
+    floor: float  # d over the number of pixels
+
+    @classmethod
+    def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> PatchPosterior:
+        """Start with half of the gradients' power as noise: nearly everything is still open."""
+        down, across = np.diff(y, axis=0), np.diff(y, axis=1)
+        noise = _FIRST_NOISE * 0.5 * float(np.mean(down**2) + np.mean(across**2)) + floor
+        return cls(
+            GradientPosterior.first(down, side, kernel, noise),
+            GradientPosterior.first(across, side, kernel, noise),
+            noise,
+            floor,
+        )
+
+    def improved(self, kernel: Kernelish, steps: int) -> PatchPosterior:
+        """Update x, c and γ of both gradients."""
+        down, across = (
+            each.sharpened(kernel, self.noise, steps).spread(kernel, self.noise).sparser()
+            for each in (self.down, self.across)
+        )
+        return replace(self, down=down, across=across)
+
+    def scaled(self, factor: float) -> PatchPosterior:
+        """Multiply both x by a factor, as k is divided by it."""
+        return replace(self, down=self.down.scaled(factor), across=self.across.scaled(factor))
+
+    def with_noise(self, kernel: Kernelish) -> PatchPosterior:
+        """Update λ = (|y - k * x|² + sum_i c_i w_i + d) / n."""
+        n = self.down.y.size + self.across.y.size
+        misfit = self.down.misfit(kernel) + self.across.misfit(kernel)
+        return replace(self, noise=misfit / n + self.floor)
+
+    def free_energy(self, kernel: Kernelish) -> float:
+        """F of both gradients."""
+        return sum(b.free_energy(kernel, self.noise, self.floor) for b in (self.down, self.across))
+
+    def weighted(self) -> tuple[tuple[GradientPosterior, float], tuple[GradientPosterior, float]]:
+        """Both posteriors with their weight 1 / λ in the kernel step."""
+        return (self.down, 1.0 / self.noise), (self.across, 1.0 / self.noise)
+
+
+def pooled_kernel(posteriors: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:
+    """Update k >= 0 to the minimum of the summed free energies of posteriors with their weights 1 / λ.
+
+    min over k >= 0 of  sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ_l
+    """
+    terms = [Term(b.grid, b.y, b.x, weight, b.grid.sums_of(b.variance)) for b, weight in posteriors]
+    return least_squares_kernel(terms, kernel)

@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.cleaning import cleaned, unsure
-from lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
+from lab.blind.steps.kernel_step import cleaned, unsure
+from lab.blind.steps.pyramid import Image, LevelSolver, View, coarse_to_fine
 from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centroid, otf
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _ORIENTATIONS = 4  # as in Cho and Lee
 _TINY = 1e-12  # keeps divisions finite: far below any gradient
+_TOLERANCE = 1e-5  # of the residual over the right side, where conjugate gradients end
 
 Mask = NDArray[np.bool_]
 
@@ -243,7 +244,6 @@ class KernelEquations:
         start: NDArray[np.float64],
         *,
         steps: int,
-        tolerance: float = 1e-5,
     ) -> NDArray[np.float64]:
         """Minimise sum w |s * k - b|² + gamma |k|² over kernels of this side, without constraints.
 
@@ -265,7 +265,7 @@ class KernelEquations:
         k = np.array(start)
         residual = target - applied(k)
         direction, energy = residual, float(np.vdot(residual, residual))
-        enough = tolerance**2 * float(np.vdot(target, target))
+        enough = _TOLERANCE**2 * float(np.vdot(target, target))
         for _ in range(steps):
             if energy <= enough:
                 break
@@ -292,15 +292,8 @@ def pruned(kernel: NDArray[np.float64], threshold: float) -> Kernel:
 
 
 def estimate_by_edges(
-    solver: LevelSolver,
-    patches: Sequence[Plane],
-    noise: Sequence[NoiseModel],
-    *,
-    size: int,
-    iterations: int,
-    on_step: StepHook,
+    solver: LevelSolver, patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
 ) -> PsfEstimate:
     """Run a method coarse to fine."""
     views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-    found = coarse_to_fine(views, solver, Schedule(size, iterations, coarsest=min(size, 5)), on_step=on_step)
-    return unsure(found.kernel, size)
+    return unsure(coarse_to_fine(views, solver, size), size)

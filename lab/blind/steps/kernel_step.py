@@ -1,22 +1,30 @@
 """The kernel step: least squares over valid convolutions, k >= 0, pooled over any number of images.
 
-Valid means that only pixels count where every pixel of the kernel meets data; nothing wraps.
+Valid means that only pixels count where every pixel of the kernel meets data; nothing wraps. And a solved
+kernel without its specks, and the estimate that it is.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
+
+from lensmodel.blind.estimator import PsfEstimate, finished
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import Kernel
 
 Floats = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
 Kernelish = NDArray[np.float64]
 
 _TINY = 1e-12  # keeps divisions finite: far below any power
+_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)  # pixels that touch at a corner belong together
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,3 +154,27 @@ def _mean_correlation(term: Term, n: int) -> Kernelish:
     wrapped = np.zeros((n, n))
     wrapped[np.ix_(lags % n, lags % n)] = full[np.ix_(lags % high, lags % wide)]
     return wrapped
+
+
+def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
+    """Drop values below `threshold` times the peak and islands below `least_mass` of the sum.
+
+    Not centred. The largest island always stays.
+    """
+    kept = np.maximum(kernel, 0.0)
+    if not kept.max() > 0:
+        raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
+    kept = np.where(kept >= threshold * kept.max(), kept, 0.0)
+    if least_mass > 0.0:
+        label, count = ndimage.label(kept > 0, _EIGHT_NEIGHBOURS)
+        mass = np.bincount(label.ravel(), weights=kept.ravel(), minlength=count + 1)
+        mass[0] = 0.0
+        heavy = mass >= min(least_mass * float(mass.sum()), float(mass.max()))
+        heavy[0] = False
+        kept = np.where(heavy[label], kept, 0.0)
+    return as_kernel(kept)
+
+
+def unsure(kernel: Kernel, size: int) -> PsfEstimate:
+    """An estimate of odd side `size` whose method does not say how far it is off."""
+    return finished(kernel, size=size, error=math.nan, diagnostics={})

@@ -1,18 +1,9 @@
 """Coarse to fine: the driver that the classic blind methods share.
 
 A wide kernel is a small one on a small copy of the patch. The methods start there, where few pixels
-decide, and hand kernel and latent image up to the next finer level. A method brings one function,
-its alternation on one level; the driver makes the levels, resamples and reports progress::
-
-    def solve(level: Level, kernel: Kernel, latents: Sequence[Image], tick: Tick) -> LevelResult:
-        for _ in range(level.iterations):
-            ...                      # image steps for level.views, one pooled kernel step
-            tick()                   # progress; lets a cancelled job stop
-        return LevelResult(kernel, latents)
-
-    found = coarse_to_fine(views, solve, Schedule(side=31, iterations=5), on_step=on_step)
-
-Everything here commutes with turns by 90 degrees and mirroring.
+decide, and hand kernel and latent image up to the next finer level. A method brings one function, its
+alternation on one level; the driver makes the levels and resamples. Everything here commutes with turns by 90
+degrees and mirroring.
 """
 
 from __future__ import annotations
@@ -21,23 +12,22 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel, delta, resized
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 Image: TypeAlias = NDArray[np.float64]
-Tick: TypeAlias = Callable[[], None]
 
-RATIO = math.sqrt(0.5)
+RATIO: Final = math.sqrt(0.5)
 """Size of a level over that of the next finer one, as in the public codes of these methods."""
 
-_SMALLEST_IMAGE = 24  # shorter side of the coarsest level in pixels (chosen)
-_REACH = 2  # of the cubic, in pixels of the coarser grid
+_COARSEST: Final = 5  # pixels: kernels of the coarsest level are not smaller than this (chosen)
+_SMALLEST_IMAGE: Final = 24  # shorter side of the coarsest level in pixels (chosen)
+_REACH: Final = 2  # of the cubic, in pixels of the coarser grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,11 +46,11 @@ class View:
         mean = float(values.mean())
         return cls((values - mean) / span, model.sigma_at(mean) / span)
 
-    def at(self, shape: tuple[int, int]) -> View:
+    def at(self, shape: tuple[int, ...]) -> View:
         """Return the same patch on another grid; averaging makes its noise smaller."""
         if shape == self.y.shape:
             return self
-        return View(resample(self.y, shape), self.noise * noise_gain(_plain(self.y.shape), shape))
+        return View(resample(self.y, shape), self.noise * noise_gain(self.y.shape, shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,111 +60,45 @@ class Level:
     number: int  # 0 is the finest
     count: int  # how many levels there are
     side: int  # odd side of the kernel on this level
-    iterations: int  # how many alternations the schedule gives it
     views: tuple[View, ...]  # the patches, all of which share the kernel
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LevelResult:
-    """Kernel and one latent image for each patch, on the grids of their level."""
+Latents: TypeAlias = tuple[Image, ...]
+"""One latent image for each patch, each of the shape of its view."""
 
-    kernel: Kernel
-    latents: tuple[Image, ...]
-
-
-class LevelSolver(Protocol):
-    """What a method does on one level, from what the coarser one found.
-
-    It must not change its arguments, and calls `tick` after each iteration.
-    """
-
-    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
-        """Improve kernel `(side, side)` and latent images, each of the shape of its view."""
+LevelSolver: TypeAlias = Callable[[Level, Kernel, Latents], tuple[Kernel, Latents]]
+"""What a method does on one level, from the kernel `(side, side)` and the images of the coarser one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """Levels and iterations."""
-
-    side: int  # odd side of the kernel on the finest level
-    iterations: int  # alternations on each level
-    coarsest: int = 5  # the coarsest level is the last whose kernel is not smaller than this, in pixels
-    ratio: float = RATIO  # size of a level over that of the next finer one, below 1
-
-    def __post_init__(self) -> None:
-        if self.side < 3 or self.side % 2 == 0 or self.coarsest < 3:
-            raise InvalidInputError(
-                f"kernel sides must be odd and at least 3, got {self.side} down to {self.coarsest}"
-            )
-        if self.iterations < 1 or not 0.3 <= self.ratio < 1.0:
-            raise InvalidInputError(
-                f"a schedule needs iterations >= 1 and a ratio in 0.3..1, got {self.iterations}, {self.ratio}"
-            )
-
-    def sides(self, image_side: int) -> tuple[int, ...]:
-        """Kernel sides by level, finest first; no level's image gets smaller than 24 px."""
-        found = [self.side]
-        while True:
-            factor = self.ratio ** len(found)
-            side = odd(self.side * factor)
-            if side < self.coarsest or image_side * factor < max(_SMALLEST_IMAGE, 3 * side):
-                return tuple(found)
-            found.append(side)
+def kernel_sides(side: int, image_side: int) -> tuple[int, ...]:
+    """Kernel sides by level, finest first; no level's image gets smaller than 24 px."""
+    found = [side]
+    while True:
+        factor = RATIO ** len(found)
+        smaller = odd(side * factor)
+        if smaller < min(side, _COARSEST) or image_side * factor < max(_SMALLEST_IMAGE, 3 * smaller):
+            return tuple(found)
+        found.append(smaller)
 
 
 def coarse_to_fine(
-    views: Sequence[View],
-    solve: LevelSolver,
-    schedule: Schedule,
-    *,
-    start: Kernel | None = None,
-    on_step: StepHook = ignore_step,
-) -> LevelResult:
-    """Run a method on every level, coarsest first."""
-    if not views:
-        raise InvalidInputError("coarse to fine needs at least one patch")
-    sides = schedule.sides(min(min(view.y.shape) for view in views))
+    views: Sequence[View], solve: LevelSolver, side: int, *, start: Kernel | None = None
+) -> Kernel:
+    """Run a method on every level, coarsest first, up to a kernel of odd `side`; from a point by default."""
+    sides = kernel_sides(side, min(min(view.y.shape) for view in views))
     count = len(sides)
-    total = count * schedule.iterations
-    kernel = delta(sides[-1])
-    if start is not None:
-        kernel = rescaled(start, schedule.ratio ** (count - 1), sides[-1])
-    latents: tuple[Image, ...] = ()
+    kernel = delta(sides[-1]) if start is None else rescaled(start, RATIO ** (count - 1), sides[-1])
+    latents: Latents = ()
     for number in reversed(range(count)):
-        factor = schedule.ratio**number
-        small = tuple(view.at(level_shape(_plain(view.y.shape), factor)) for view in views)
+        small = tuple(view.at(level_shape(view.y.shape, RATIO**number)) for view in views)
         if number == count - 1:
             latents = tuple(view.y for view in small)
         else:
-            kernel = rescaled(kernel, 1.0 / schedule.ratio, sides[number])
-            latents = tuple(resample(x, _plain(v.y.shape)) for x, v in zip(latents, small, strict=True))
-        before = (count - 1 - number) * schedule.iterations
-        ticks = _Ticks(before, before + schedule.iterations, total, on_step)
-        level = Level(number, count, sides[number], schedule.iterations, small)
-        result = solve(level, kernel, latents, ticks)
-        ticks.finish()
-        kernel, latents = resized(result.kernel, sides[number]), result.latents
-    return LevelResult(kernel, latents)
-
-
-@dataclass(slots=True)
-class _Ticks:
-    """Counts iterations of one level; a method that stops early leaps to the level's end."""
-
-    done: int
-    last: int
-    total: int
-    on_step: StepHook
-
-    def __call__(self) -> None:
-        if self.done < self.last:
-            self.done += 1
-        self.on_step(self.done, self.total)
-
-    def finish(self) -> None:
-        if self.done < self.last:
-            self.done = self.last
-            self.on_step(self.done, self.total)
+            kernel = rescaled(kernel, 1.0 / RATIO, sides[number])
+            latents = tuple(resample(x, v.y.shape) for x, v in zip(latents, small, strict=True))
+        kernel, latents = solve(Level(number, count, sides[number], small), kernel, latents)
+        kernel = resized(kernel, sides[number])
+    return kernel
 
 
 def odd(value: float) -> int:
@@ -182,12 +106,12 @@ def odd(value: float) -> int:
     return max(2 * round((value - 1.0) / 2.0) + 1, 1)
 
 
-def level_shape(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+def level_shape(shape: tuple[int, ...], factor: float) -> tuple[int, int]:
     """Shape of an image scaled by `factor`."""
     return max(round(shape[0] * factor), 1), max(round(shape[1] * factor), 1)
 
 
-def resample(image: Image, shape: tuple[int, int]) -> Image:
+def resample(image: Image, shape: tuple[int, ...]) -> Image:
     """Resize by Keys' cubic, stretched when the image shrinks so that nothing aliases.
 
     The extent is kept: pixel i of n lies at (i + 1/2) / n. Beyond the border the image is mirrored.
@@ -203,7 +127,7 @@ def resample(image: Image, shape: tuple[int, int]) -> Image:
     return np.asarray(rows @ image @ cols.T)
 
 
-def noise_gain(shape: tuple[int, int], target: tuple[int, int]) -> float:
+def noise_gain(shape: tuple[int, ...], target: tuple[int, ...]) -> float:
     """Root mean square by which `resample` scales the standard deviation of white noise."""
     powers = [
         float(np.square(_weights(have, want)).sum(axis=1).mean())
@@ -253,7 +177,3 @@ def _cubic(t: Image) -> Image:
     near = (1.5 * t - 2.5) * t * t + 1.0
     far = ((-0.5 * t + 2.5) * t - 4.0) * t + 2.0
     return np.where(t <= 1.0, near, np.where(t < 2.0, far, 0.0))
-
-
-def _plain(shape: tuple[int, ...]) -> tuple[int, int]:
-    return shape[0], shape[1]

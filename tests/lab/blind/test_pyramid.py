@@ -7,18 +7,16 @@ from scipy import signal
 from lab.blind.steps.pyramid import (
     RATIO,
     Image,
+    Latents,
     Level,
-    LevelResult,
-    Schedule,
-    Tick,
     View,
     coarse_to_fine,
+    kernel_sides,
     noise_gain,
     odd,
     resample,
     rescaled,
 )
-from lensmodel.core.errors import CancelledError, InvalidInputError
 from lensmodel.core.psf import centroid, gaussian, second_moments
 from lensmodel.core.types import Kernel, NoiseModel
 
@@ -26,12 +24,6 @@ from lensmodel.core.types import Kernel, NoiseModel
 def picture(height: int = 60, width: int = 48) -> Image:
     rng = np.random.default_rng(0)
     return signal.convolve(rng.normal(size=(height + 8, width + 8)), gaussian(9, 2.0 * np.eye(2)), "valid")
-
-
-def keep(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
-    for _ in range(level.iterations):
-        tick()
-    return LevelResult(kernel, latents)
 
 
 def test_a_constant_and_a_ramp_survive_resampling() -> None:
@@ -87,54 +79,26 @@ def test_rescaled_kernels_keep_their_centre_and_scale_their_moments() -> None:
 
 
 def test_levels_go_down_to_the_coarsest_side_or_the_smallest_image() -> None:
-    sides = Schedule(side=31, iterations=1).sides(256)
+    sides = kernel_sides(31, 256)
 
     assert sides[0] == 31
     assert sides == tuple(odd(31 * RATIO**i) for i in range(len(sides)))
     assert sides[-1] >= 5 > odd(31 * RATIO ** len(sides))
-    assert len(Schedule(side=31, iterations=1).sides(64)) < len(sides)
-
-
-def test_progress_reaches_its_total_even_where_a_level_stops_early() -> None:
-    seen: list[tuple[int, int]] = []
-
-    def lazy(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
-        tick()
-        return LevelResult(kernel, latents)
-
-    view = View(picture(), 0.01)
-    coarse_to_fine([view], lazy, Schedule(15, 4), on_step=lambda done, total: seen.append((done, total)))
-
-    assert seen[-1][0] == seen[-1][1]
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-
-
-def test_cancelling_in_the_hook_stops_the_driver() -> None:
-    def stop(done: int, total: int) -> None:
-        raise CancelledError(f"stopped at {done} of {total}")
-
-    with pytest.raises(CancelledError):
-        coarse_to_fine([View(picture(), 0.01)], keep, Schedule(9, 2), on_step=stop)
+    assert len(kernel_sides(31, 64)) < len(sides)
 
 
 def test_every_level_gets_shapes_that_fit_together() -> None:
     levels: list[Level] = []
 
-    def look(level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+    def look(level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
         assert kernel.shape == (level.side, level.side)
         assert [x.shape for x in latents] == [v.y.shape for v in level.views]
         levels.append(level)
-        return keep(level, kernel, latents, tick)
+        return kernel, latents
 
     views = [View(picture(96, 80), 0.01), View(picture(64, 64), 0.02)]
-    found = coarse_to_fine(views, look, Schedule(15, 2), start=gaussian(15, np.eye(2)))
+    found = coarse_to_fine(views, look, 15, start=gaussian(15, np.eye(2)))
 
     assert [level.number for level in levels] == list(reversed(range(len(levels))))
-    assert found.kernel.shape == (15, 15)
+    assert found.shape == (15, 15)
     assert all(level.views[0].noise <= 0.01 for level in levels)
-
-
-@pytest.mark.parametrize("wrong", [{"side": 4}, {"iterations": 0}, {"ratio": 1.0}, {"coarsest": 1}])
-def test_impossible_schedules_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InvalidInputError):
-        Schedule(**{"side": 15, "iterations": 2, **wrong})  # type: ignore[arg-type]  # on purpose

@@ -6,7 +6,7 @@ from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.zhang_model import PatchPosterior, pooled_kernel
+from lab.blind.methods.zhang import PatchPosterior, pooled_kernel
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian
 from lensmodel.core.types import Kernel

@@ -2,11 +2,10 @@
 
     LENSMODEL_TEST_DATA=... python -m lab.lens_test GRID.npz
 
-A chart of dark squares that lean is photographed through a lens whose kernels are known. Nothing of what is
-tested takes part in making it: squares are drawn by their exact areas in pixels, the pixel's own box is
-taken out again, and the truth is the transfer function of the lens's own kernel at each place. The lens is
-also learned from three photos as `lab.blind_gain` takes them, and the figures
-of its report stand below those of the chart.
+A chart of dark squares that lean is photographed through a lens whose kernels are known: squares are drawn
+by their exact areas in pixels, the pixel's own box is taken out again, and the truth is the transfer function
+of the lens's own kernel at each place. The lens is also learned from three photos as `lab.blind_gain` takes
+them, and the figures of its report stand below those of the chart.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.photo import develop
 from lensmodel.quality import tangential_sagittal_mtf50
+from lensmodel.quality.edge import edge_area
 from lensmodel.report import lens_report
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
-from lensmodel.simulate.charts import edge_area
 
 MARGIN: Final = 40  # pixels of scene beyond the frame
 LEAN_DEG: Final = 5.0

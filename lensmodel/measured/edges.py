@@ -1,28 +1,21 @@
-"""PSFs from the slanted edges of a chart: what the edge spreads of a square say of the kernel there.
+"""PSFs from the squares of a chart: what their edges and corners say of the kernel there.
 
 The edge spread across an edge is the kernel's integral over lines along it. Its derivative's transform is
 the kernel's transfer function on the line through zero along the normal n,
 
     O(f) = sum_u k(u) exp(-2 pi i f n.u)
 
-The edges of one square give two such lines; between them nothing is known. The kernel is that one nearest to
-a elliptical g which agrees with them,
+The edges of one square give two such lines; at a corner of the frame, where u lies between the edges, T and S
+would be mixed. What lies between the lines is seen at the corners of the square: the mixed derivative of a
+blurred corner is the kernel itself. So the kernel is taken for a mixture of Gaussians,
 
-    min over k >= 0 of  sum_edges sum_f |(F k)(f) - O(f)|² / s² + (k - g)' T^-1 (k - g)
+    k(x) = sum_i w_i N(x; m_i, C_i),
 
-by the alternating directions of S. Boyd et al., Foundations and Trends in Machine Learning 3, 2011, sec.
-5.2: the matrix to invert has a row for each frequency of an edge, not for each pixel.
-
-Two edges tell the variance of g along their normals, n' C n = ln 2 / (2 pi² f50²), but not what joins the
-two directions: at a corner of the frame, where u lies between the edges, T and S would be mixed. What a
-square does not tell, all squares together do: u turns around the frame while the edges do not. So C is first
-fitted to all edges of the chart, smooth over the field h = (x, y), and radially symmetric but for what one
-decentred copy adds (K. P. Thompson, JOSA A 22, 2005):
-
-    C(h) = A0 + A1 x + A2 y + |h|² (a I + b u u' + (c.h)(d I + e u u')) + |h|^4 (f I + g u u')
-
-and at each square changed as little as makes it agree with the square's own edges. Along every direction g
-has the profile that the chart's edges have in the middle, scaled to one width.
+two of any shape and a round halo, and fitted by least squares to the transfer functions of the edges and to
+the pixels of the corners that the sensor measured. A corner is drawn sharp, from the areas that its edges cut
+off pixels, and blurred by k; the levels of its four quarters, small shifts of both edges and a slope of the
+light are linear, and solved for anew in each step (G. Golub and V. Pereyra, SIAM J. Numer. Anal. 10, 1973).
+Squares and checkerboards are alike in this.
 
 Source of the edge spread: ISO 12233:2017, annex D, in `quality.edge`.
 """
@@ -33,35 +26,29 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg
+from scipy import fft, optimize
 from scipy.sparse.csgraph import connected_components
 
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError
-from lensmodel.core.psf import as_kernel, centred, gaussian
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, StepHook, ignore_step
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
 from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.solve import even_variance, measured_pixels, on_simplex
 from lensmodel.photo import LinearPhoto
-from lensmodel.quality.edge import OVERSAMPLING, EdgeResponse, crossing, slanted_edge
+from lensmodel.quality.edge import OVERSAMPLING, EdgeResponse, crossing, edge_area, slanted_edge
 from lensmodel.quality.edge_finder import FoundEdge, find_edges
 
-# Error that no square shows of itself: what lies between two directions. Chosen: an even mixture of a core
-# and its aberrations differs by that much from its own two slices' Gaussian
+# Relative L2 that no square shows of itself: kernels are no mixtures of three Gaussians (chosen: half of the
+# squares of five traced lenses are off by .07 to .24)
 FLOOR: Final = 0.15
-# The same of one edge alone: across it only the other edges of the chart say anything (chosen)
-_LONE_FLOOR: Final = 0.3
 # Cycles/pixel: steps far below what a kernel resolves (chosen)
 _FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)
-_SCALED: Final = np.linspace(0.0, 3.0, 61)  # Frequencies over that at which the contrast is a half
-_FEW: Final = 3  # edges that must reach a frequency of the profile (chosen)
-_SLICE_ERROR: Final = 0.01  # s: of an edge of 64 lines at 1 percent noise, demosaiced
-# Light differs from g by so much of its peak in the middle; further out by less, as a Gaussian of so many
-# times the variance falls (chosen on traced lenses)
-_SPREAD, _ENVELOPE = 0.1, 4.0
-_ROUNDS: Final = 40  # of ADMM: later ones change nothing that is measured (chosen)
+_SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise, demosaiced
 # Edges closer in direction say nearly the same of a kernel; those of a square cross at 90 degrees (chosen)
 _CROSSING: Final = math.radians(45.0)
 # A corner of a square lies at most so much further out than the middles of windows that hold one edge and
@@ -70,15 +57,23 @@ _CORNER_PX: Final = 64.0
 # Pixels from an edge that its line spread is read at: further out is noise; nearer, halos are cut (chosen)
 _REACH_PX: Final = 16.0
 _TAPER_PX: Final = 4.0  # pixels over which it fades: a sudden end would ring (chosen)
-_LEAST_VARIANCE: Final = 0.05  # pixels^2, of a kernel along any direction: a pixel's own box has 1/12
-_RIDGE: Final = 0.05  # of the variances: what nothing speaks for stays small (chosen)
-_ODD: Final = 0.15  # relative misfit from which on an edge counts less (chosen: ten times an edge's error)
-_SYMMETRIC: Final = (0, 2, 9, 10, 15, 16)  # columns of `_columns` that a centred lens has: no ridge
+_LEAST_PX: Final = (
+    0.15  # standard deviation of a Gaussian: what is narrower looks the same to pixels (chosen)
+)
+# Pixels around a corner that are compared: so many standard deviations, within limits (chosen)
+_HALF_WIDTHS, _LEAST_HALF, _MOST_HALF = 3.0, 6, 20
+_SPARE_PX: Final = 16  # around them, which the blur of the rim of what is drawn reaches (chosen)
+# Where the fit begins: widths of the core and of the wider Gaussian over that of the square, weights of the
+# latter and of the halo over that of the core, and the halo's width. And a weak prior around it: standard
+# deviations of the logarithms, of the factors' lower corners, and of the two means in pixels (chosen)
+_CORE, _WIDE, _START_WEIGHTS, _HALO_PX = 0.75, 1.7, (0.37, 0.05), 3.5
+_SPREAD: Final = np.array([1.0] * 6 + [0.5] * 4 + [1.5, 1.5, 0.4])
+_STEPS: Final = 40  # of the fit, at most (chosen)
 
 
 @dataclass(frozen=True, slots=True)
 class SlantedEdges:
-    """PSFs from the slanted edges of a chart of squares, wherever they are in the frame."""
+    """PSFs from the squares of a chart, wherever they are in the frame."""
 
     name: ClassVar[str] = "edges"
     version: ClassVar[int] = 1
@@ -92,21 +87,17 @@ class SlantedEdges:
         channels: Sequence[Channel] = CHANNELS,
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
-        """Measure a PSF at every square, and at every edge that belongs to none; see `Measurer`."""
+        """Measure a PSF at every square of which two edges and their corner are seen; see `Measurer`."""
         require_photos(self, photos)
-        photo = photos[0]
-        edges = chart_edges(photo)
-        squares = squares_of(edges)
-        fields = {channel: VarianceField.fit(_measured(photo, channel, edges)) for channel in channels}
+        squares = squares_of(chart_edges(photos[0]))
         measured_psfs = []
         for done, square in enumerate(squares, start=1):
             for channel in channels:
-                psf = _square_psf(photo, channel, square, fields[channel], size)
-                if psf is not None:
-                    measured_psfs.append(psf)
+                with contextlib.suppress(LensModelError):
+                    measured_psfs.append(_square_psf(photos[0], channel, square, size))
             on_step(done, len(squares))
         if not measured_psfs:
-            raise NotEnoughEvidenceError("no edge could be measured; is the photo in focus and unclipped?")
+            raise NotEnoughEvidenceError("no square could be measured; is the photo in focus and unclipped?")
         return measured_psfs
 
 
@@ -147,7 +138,7 @@ def _share_corner(a: FoundEdge, b: FoundEdge, side: float) -> bool:
     if _angle_between(a.response.normal, b.response.normal) < _CROSSING:
         return False
     between = np.subtract(b.middle, a.middle)
-    normals = [np.array([-math.sin(e.response.normal), math.cos(e.response.normal)]) for e in (a, b)]
+    normals = [_unit(e.response.normal) for e in (a, b)]
     if side * float(between @ normals[0]) <= 0.0 or side * float(-between @ normals[1]) <= 0.0:
         return False
     # the lines p n = p_a n_a and p n = p_b n_b cross here, (row, col)
@@ -155,203 +146,101 @@ def _share_corner(a: FoundEdge, b: FoundEdge, side: float) -> bool:
     return all(min(math.dist(corner, end) for end in edge.ends) < _CORNER_PX for edge in (a, b))
 
 
-@dataclass(frozen=True, slots=True)
-class VarianceField:
-    """Covariance of the kernel as a smooth function of the field, from all edges of a chart.
+def _unit(normal: float) -> NDArray[np.float64]:
+    """Unit vector (row, col) of an angle."""
+    return np.array([-math.sin(normal), math.cos(normal)])
 
-    `coefficients` belong to `_columns`, in square pixels; `profile` is the contrast at `_SCALED`.
-    """
 
-    coefficients: NDArray[np.float64]
-    profile: NDArray[np.float64]
+def _angle_between(first: float, second: float) -> float:
+    """Angle between two normals, whichever side is bright: 0 to pi/2."""
+    folded = abs(first - second) % math.pi
+    return min(folded, math.pi - folded)
+
+
+# --- what is fitted to --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """An edge as measured in one colour: unit normal n (row, col) and p, so that n.x = p on it."""
+
+    normal: NDArray[np.float64]
+    place: float
+    transfer: NDArray[np.complex128]  # along the normal, at `_FREQUENCIES`
+    variance: float  # pixels^2, of the Gaussian whose contrast falls to a half where this does
 
     @classmethod
-    def fit(cls, edges: Sequence[tuple[FieldPosition, EdgeResponse]]) -> VarianceField:
-        """Fit n' C(h) n to the variances along the normals; edges that fit badly count less."""
-        transfers = [edge_transfer(response) for _, response in edges]
-        values = np.array([_variance(transfer) for transfer in transfers])
-        design = np.array([_columns(place, response.normal) for place, response in edges])
-        usual = float(np.median(values)) if len(values) else 1.0
-        ridge = np.full(design.shape[1] if len(values) else 17, _RIDGE / usual)
-        ridge[list(_SYMMETRIC)] /= 50.0
-        weight = np.ones(len(values))
-        coefficients = np.zeros(ridge.size)
-        for _ in range(4):
-            rows = np.concatenate([design * (weight / values)[:, None], np.diag(ridge)])
-            coefficients = np.linalg.lstsq(rows, np.concatenate([weight, np.zeros(ridge.size)]), rcond=None)[
-                0
-            ]
-            misfit = np.abs(design @ coefficients / values - 1.0)
-            weight = np.sqrt(np.minimum(1.0, _ODD / np.maximum(misfit, 1e-9)))
-        return cls(coefficients, _profile_of(transfers, values))
-
-    def at(self, place: FieldPosition) -> NDArray[np.float64]:
-        """Covariance in (row, col)."""
-        right, up, both = (
-            float(_columns(place, angle) @ self.coefficients) for angle in (0.0, math.pi / 2, math.pi / 4)
-        )
-        cross = both - (right + up) / 2.0
-        return np.array([[up, -cross], [-cross, right]])
-
-
-def _profile_of(
-    transfers: Sequence[NDArray[np.complex128]], variances: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Median contrast over frequency, both scaled to one width; where no edge reaches, a Gaussian's."""
-    gaussians = np.exp2(-np.square(_SCALED))
-    known = [
-        np.interp(_SCALED * _f50(variance), _FREQUENCIES, transfer.real, right=np.nan)
-        for transfer, variance in zip(transfers, variances, strict=True)
-    ]
-    enough = int((np.isfinite(known).sum(axis=0) >= _FEW).sum()) if known else 0
-    if not enough:
-        return gaussians
-    profile = np.nanmedian(np.array(known)[:, :enough], axis=0)
-    return np.concatenate([profile, gaussians[enough:] * profile[-1] / gaussians[enough - 1]])
-
-
-def _f50(variance: float) -> float:
-    return math.sqrt(math.log(2.0) / (2.0 * math.pi**2 * variance))
-
-
-def _elliptical(
-    covariance: NDArray[np.float64], profile: NDArray[np.float64], size: int
-) -> NDArray[np.float64]:
-    """Kernel whose contrast has the profile along every direction, and there the width of the covariance."""
-    count = 3 * size
-    rows, cols = fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]
-    (rr, rc), (_, cc) = covariance
-    scaled = np.sqrt(
-        (rr * rows**2 + 2.0 * rc * rows * cols + cc * cols**2) * 2.0 * math.pi**2 / math.log(2.0)
-    )
-    light = fft.irfft2(np.interp(scaled, _SCALED, profile), s=(count, count))
-    middle = np.roll(light, (size // 2, size // 2), (0, 1))[:size, :size]
-    return np.asarray(as_kernel(np.maximum(middle, 0.0)))
-
-
-def _columns(place: FieldPosition, normal: float) -> NDArray[np.float64]:
-    """Terms of n' C(h) n at a place, for a unit vector n of an angle."""
-    x, y = place.r * math.cos(place.phi), place.r * math.sin(place.phi)
-    c, s = math.cos(normal), math.sin(normal)
-    r2, along = x * x + y * y, (c * x + s * y) ** 2  # along: |h|^2 n'uu'n
-    fixed = np.array([c * c, 2.0 * c * s, s * s])
-    radial = [r2, along, r2 * x, r2 * y, along * x, along * y, r2 * r2, r2 * along]
-    return np.concatenate([fixed, fixed * x, fixed * y, radial])
-
-
-def _variance(transfer: NDArray[np.complex128]) -> float:
-    """Of the Gaussian whose contrast agrees where it falls to a half, or at the highest frequency."""
-    contrast = np.abs(transfer)
-    f = crossing(_FREQUENCIES, contrast, 0.5)
-    level = max(float(np.interp(f, _FREQUENCIES, contrast)), 1e-3)
-    return max(-math.log(min(level, 0.99)) / (2.0 * math.pi**2 * f * f), _LEAST_VARIANCE)
-
-
-def _measured(
-    photo: LinearPhoto, channel: Channel, edges: Sequence[FoundEdge]
-) -> list[tuple[FieldPosition, EdgeResponse]]:
-    """Places and responses of the edges in one colour; those that cannot be measured are left out."""
-    plane = photo.planes[CHANNELS.index(channel)]
-    responses = []
-    for edge in edges:
+    def of(cls, plane: NDArray[np.floating], edge: FoundEdge) -> _Line:
+        """Measure an edge; raises where that fails."""
         row, col, height, width = edge.box
-        with contextlib.suppress(LensModelError):
-            response = slanted_edge(plane[row : row + height, col : col + width])
-            responses.append((photo.frame.position(*edge.middle), response))
-    return responses
+        response = slanted_edge(plane[row : row + height, col : col + width])
+        transfer, middle = _transfer(response)
+        normal = _unit(response.normal)
+        half = crossing(_FREQUENCIES, np.abs(transfer), 0.5)
+        place = float(normal @ edge.middle) + response.offset + middle
+        return cls(normal, place, transfer, math.log(2.0) / (2.0 * math.pi**2 * half**2))
 
 
-def _square_psf(
-    photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], field: VarianceField, size: int
-) -> MeasuredPsf | None:
-    responses = [response for _, response in _measured(photo, channel, square)]
-    if len(responses) < len(square):
-        return None
-    middle = np.mean([edge.middle for edge in square], axis=0)
-    pixel = float(middle[0]), float(middle[1])
-    place = photo.frame.position(*pixel)
-    try:
-        kernel, error = constrained(responses, size, field.at(place), field.profile)
-    except LensModelError:
-        return None
-    return MeasuredPsf(kernel, place, channel, error, pixel, max(max(edge.box[2:]) for edge in square))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Corner:
+    """Pixels around a corner that the sensor measured, over their noise, and what they show without blur."""
+
+    seen: NDArray[np.bool_]  # (n, n), of a drawing wide enough for the blur of its rim
+    values: NDArray[np.float64]  # those that are seen
+    slope: NDArray[np.float64]  # (values, 3), terms of light that changes evenly
+    spectra: NDArray[np.complex128]  # (7, n, n // 2 + 1), both half planes, their product, and its changes
+
+    @classmethod
+    def of(
+        cls, photo: LinearPhoto, channel: Channel, edges: tuple[_Line, _Line], half: int
+    ) -> _Corner | None:
+        """Take the pixels around where two edges cross; None where they leave the frame."""
+        corner = np.linalg.solve([edge.normal for edge in edges], [edge.place for edge in edges])
+        row, col = np.rint(corner).astype(int) - half
+        side = 2 * half + 1
+        if min(row, col) < 0 or row + side > photo.frame.height or col + side > photo.frame.width:
+            return None
+        good = measured_pixels(photo, channel, row, col, (side, side))
+        window = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side].astype(np.float64)
+        if good.sum() < side:
+            return None
+        noise = math.sqrt(float(even_variance(photo, channel, window, good)[0, 0]))
+        slope = np.column_stack([np.ones(int(good.sum())), np.argwhere(good) / half - 1.0])
+        count = int(fft.next_fast_len(side + 2 * _SPARE_PX, real=True))
+        seen = np.zeros((count, count), dtype=np.bool_)
+        seen[_SPARE_PX : _SPARE_PX + side, _SPARE_PX : _SPARE_PX + side] = good
+        first = corner - (row - _SPARE_PX, col - _SPARE_PX)
+        return cls(seen, window[good] / noise, slope, _drawn(first, [e.normal for e in edges], count))
+
+    def misfit(self, mixture: _Mixture) -> NDArray[np.float64]:
+        """What the best levels, shifts of the edges and slope of the light leave, over the noise."""
+        count = len(self.seen)
+        blurred = self.spectra * mixture.transfer(fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :])
+        light = fft.irfft2(blurred, (count, count))[:, self.seen]
+        columns = np.column_stack([self.slope, light.T])
+        gram = columns.T @ columns
+        terms = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(len(gram)), columns.T @ self.values)
+        return np.asarray(self.values - columns @ terms)
 
 
-def constrained(
-    responses: Sequence[EdgeResponse],
-    size: int,
-    covariance: NDArray[np.floating],
-    profile: NDArray[np.floating] | None = None,
-) -> tuple[Kernel, float]:
-    """Find the kernel that agrees with edge spreads and is nearest to an ellipse, and its expected error.
+def _drawn(
+    corner: NDArray[np.float64], normals: Sequence[NDArray[np.float64]], count: int
+) -> NDArray[np.complex128]:
+    """Spectra of the half planes beyond two edges, of their product, and of what moves of the edges change.
 
-    Parameters
-    ----------
-    responses : sequence of EdgeResponse
-        Edges near one place.
-    size : int
-        Odd side of the kernel.
-    covariance : ndarray, shape (2, 2)
-        Of the kernel as far as it is known otherwise, pixels^2, (row, col); changed as little as makes it
-        agree with the edges.
-    profile : ndarray, optional
-        Contrast at `_SCALED` frequencies; by default a Gaussian's.
+    No pixel has blurred them: the box in which areas are counted is divided out.
     """
-    slices = _slices(responses)
-    covariance = _agreeing(np.asarray(covariance, dtype=np.float64), slices)
-    shape = np.exp2(-np.square(_SCALED)) if profile is None else np.asarray(profile, dtype=np.float64)
-    start = _elliptical(covariance, shape, size)
-    t = np.arange(size) - size // 2
-    rows, values = [], []
-    for normal, transfer in slices:
-        along = (t[None, :] * math.cos(normal) - t[:, None] * math.sin(normal)).ravel()
-        phase = 2.0 * np.pi * _FREQUENCIES[:, None] * along[None, :]
-        rows += [np.cos(phase), -np.sin(phase)]
-        values += [transfer.real, transfer.imag]
-    f, o = np.concatenate(rows), np.concatenate(values)
-    g = start.ravel()
-    envelope = np.asarray(gaussian(size, _ENVELOPE * covariance)).ravel()
-    t2 = (_SPREAD * g.max()) ** 2 * envelope / envelope.max()
-    spread = f * t2  # F T
-    inverse = linalg.cho_factor(spread @ f.T + 2.0 * _SLICE_ERROR**2 * np.eye(len(o)))
-    z, excess = g, np.zeros_like(g)
-    for _ in range(_ROUNDS):
-        between = (g + z - excess) / 2.0
-        k = between + spread.T @ linalg.cho_solve(inverse, o - f @ between)
-        z = np.maximum(k + excess, 0.0)
-        excess = excess + k - z
-    kernel = centred(as_kernel(z.reshape(size, size)))
-    unlike = float(np.linalg.norm(kernel - start) / np.linalg.norm(kernel))
-    floor = FLOOR if len(slices) > 1 else _LONE_FLOOR
-    return kernel, min(math.hypot(floor, unlike / 2.0), 1.0)
+    rows, cols = np.arange(count)[:, None] - corner[0], np.arange(count)[None, :] - corner[1]
+    first, second = (edge_area(rows, cols, math.atan2(-n[0], n[1])) for n in normals)
+    down, across = fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]
+    spectra = fft.rfft2([first, second, first * second]) / (np.sinc(down) * np.sinc(across))
+    moves = [2j * np.pi * (n[0] * down + n[1] * across) for n in normals]
+    changes = [spectra[0] * moves[0], spectra[1] * moves[1], *(spectra[2] * move for move in moves)]
+    return np.concatenate([spectra, changes])
 
 
-def _slices(responses: Sequence[EdgeResponse]) -> list[tuple[float, NDArray[np.complex128]]]:
-    """Normals and transfer functions, one for all edges of one direction: opposite ones are conjugate."""
-    slices: list[tuple[float, NDArray[np.complex128]]] = []
-    left = list(responses)
-    while left:
-        first = left[0].normal
-        own = [r for r in left if _angle_between(first, r.normal) <= _CROSSING / 2]
-        left = [r for r in left if _angle_between(first, r.normal) > _CROSSING / 2]
-        ahead = [math.cos(r.normal - first) > 0.0 for r in own]
-        normal = first + float(
-            np.mean(
-                [_signed(r.normal - first - (0.0 if a else math.pi)) for r, a in zip(own, ahead, strict=True)]
-            )
-        )
-        transfers = [edge_transfer(r) for r in own]
-        mean = np.mean([o if a else o.conj() for o, a in zip(transfers, ahead, strict=True)], axis=0)
-        slices.append((normal, mean))
-    return slices
-
-
-def _signed(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def edge_transfer(response: EdgeResponse) -> NDArray[np.complex128]:
-    """Transfer function along the normal at `_FREQUENCIES`, its phase from the middle of the light.
+def _transfer(response: EdgeResponse) -> tuple[NDArray[np.complex128], float]:
+    """Transfer function along the normal at `_FREQUENCIES`, and the middle of the light: phases are 0 there.
 
     The derivative of the profile, tapered where only noise is left, transformed; what the difference over
     two bins and the bins themselves take off is put back, as `quality.edge` does.
@@ -367,25 +256,106 @@ def edge_transfer(response: EdgeResponse) -> NDArray[np.complex128]:
     middle = float((lsf * place).sum()) / total
     wave = np.exp(-2j * np.pi * _FREQUENCIES[:, None] * (place - middle)[None, :])
     known = np.sinc(2.0 * _FREQUENCIES / OVERSAMPLING) * np.sinc(_FREQUENCIES / OVERSAMPLING)
-    return np.asarray((wave @ lsf) / total / known, dtype=np.complex128)
+    return np.asarray((wave @ lsf) / total / known, dtype=np.complex128), middle
 
 
-def _agreeing(
-    covariance: NDArray[np.float64], slices: Sequence[tuple[float, NDArray[np.complex128]]]
-) -> NDArray[np.float64]:
-    """The nearest covariance whose variance along each normal is that of its edge."""
-    rows, values = [], []
-    for normal, transfer in slices:
-        r, c = -math.sin(normal), math.cos(normal)
-        rows.append((r * r, 2 * r * c, c * c))
-        values.append(_variance(transfer) - float(np.array([r, c]) @ covariance @ np.array([r, c])))
-    # the least-norm solution leaves the term that the edges do not see as it was
-    rr, rc, cc = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
-    spread, axes = np.linalg.eigh(covariance + np.array([[rr, rc], [rc, cc]]))
-    return np.asarray(axes @ np.diag(np.maximum(spread, _LEAST_VARIANCE)) @ axes.T)
+# --- the kernel ---------------------------------------------------------------------------------
 
 
-def _angle_between(first: float, second: float) -> float:
-    """Angle between two normals, whichever side is bright: 0 to pi/2."""
-    folded = abs(first - second) % math.pi
-    return min(folded, math.pi - folded)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mixture:
+    """Three Gaussians: weights that sum to 1, means and covariances in pixels, (row, col)."""
+
+    weights: NDArray[np.float64]  # (3,)
+    means: NDArray[np.float64]  # (3, 2)
+    covariances: NDArray[np.float64]  # (3, 2, 2)
+
+    @classmethod
+    def of(cls, vector: NDArray[np.float64]) -> _Mixture:
+        """Read the parameters: two Cholesky factors, two means, logarithms of weights and of a width."""
+        factors = np.zeros((3, 2, 2))
+        for factor, (down, both, across) in zip(factors, vector[:6].reshape(2, 3), strict=False):
+            factor[:] = (math.exp(down), 0.0), (both, math.exp(across))
+        factors[2] = math.exp(vector[12]) * np.eye(2)
+        weights = np.exp([0.0, *vector[10:12]])
+        means = np.concatenate([vector[6:10].reshape(2, 2), np.zeros((1, 2))])
+        return cls(weights / weights.sum(), means, factors @ factors.transpose(0, 2, 1))
+
+    @staticmethod
+    def start(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Parameters that a square of a covariance begins with."""
+        factor = np.linalg.cholesky(covariance)
+        down, both, across = factor[0, 0], factor[1, 0], factor[1, 1]
+        shapes = [[math.log(s * down), s * both, math.log(s * across)] for s in (_CORE, _WIDE)]
+        return np.array([*shapes[0], *shapes[1], *[0.0] * 4, *np.log(_START_WEIGHTS), math.log(_HALO_PX)])
+
+    def transfer(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transfer function at frequencies in cycles/pixel."""
+        total: NDArray[np.complex128] = np.zeros(np.broadcast(rows, cols).shape, dtype=np.complex128)
+        for weight, (down, across), ((rr, rc), (_, cc)) in zip(
+            self.weights, self.means, self.covariances, strict=True
+        ):
+            spread = rr * rows**2 + 2.0 * rc * rows * cols + cc * cols**2
+            turn = 2j * np.pi * (rows * down + cols * across)
+            total = total + weight * np.exp(-2.0 * np.pi**2 * spread - turn)
+        return total
+
+    def kernel(self, size: int) -> Kernel:
+        """Kernel of pixels, by its transfer function up to the highest frequency that they hold."""
+        count = 3 * size
+        light = fft.irfft2(
+            self.transfer(fft.fftfreq(count)[:, None], fft.rfftfreq(count)[None, :]), (count,) * 2
+        )
+        middle = np.roll(light, (size // 2, size // 2), (0, 1))[:size, :size]
+        return as_kernel(on_simplex(middle.ravel(), 1.0).reshape(size, size))
+
+
+def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], size: int) -> MeasuredPsf:
+    """Fit the kernel of one square in one colour."""
+    plane = photo.planes[CHANNELS.index(channel)]
+    lines = [_Line.of(plane, edge) for edge in square]
+    half = math.ceil(_HALF_WIDTHS * math.sqrt(max(line.variance for line in lines)))
+    half = min(max(half, _LEAST_HALF), _MOST_HALF)
+    pairs = [(a, b) for a, b in combinations(lines, 2) if abs(a.normal @ b.normal) < math.cos(_CROSSING)]
+    around = [_Corner.of(photo, channel, pair, half) for pair in pairs]
+    corners = [corner for corner in around if corner is not None]
+    if not corners:
+        raise NotEnoughEvidenceError("no corner of the square is seen")
+    middle = np.mean([edge.middle for edge in square], axis=0)
+    pixel = float(middle[0]), float(middle[1])
+    side = max(max(edge.box[2:]) for edge in square)
+    kernel = _fitted(lines, corners).kernel(size)
+    return MeasuredPsf(kernel, photo.frame.position(*pixel), channel, FLOOR, pixel, side)
+
+
+def _fitted(lines: Sequence[_Line], corners: Sequence[_Corner]) -> _Mixture:
+    """Fit a mixture to edges and corners."""
+
+    def misfit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        mixture = _Mixture.of(vector)
+        waves = [mixture.transfer(*(_FREQUENCIES * n for n in line.normal)) - line.transfer for line in lines]
+        slices = [part / _SLICE_ERROR for wave in waves for part in (wave.real, wave.imag)]
+        return np.concatenate([*slices, *(corner.misfit(mixture) for corner in corners)])
+
+    start = min(_starts(lines), key=lambda vector: float(np.square(misfit(vector)).sum()))
+    low = np.full(start.size, -np.inf)
+    low[[0, 2, 3, 5]] = math.log(_LEAST_PX)
+    start = np.maximum(start, low + 1e-3)
+    result = optimize.least_squares(
+        lambda vector: np.concatenate([misfit(vector), (vector - start) / _SPREAD]),
+        start, bounds=(low, np.inf), x_scale=_SPREAD, max_nfev=_STEPS, ftol=1e-7,
+    )  # fmt: skip
+    return _Mixture.of(result.x)
+
+
+def _starts(lines: Sequence[_Line]) -> list[NDArray[np.float64]]:
+    """Parameters whose widths along two axes are those of the edges, and correlations from -.9 to .9."""
+    n = lines[0].normal
+    m = np.array([-n[1], n[0]])
+    first, second = (
+        float(np.mean([line.variance for line in lines if (abs(line.normal @ n) > math.sqrt(0.5)) == along]))
+        for along in (True, False)
+    )
+    both = math.sqrt(first * second) * (np.outer(n, m) + np.outer(m, n))
+    ellipse = first * np.outer(n, n) + second * np.outer(m, m)
+    return [_Mixture.start(ellipse + share * both) for share in np.linspace(-0.9, 0.9, 7)]

@@ -274,13 +274,13 @@ def _of_sum(
         lambda k: a @ k - b,
         start,
         1.0 / largest,
-        lambda k: _on_simplex(k, light),
+        lambda k: on_simplex(k, light),
         steps=steps,
         still=_STILL * light,
     )
 
 
-def _on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:
+def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]:
     """Nearest values that are not negative and have this sum.
 
     Source: J. Duchi et al., "Efficient projections onto the l1-ball for learning in high dimensions",

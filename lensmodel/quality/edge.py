@@ -59,6 +59,7 @@ class EdgeResponse:
     overshoot: float
     undershoot: float
     normal: float  # angle of the normal from dark to bright, radians, counter-clockwise from the right
+    offset: float  # pixels along the normal from the middle of the crop to the edge
     step: float  # bright minus dark level
     esf_distance: NDArray[np.float64]  # (m,), edge profile: distance in pixels, dark to bright, and level
     esf: NDArray[np.float64]
@@ -82,6 +83,28 @@ def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float
     return float(f[i - 1] + share * (f[i] - f[i - 1]))
 
 
+def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: float) -> NDArray[np.float64]:
+    """Share of each unit pixel on the bright side of an edge through the origin.
+
+    A square seen along the normal is a trapezoid, the box of width a = |cos| convolved with that
+    of width b = |sin|; its integral up to the pixel's distance d from the edge is exact::
+
+        F(d) = [(d + p)+^2 - (d + m)+^2 - (d - m)+^2 + (d - p)+^2] / (2 a b)
+        p = (a + b) / 2,  m = |a - b| / 2
+    """
+    distance = np.asarray(cols) * math.cos(normal) - np.asarray(rows) * math.sin(normal)
+    a, b = abs(math.cos(normal)), abs(math.sin(normal))
+    if min(a, b) < 1e-9:  # along the grid the trapezoid is a box
+        return np.clip(distance + 0.5, 0.0, 1.0)
+    p, m = (a + b) / 2.0, abs(a - b) / 2.0
+
+    def squared(x: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.square(np.maximum(x, 0.0))
+
+    area = squared(distance + p) - squared(distance + m) - squared(distance - m) + squared(distance - p)
+    return np.clip(area / (2.0 * a * b), 0.0, 1.0)
+
+
 def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     """Measure one slanted edge, near-vertical or near-horizontal, either side bright.
 
@@ -100,6 +123,7 @@ def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     rows, cols = upright.shape
     x = np.arange(cols)[None, :] - (intercept + slope * np.arange(rows)[:, None])
     distance, esf = _profile(x * cos * sign, upright)
+    middle = (cols - 1) / 2.0 - (intercept + slope * (rows - 1) / 2.0)
     frequencies, mtf = _spectrum(esf)
     # the normal in the upright crop: (1, -slope) in (column, row), towards the bright side
     d_col, d_row = sign * 1.0, -sign * slope
@@ -116,6 +140,7 @@ def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
         overshoot=max(float(esf.max()) - bright, 0.0) / step * 100.0,
         undershoot=max(dark - float(esf.min()), 0.0) / step * 100.0,
         normal=normal,
+        offset=-middle * cos * sign,
         step=step,
         esf_distance=distance,
         esf=esf,

@@ -8,7 +8,7 @@ from lensmodel.simulate.camera import (
     photograph,
     write_photo,
 )
-from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
+from lensmodel.simulate.charts import Chart, ChartEdge, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.lens import Aberrations, CameraLens, SimulatedField, SimulatedLens
 from lensmodel.simulate.scenes import DEMO_SCENES, demo_data_path, demo_scene, load_scene, srgb_to_linear
@@ -29,7 +29,6 @@ __all__ = [
     "demo_data_path",
     "demo_scene",
     "draw_lens",
-    "edge_area",
     "edge_chart",
     "load_scene",
     "photograph",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.types import FieldPosition, Planes, Zone
+from lensmodel.quality.edge import edge_area
 
 Direction = Literal["tangential", "sagittal"]
 
@@ -49,28 +50,6 @@ class Chart:
 
     scene: Planes  # (3, H + 2 margin, W + 2 margin), linear light
     edges: tuple[ChartEdge, ...]  # in coordinates of the frame, margin not counted
-
-
-def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: float) -> NDArray[np.float64]:
-    """Share of each unit pixel on the bright side of an edge through the origin.
-
-    A square seen along the normal is a trapezoid, the box of width a = |cos| convolved with that
-    of width b = |sin|; its integral up to the pixel's distance d from the edge is exact::
-
-        F(d) = [(d + p)+^2 - (d + m)+^2 - (d - m)+^2 + (d - p)+^2] / (2 a b)
-        p = (a + b) / 2,  m = |a - b| / 2
-    """
-    distance = np.asarray(cols) * math.cos(normal) - np.asarray(rows) * math.sin(normal)
-    a, b = abs(math.cos(normal)), abs(math.sin(normal))
-    if min(a, b) < 1e-9:  # along the grid the trapezoid is a box
-        return np.clip(distance + 0.5, 0.0, 1.0)
-    p, m = (a + b) / 2.0, abs(a - b) / 2.0
-
-    def squared(x: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.square(np.maximum(x, 0.0))
-
-    area = squared(distance + p) - squared(distance + m) - squared(distance - m) + squared(distance - p)
-    return np.clip(area / (2.0 * a * b), 0.0, 1.0)
 
 
 def slanted_edge_scene(

@@ -14,7 +14,7 @@ from lab.blind.steps.pyramid import View
 from lab.training import make_edge_patches
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.simulate import edge_area
+from lensmodel.quality.edge import edge_area
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

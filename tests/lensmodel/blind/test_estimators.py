@@ -14,7 +14,8 @@ from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelEr
 from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import centroid, delta, distance, gaussian, rms_width
 from lensmodel.core.types import NoiseModel, Plane
-from lensmodel.simulate import demo_scene, edge_area
+from lensmodel.quality.edge import edge_area
+from lensmodel.simulate import demo_scene
 
 SIGMA = 0.01
 NAMES = sorted(compared)  # those of the laboratory keep the same contract

@@ -19,6 +19,7 @@ from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import Kernel, LensSettings, Planes
+from lensmodel.quality.edge import edge_area
 from lensmodel.simulate import (
     DEMO_SCENES,
     Aberrations,
@@ -29,7 +30,6 @@ from lensmodel.simulate import (
     demo_data_path,
     demo_scene,
     draw_lens,
-    edge_area,
     edge_chart,
     load_scene,
     photograph,

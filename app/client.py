@@ -13,12 +13,12 @@ with Client("http://127.0.0.1:8000") as client:
 from __future__ import annotations
 
 import io
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, Self, TypeAlias, TypeVar
+from typing import Any, Final, Self, TypeAlias, TypeVar
 
 import httpx2
 import numpy as np
@@ -29,7 +29,6 @@ from app import schemas as s
 from app.runtime.settings import CLIENT_KEY
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import atomic
-from lensmodel.core.types import Channel
 
 M = TypeVar("M", bound=BaseModel)
 Query: TypeAlias = Mapping[str, str | int | float | bool | None]
@@ -95,9 +94,7 @@ class Client:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the connections."""
         self.close()
 
@@ -111,16 +108,16 @@ class Client:
         self,
         path: str | Path,
         *,
-        calibrate: bool = True,
         on_progress: Callable[[int, int], None] | None = None,
         **fields: str | float | None,
     ) -> s.PhotoOut:
         """Send a photo, streamed from its file; the same bytes give the photo that is there already.
 
-        `fields` are those of `UploadFields`, such as `lens_id` or `aperture`; `on_progress(sent, total)` is
-        called in bytes after each mebibyte. Settings are those of a file that does not say its own:
-        `change_photo` corrects one that says them wrongly. With `kind` it was made to measure the lens; of a
-        pair it is the open photo, and `reference_id` is the closed one, sent before with `calibrate=False`.
+        `fields` are those of `UploadFields`, such as `calibrate`, `lens_id` or `aperture`; `on_progress(sent,
+        total)` is called in bytes after each mebibyte. Settings are those of a file that does not say its
+        own: `change_photo` corrects one that says them wrongly. With `kind` it was made to measure the lens;
+        of a pair it is the open photo, and `reference_id` is the closed one, sent before with
+        `calibrate=False`.
 
         Raises
         ------
@@ -129,12 +126,11 @@ class Client:
         OSError
             If the file cannot be read.
         """
-        given = s.UploadFields.model_validate({"calibrate": calibrate, **fields})
-        query = given.model_dump(exclude_none=True) | {"calibrate": str(calibrate).lower()}
+        given = s.UploadFields.model_validate(fields).model_dump(mode="json", exclude_unset=True)
         with Path(path).open("rb") as file:
             answer = self._http.post(
                 "/v1/photos",
-                params={"filename": Path(path).name, **query},
+                params=_present({"filename": Path(path).name, **given}),
                 content=_pieces(file, on_progress),
                 headers={"Content-Type": "application/octet-stream"},
             )
@@ -153,9 +149,9 @@ class Client:
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
         return self._send(s.PhotoOut, "PATCH", f"/v1/photos/{photo_id}", body)
 
-    def delete_photo(self, photo_id: str) -> None:
-        """Delete a photo with all that was made of it."""
-        _require_success(self._http.delete(f"/v1/photos/{photo_id}"))
+    def delete(self, what: s.PhotoOut | s.LensOut | s.CorrectionOut) -> None:
+        """Delete a photo with all that was made of it, a lens, or a correction, which stops if it runs."""
+        _require_success(self._http.delete(str(what.links["self"])))
 
     # --- jobs -------------------------------------------------------------------------------------
 
@@ -197,34 +193,32 @@ class Client:
             If it took longer than `timeout`.
         """
         job_id = work if isinstance(work, str) else work.id
-        until = None if timeout is None else time.monotonic() + timeout
-        tag: str | None = None
+        until = math.inf if timeout is None else time.monotonic() + timeout
+        tag = ""
         while True:
-            left = LONG_POLL_SECONDS if until is None else max(until - time.monotonic(), 0.0)
-            pause, job = PAUSE_SECONDS, None
+            left = min(max(until - time.monotonic(), 0.0), LONG_POLL_SECONDS) if tag else 0.0
+            pause = PAUSE_SECONDS
             try:
-                job, tag = self._poll(job_id, tag, 0.0 if tag is None else min(left, LONG_POLL_SECONDS))
-            except (httpx2.TransportError, ServiceProblemError) as error:
-                if tag is None or (
-                    isinstance(error, ServiceProblemError) and error.problem.status not in _AWAY
-                ):
+                answer = self._http.get(
+                    f"/v1/jobs/{job_id}", params={"wait": left}, headers={"If-None-Match": tag} if tag else {}
+                )
+                if answer.status_code != httpx2.codes.NOT_MODIFIED:
+                    job, tag = _read(s.JobOut, answer), answer.headers.get("ETag", "")
+                    if _ended(job, on_change):
+                        return job
+            except httpx2.TransportError:
+                if not tag:
                     raise
                 pause = AWAY_SECONDS
-            if job is not None and _ended(job, on_change):
-                return job
-            if until is not None and time.monotonic() >= until:
+            except ServiceProblemError as error:
+                if not tag or error.problem.status not in _AWAY:
+                    raise
+                pause = AWAY_SECONDS
+            if time.monotonic() >= until:
                 raise JobPatienceError(
                     f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
                 )
             time.sleep(pause)
-
-    def _poll(self, job_id: str, tag: str | None, seconds: float) -> tuple[s.JobOut | None, str | None]:
-        """Ask once for a job, waiting so many seconds for a change since `tag`; None where there was none."""
-        headers = {} if tag is None else {"If-None-Match": tag}
-        answer = self._http.get(f"/v1/jobs/{job_id}", params={"wait": seconds}, headers=headers)
-        if answer.status_code == httpx2.codes.NOT_MODIFIED:
-            return None, tag
-        return _read(s.JobOut, answer), answer.headers.get("ETag")
 
     # --- corrections ------------------------------------------------------------------------------
 
@@ -236,14 +230,6 @@ class Client:
     def correction(self, correction_id: str) -> s.CorrectionOut:
         """Return one correction."""
         return self._get(s.CorrectionOut, f"/v1/corrections/{correction_id}")
-
-    def corrections(self, *, photo_id: str | None = None) -> list[s.CorrectionOut]:
-        """Return all corrections, newest first, optionally those of one photo."""
-        return list(self._pages(s.CorrectionPage, "/v1/corrections", {"photo_id": photo_id}))
-
-    def delete_correction(self, correction_id: str) -> None:
-        """Delete a correction with its file; one that runs stops."""
-        _require_success(self._http.delete(f"/v1/corrections/{correction_id}"))
 
     def download(self, correction_id: str, path: str | Path) -> Path:
         """Save the corrected photo; the file appears under its name only when it is complete."""
@@ -259,50 +245,22 @@ class Client:
         """Return one lens."""
         return self._get(s.LensOut, f"/v1/lenses/{lens_id}")
 
-    def calibrations(self, lens_id: str) -> list[s.CalibrationOut]:
-        """Return the history of a lens, oldest first."""
-        return list(self._pages(s.CalibrationPage, f"/v1/lenses/{lens_id}/calibrations"))
-
-    def psf(
-        self,
-        /,
-        lens_id: str,
-        *,
-        r: float,
-        phi: float = 0.0,
-        aperture: float | None = None,
-        channel: Channel = "g",
-        size: int = 55,
-        **more: float | bool | None,
-    ) -> s.PsfOut:
-        """Return the PSF of a lens at one place and setting, with what it rests on."""
-        query: Query = {"r": r, "phi": phi, "aperture": aperture, "channel": channel, "size": size, **more}
+    def psf(self, /, lens_id: str, **query: str | float | None) -> s.PsfOut:
+        """Return the PSF of a lens at one place and setting, with what it rests on: fields of `PsfQuery`."""
         return self._get(s.PsfOut, f"/v1/lenses/{lens_id}/psf.json", query)
 
-    def kernel(
-        self, /, lens_id: str, *, r: float, phi: float = 0.0, **query: str | float | None
-    ) -> NDArray[np.float32]:
+    def kernel(self, /, lens_id: str, **query: str | float | None) -> NDArray[np.float32]:
         """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
-        params = _present({"r": r, "phi": phi, **query})
-        answer = _require_success(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=params))
+        answer = _require_success(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=_present(query)))
         kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
         return kernel
 
-    def delete_lens(self, lens_id: str) -> None:
-        """Delete a lens with all that was learned of it."""
-        _require_success(self._http.delete(f"/v1/lenses/{lens_id}"))
+    def change_lens(self, /, lens_id: str, **change: object) -> s.LensOut:
+        """Rename a lens by `label`, or let it become a part of another by `merge_into`, which is returned.
 
-    def rename_lens(self, lens_id: str, label: str | None) -> s.LensOut:
-        """Call a lens by a name of its owner's; None takes the name away."""
-        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", {"label": label})
-
-    def merge_lens(self, lens_id: str, into: str, *, any_lens: bool = False) -> s.LensOut:
-        """Let a lens become a part of another, which is returned; it is forgotten itself.
-
-        One that seems to be another lens is refused without `any_lens`.
+        Two that seem to be different lenses are merged only with `any_lens=True`.
         """
-        asked = {"merge_into": into, "any_lens": any_lens}
-        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", asked)
+        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", change)
 
     def save_profile(self, lens_id: str, path: str | Path) -> Path:
         """Save what was learned of a lens as a `.lensprofile`."""
@@ -325,20 +283,10 @@ class Client:
             raise (ServiceProblemError(ended.job.error) if ended.job.error else ended) from ended
         return self.lens(lens_id)
 
-    def save_report(
-        self,
-        lens_id: str,
-        path: str | Path,
-        *,
-        form: Literal["json", "csv", "pdf"] | None = None,
-        against: str | None = None,
-        aperture: float | None = None,
-        against_aperture: float | None = None,
-        channel: Channel = "g",
-    ) -> Path:
-        """Save the test report of a lens, in the form that the ending of `path` names unless `form` does.
+    def save_report(self, /, lens_id: str, path: str | Path, **query: str | float | None) -> Path:
+        """Save the test report of a lens in the form that `path` ends with: `.json`, `.csv` or `.pdf`.
 
-        With `against`, another lens, or `against_aperture` it is a comparison.
+        With `against`, another lens, or `against_aperture` it is a comparison, also at an `aperture`.
 
         Raises
         ------
@@ -346,14 +294,7 @@ class Client:
             With the code `not_ready` while a worker has yet to make it.
         """
         target = Path(path)
-        query: Query = {
-            "against": against,
-            "aperture": aperture,
-            "against_aperture": against_aperture,
-            "channel": channel,
-        }
-        kind = form or target.suffix.lower().removeprefix(".")
-        return self._save(f"/v1/lenses/{lens_id}/report.{kind}", target, query)
+        return self._save(f"/v1/lenses/{lens_id}/report{target.suffix.lower()}", target, query)
 
     def get(self, path: str, **query: str | float | bool | None) -> Any:  # noqa: ANN401 - JSON of any shape
         """Return the JSON of any other address of the service, such as `/v1/account`."""

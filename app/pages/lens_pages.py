@@ -75,7 +75,6 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, _ = shown.photos(call, lens_id)
-    newest = next((event.coverage for event in reversed(history) if event.coverage), None)
     aspect, test = _aspect(call, row), _test(call, row)
     gone = max((event.version for event in history if event.kind != "photo_added"), default=0)
     return page(
@@ -86,7 +85,6 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
         curve=_error_history(history),
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
-        coverage=words.coverage_bars(newest),
         aspect=aspect,
         spots=_spots(_positions(call, photos), aspect),
         comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],

@@ -79,7 +79,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         done=done,
         nothing=words.nothing_words(row.kind),
         least=SEEN_DB,
-        before=f"/ui/photos/{photo_id}/tiles" if done is None else f"{shown_by}/before",
+        before=f"/ui/photos/{photo_id}/tiles/before" if done is None else f"{shown_by}/before",
         after=f"{shown_by}/after" if better else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )
@@ -130,7 +130,6 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     changed = not report.get("nothing_to_correct")
     can_look = can_look and changed
     zones, most_gain = words.gain_bars(report.get("zones") or {})
-    size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(
         "correction.html",
         correction=correction,
@@ -140,7 +139,6 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         zones=zones if changed else [],
         most_gain=most_gain,
         nothing=words.nothing_words(row.kind),
-        audit=words.held_places(report.get("audit") or {}, *size) if changed else None,
-        held=words.held_squares(report.get("audit") or {}, *size) if can_look else None,
+        audit=words.held_back(report.get("audit") or {}) if changed else None,
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Annotated, Final, Literal, TypeVar
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Depends, Path, Response
 
 from app.blobs import tiles
 from app.blobs.storage import Storage
@@ -22,7 +22,8 @@ from app.store.tables import CorrectionRow
 
 Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
 Number = Annotated[int, Path(ge=0, le=10_000)]
-Which = Literal["before", "after"]
+Kind = Literal["photos", "corrections"]
+Which = Literal["before", "after"]  # a photo by itself is as it was before
 
 # Placeholder until there is a picture
 NOTHING: Final = (
@@ -63,27 +64,32 @@ def photo_r_map(photo_id: str, call: CallDep) -> Response:
     return _picture(_stored(call, key), "image/png")
 
 
-def _shown(call: Call, photo_id: str) -> str:
-    return f"{photo_routes.find_photo(call, photo_id).folder}{SHOWN}"
+def _tiles_of(call: CallDep, kind: Kind, subject: str, which: Which) -> str:
+    """Return the key of the tiles of a photo, or of one side of a correction."""
+    if kind == "photos":
+        return f"{photo_routes.find_photo(call, subject).folder}{SHOWN}"
+    return f"{_compared(call, subject).run_folder}{SIDES[which]}"
 
 
-@router.get("/ui/photos/{photo_id}/preview.jpg")
-@router.get("/ui/photos/{photo_id}/tiles/whole.jpg")
-def photo_whole(photo_id: str, call: CallDep) -> Response:
-    """Show a developed photo as large as most screens are."""
-    return _picture(tiles.whole(call.storage, _shown(call, photo_id)))
+Tiles = Annotated[str, Depends(_tiles_of)]
 
 
-@router.get("/ui/photos/{photo_id}/tiles/places/{place}.jpg")
-def photo_place(photo_id: str, place: Number, call: CallDep) -> Response:
-    """Show a part of a developed photo, 1:1."""
-    return _picture(tiles.part(call.storage, _shown(call, photo_id), place))
+@router.get("/ui/{kind}/{subject}/tiles/{which}/whole.jpg")
+def whole_picture(call: CallDep, key: Tiles) -> Response:
+    """Show a photo as large as most screens are."""
+    return _picture(tiles.whole(call.storage, key))
 
 
-@router.get("/ui/photos/{photo_id}/tiles/{half}/{col}_{row}.jpg")
-def photo_tile(photo_id: str, half: Half, col: Number, row: Number, call: CallDep) -> Response:
-    """Show a tile of a developed photo, halved `half` times."""
-    return _picture(tiles.tile(call.storage, _shown(call, photo_id), half, col, row))
+@router.get("/ui/{kind}/{subject}/tiles/{which}/places/{place}.jpg")
+def place_of_picture(call: CallDep, key: Tiles, place: Number) -> Response:
+    """Show a part of a photo, 1:1."""
+    return _picture(tiles.part(call.storage, key, place))
+
+
+@router.get("/ui/{kind}/{subject}/tiles/{which}/{half}/{col}_{row}.jpg")
+def tile_of_picture(call: CallDep, key: Tiles, half: Half, col: Number, row: Number) -> Response:
+    """Show a tile of a photo, halved `half` times."""
+    return _picture(tiles.tile(call.storage, key, half, col, row))
 
 
 def _compared(call: Call, correction_id: str) -> CorrectionRow:
@@ -91,30 +97,6 @@ def _compared(call: Call, correction_id: str) -> CorrectionRow:
     if row.state != "succeeded":
         raise NotReadyError(f"correction {correction_id} is {row.state}: wait for its job")
     return row
-
-
-def _side(call: Call, correction_id: str, which: Which) -> str:
-    return f"{_compared(call, correction_id).run_folder}{SIDES[which]}"
-
-
-@router.get("/ui/corrections/{correction_id}/tiles/{which}/whole.jpg")
-def correction_whole(correction_id: str, which: Which, call: CallDep) -> Response:
-    """Show a photo before or after a correction as large as most screens are."""
-    return _picture(tiles.whole(call.storage, _side(call, correction_id, which)))
-
-
-@router.get("/ui/corrections/{correction_id}/tiles/{which}/places/{place}.jpg")
-def correction_place(correction_id: str, which: Which, place: Number, call: CallDep) -> Response:
-    """Show a part of a photo before or after a correction, 1:1."""
-    return _picture(tiles.part(call.storage, _side(call, correction_id, which), place))
-
-
-@router.get("/ui/corrections/{correction_id}/tiles/{which}/{half}/{col}_{row}.jpg")
-def correction_tile(
-    correction_id: str, which: Which, half: Half, col: Number, row: Number, call: CallDep
-) -> Response:
-    """Show a tile of a photo before or after a correction, halved `half` times."""
-    return _picture(tiles.tile(call.storage, _side(call, correction_id, which), half, col, row))
 
 
 @router.get("/ui/corrections/{correction_id}/layer/{name}")

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
-from app.pages.pictures import upright_point
 from app.pages.shown import WaitingGroup
-from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
+from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
 from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
-from lensmodel.report import Centring, Unit, sharpness
+from lensmodel.report import sharpness
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "In the queue",
@@ -45,17 +44,12 @@ FILES: Final[Mapping[str, str]] = {
     "dng": "Linear DNG",
 }
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
-UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 CHECKS: Final[Mapping[str, str]] = {
     "isolated pixels": "single pixels that stand out",
     "re-blur": "detail that does not match the photo",
     "spectrum": "finer contrast than the photo can have held",
 }
 LEAST: Final = 0.005  # Share below which a check is not mentioned (chosen): less than can be seen
-MAX_PLACES: Final = 6  # Places that are listed (chosen): the worst ones
-# Side of a square in photo pixels for audits without `tile_side` (chosen): large enough to find in the
-# picture
-SQUARE: Final = 96
 
 REASONS: Final[Mapping[str, str]] = {
     "clipped": "too bright: the sensor was saturated",
@@ -194,11 +188,15 @@ def patch_words(patch: PatchOut) -> str:
     return f"Used ({place})" if patch.state == "done" else f"Still to be measured ({place})"
 
 
-def error_words(error: dict[str, Any] | float | None) -> str:
+def error_words(error: Mapping[str, float | None] | float | None) -> str:
     """Write a held-out error in percent, one figure a zone."""
-    if isinstance(error, Mapping):
-        return ", ".join(percent(error.get(zone)) for zone in ZONES) if error else "not yet known"
-    return "not yet known" if error is None else percent(error)
+    if not error:
+        return "not yet known"
+    return (
+        ", ".join(percent(error.get(zone)) for zone in ZONES)
+        if isinstance(error, Mapping)
+        else percent(error)
+    )
 
 
 def percent(share: float | None) -> str:
@@ -206,72 +204,20 @@ def percent(share: float | None) -> str:
     return "not known" if share is None else f"{100 * share:.0f} %"
 
 
-EVENTS: Final[Mapping[str, str]] = {
-    "photo_added": "photo added",
-    "photo_included": "photo used again",
-    "photo_excluded": "photo left out",
-    "photo_removed": "photo deleted",
-    "photo_changed": "details of a photo changed",
-}
-
-
-def event_words(event: CalibrationOut) -> str:
-    """Say what made a version."""
-    return EVENTS.get(event.kind, event.kind)
-
-
-def centring_verdict(centring: Centring) -> str:
-    """Say in a word or two whether a lens is centred."""
-    return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Not known yet."}[
-        centring.verdict
-    ]
-
-
-def centring_words(centring: Centring) -> str:
-    """Write why, with its error."""
-    return f"{centring.text[:1].upper()}{centring.text[1:]}."
-
-
-def unit_name(unit: Unit) -> str:
-    """Write a unit out."""
-    return {"c/px": "cycles/pixel", "lp/ph": "line pairs per picture height", "lp/mm": "line pairs per mm"}[
-        unit
-    ]
-
-
 def coverage_words(coverage: Mapping[str, Any] | None) -> str:
     """Write the places seen in each zone."""
     return ", ".join(str(coverage.get(zone, 0)) for zone in ZONES) if coverage else ""
 
 
-@dataclass(frozen=True, slots=True)
-class ZoneBar:
-    """One zone of the picture in a bar chart; `share` is the length of the bar in percent."""
-
-    words: str
-    share: int
-    count: int = 0
-    gain: str = ""
-
-
-def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
-    """Compare how many places were seen in each zone."""
-    if not coverage:
-        return []
-    counts = {zone: int(coverage.get(zone, 0)) for zone in ZONES}
-    most = max(1, *counts.values())
-    return [ZoneBar(ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
-
-
-def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> tuple[list[ZoneBar], int]:
-    """Compare the expected gains of the zones, and return the whole decibels at the end of their scale."""
+def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> tuple[list[tuple[str, int, str]], int]:
+    """Return name, length in percent and words of a bar for each zone, and the decibels at their end."""
     gains = {zone: zones[zone].get("expected_gain_db") for zone in ZONES if zones.get(zone, {}).get("cells")}
     most = math.ceil(max([3.0, *(gain for gain in gains.values() if gain is not None)]))
     return [
-        ZoneBar(
+        (
             ZONES[zone],
             round(100 * max(gain or 0.0, 0.0) / most),
-            gain=gain_words(gain) + held_words(zones[zone]),
+            gain_words(gain) + held_words(zones[zone]),
         )
         for zone, gain in gains.items()
     ], most
@@ -293,69 +239,21 @@ def held_words(zone: Mapping[str, Any]) -> str:
     return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
 
 
-@dataclass(frozen=True, slots=True)
-class MarkedPlace:
-    """A place of the upright photo in its pixels, with a caption."""
-
-    x: int
-    y: int
-    words: str
-
-
-@dataclass(frozen=True, slots=True)
-class HeldBack:
-    """What was held back: a sentence, the reasons, and the worst places."""
-
-    words: str
-    reasons: list[str]
-    places: list[MarkedPlace]
-
-
-def check_words(name: str) -> str:
-    """Return what a check objects to, in words."""
-    return CHECKS.get(name, name)
-
-
-def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> HeldBack | None:
-    """Return what was held back of a correction; None where nothing was checked."""
-    zones = audit.get("zones") or {}
-    tiles = sum(zone["tiles"] for zone in zones.values())
+def held_back(audit: Mapping[str, Any]) -> tuple[str, list[str]] | None:
+    """Say how much of a correction was held back, and why; None where nothing was checked."""
+    zones = (audit.get("zones") or {}).values()
+    tiles = sum(zone["tiles"] for zone in zones)
     if not tiles:
         return None
-    share = sum(zone["tiles"] * zone["held_back"] for zone in zones.values()) / tiles
-    checks: dict[str, float] = {}
-    for zone in zones.values():
-        for name, part in zone["checks"].items():
-            checks[name] = checks.get(name, 0.0) + part * zone["tiles"] / tiles
-    listed = sorted(checks.items(), key=lambda item: -item[1])
-    reasons = [f"{check_words(name)}: {part:.1%}" for name, part in listed if part >= LEAST]
-    words = (
-        "Applied almost in full."
-        if share < LEAST
-        else f"{share:.0%} of the correction was held back over the whole photo."
+    checks: Counter[str] = Counter()
+    for zone in zones:
+        checks.update({name: part * zone["tiles"] / tiles for name, part in zone["checks"].items()})
+    share = sum(zone["tiles"] * zone["held_back"] for zone in zones) / tiles
+    words = f"{share:.0%} of the correction was held back over the whole photo."
+    return (
+        "Applied almost in full." if share < LEAST else words,
+        [f"{CHECKS.get(name, name)}: {part:.1%}" for name, part in checks.most_common() if part >= LEAST],
     )
-    places = []
-    worst = audit.get("worst", []) if share >= LEAST else []  # less cannot be seen
-    for place in worst[:MAX_PLACES]:
-        y, x = upright_point(place["row"], place["col"], height, width, orientation)
-        places.append(MarkedPlace(x, y, f"{place['held_back']:.0%}: {check_words(place['check'])}"))
-    return HeldBack(words, reasons, places)
-
-
-def held_squares(
-    audit: Mapping[str, Any], height: int, width: int, orientation: int
-) -> dict[str, Any] | None:
-    """Return the tiles with something held back as squares of the upright photo."""
-    tiles = audit.get("tiles") or []
-    if not tiles:
-        return None
-    side = int(audit.get("tile_side") or SQUARE)
-    squares = []
-    for tile in tiles:
-        middle = (tile["row"] + side / 2, tile["col"] + side / 2)
-        y, x = upright_point(*middle, height, width, orientation)
-        squares.append({"x": round(x - side / 2), "y": round(y - side / 2), "held": tile["held_back"]})
-    return {"tiles": squares, "side": side, "most": max(tile["held_back"] for tile in tiles)}
 
 
 def active(photo: PhotoOut) -> bool:
@@ -363,43 +261,13 @@ def active(photo: PhotoOut) -> bool:
     return photo.state in ACTIVE
 
 
-def developed(photo: PhotoOut) -> bool:
-    """Whether there may be a picture to show."""
-    return photo.state not in UNDEVELOPED
-
-
 def correctable(photo: PhotoOut) -> bool:
     """Whether it can be corrected now."""
     return photo.state in {"counted", "stored", "excluded"}
 
 
+# Templates use all of these as filters
 FILTERS: Final[Mapping[str, Callable[..., object]]] = {
-    f.__name__: f
-    for f in (
-        lens_name,
-        f_stop,
-        centring_verdict,
-        centring_words,
-        event_words,
-        sharpness,
-        plain,
-        unit_name,
-        photo_state,
-        state_class,
-        counted,
-        duration,
-        failure,
-        correction_name,
-        file_words,
-        waiting_words,
-        group_name,
-        correction_state,
-        reason_words,
-        patch_words,
-        error_words,
-        coverage_words,
-        active,
-        developed,
-        correctable,
-    )
+    "sharpness": sharpness,
+    **{name: made for name, made in globals().items() if getattr(made, "__module__", "") == __name__},
 }

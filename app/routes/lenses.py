@@ -43,9 +43,6 @@ class LensChange(Question):
 
     label: Name | None = Field(None, description="what its owner calls it; null takes the name away")
     merge_into: Id | None = Field(None, description="the lens that this one is a part of")
-    back_to: int | None = Field(
-        None, ge=1, le=MAX_VERSION, description="a version: photos that joined later are left out"
-    )
     any_lens: bool = Field(default=False, description="merge lenses too that seem to be two")
 
 
@@ -63,15 +60,14 @@ def create_lens(new: LensIn, call: CallDep) -> LensOut:
 
 @router.patch("/lenses/{lens_id}", operation_id="changeLens")
 def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
-    """Rename a lens, merge it into another, or go back to an earlier version.
+    """Rename a lens, or merge it into another.
 
     Merged, its photos teach the other lens, which is returned, and it is forgotten; lenses that seem to be
-    two are merged only with `any_lens`. Going back leaves out the photos that joined later; they stay,
-    and can be included again.
+    two are merged only with `any_lens`.
     """
     lens = find_lens(call, lens_id)
     if len(change.model_fields_set - {"any_lens"}) != 1:
-        raise InvalidParameterError("send one of label, merge_into and back_to")
+        raise InvalidParameterError("send label or merge_into")
     lenses = call.store.lenses
     if change.merge_into is not None:
         target = find_lens(call, change.merge_into)
@@ -85,11 +81,6 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
         if not lenses.merge(lens_id, change.merge_into, call.owner):
             raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
         return read_lens(change.merge_into, call)
-    if change.back_to is not None:
-        if change.back_to >= lens.version:
-            raise InvalidParameterError(f"back_to must be below {lens.version}, the newest version")
-        lenses.go_back(lens_id, call.owner, change.back_to)
-        return read_lens(lens_id, call)
     lenses.rename(lens_id, call.owner, change.label)
     return read_lens(lens_id, call)
 

@@ -261,20 +261,6 @@ class Lenses(Repository):
         return True
 
     @writes
-    def go_back(self, session: Session, lens_id: str, owner: str, version: int) -> int | None:
-        """Exclude the photos that joined a lens after a version; return how many, None without a lens."""
-        # They stay, and can be included again one by one
-        lens = find_to_change(session, LensRow, lens_id, owner)
-        if lens is None:
-            return None
-        joining = EventRow.kind.in_(("photo_added", "photo_included"))
-        events = select(EventRow).where(EventRow.lens_id == lens.id, joining).order_by(EventRow.version)
-        joined = {event.photo_public_id: event.version for event in session.scalars(events)}
-        later = [key for key, at in joined.items() if at > version]
-        photos = select(PhotoRow).where(PhotoRow.public_id.in_(later), PhotoRow.lens_id == lens.id)
-        return sum(switch(session, photo, "excluded") for photo in session.scalars(photos))
-
-    @writes
     def delete(self, session: Session, lens_id: str, owner: Owner) -> bool:
         """Delete a lens with all that was learned of it; its photos stay and can be corrected with another.
 

@@ -219,10 +219,4 @@ export function setUpLensActions() {
     },
   };
   for (const form of holder?.querySelectorAll("form") ?? []) acting(form, acts[form.dataset.act], holder.querySelector(".alert"));
-  for (const back of document.querySelectorAll("[data-back]"))
-    acting(back, async () => {
-      const version = Number(back.dataset.back);
-      const question = `Go back to version ${version}? Photos that joined later are left out; they stay and can be counted again.`;
-      return (await confirmed(question, "Go back")) && send("PATCH", `/v1/lenses/${back.dataset.lens}`, { back_to: version }).then(() => true);
-    }, byId("back-alert"));
 }

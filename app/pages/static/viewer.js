@@ -4,7 +4,6 @@ import { byId } from "./common.js";
 
 const TILE = 512; // as the service cuts pictures
 const CLOSEST = 8; // pixels of the screen for one of the photo
-const OVERLAY = 8; // pixels of the photo for one of the squares over it
 
 const ratio = () => window.devicePixelRatio || 1;
 
@@ -243,31 +242,16 @@ function setUpSplit(root, { stage }) {
   });
 }
 
-// Nine places of the picture as small crops, and a list of the worst ones: choosing one brings the view there, pixel by
-// pixel. A box shows as squares over the photo where checks held the correction back.
+// Nine places of the picture as small crops: choosing one brings the view there, pixel by pixel.
 function setUpPlaces(root, viewer) {
-  const places = [...document.querySelectorAll(".mosaic button, [data-x]")];
+  const places = [...document.querySelectorAll(".mosaic button")];
   for (const place of places) {
-    const { row, col, x = col * viewer.width, y = row * viewer.height } = place.dataset;
+    const { row, col } = place.dataset;
     place.disabled = false;
     place.addEventListener("click", () => {
-      viewer.goTo(Number(x), Number(y));
+      viewer.goTo(col * viewer.width, row * viewer.height);
       root.scrollIntoView({ block: "start" });
       for (const other of places) other.setAttribute("aria-pressed", String(other === place));
     });
   }
-  const box = byId("show-held");
-  if (!box) return;
-  const { tiles, side, most } = JSON.parse(byId("held").textContent);
-  const canvas = Object.assign(document.createElement("canvas"), { width: viewer.width / OVERLAY, height: viewer.height / OVERLAY });
-  const context = canvas.getContext("2d");
-  for (const tile of tiles) {
-    context.fillStyle = `rgb(255 60 40 / ${0.12 + (0.5 * tile.held) / most})`;
-    context.fillRect(tile.x / OVERLAY, tile.y / OVERLAY, side / OVERLAY, side / OVERLAY);
-  }
-  box.disabled = false;
-  box.addEventListener("change", () => {
-    viewer.cover(canvas, { x: 0, y: 0, width: viewer.width, height: viewer.height });
-    canvas.hidden = !box.checked;
-  });
 }

@@ -104,7 +104,12 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
     described = set(app.openapi()["paths"])
     rooms = (page_routes, photo_pages, lens_pages, pictures)  # a stream of events has no end
     hidden = [route for room in rooms for route in room.router.routes] + page_routes.strangers.routes
-    pages = {route.path for route in hidden if isinstance(route, APIRoute)}
+    pages = {
+        route.path.replace("{kind}/{subject}", subject)
+        for route in hidden
+        if isinstance(route, APIRoute)
+        for subject in ("photos/{photo_id}", "corrections/{correction_id}")
+    }
     for path in sorted(described | pages):
         name = path.rpartition("/")[2]
         for method in METHODS:
@@ -151,7 +156,9 @@ def test_a_second_owner_finds_nothing_of_the_first_on_any_route(
     assert len(statuses) >= 12
     assert not {address for address, status in statuses.items() if status in {401, 403}}
     missing = {address for address, status in statuses.items() if status == 404}
-    assert missing <= {f"/ui/photos/{ids['photo_id']}/{name}" for name in ("preview.jpg", "r-map.png")}
+    assert missing <= {
+        f"/ui/photos/{ids['photo_id']}/{name}" for name in ("tiles/before/whole.jpg", "r-map.png")
+    }
 
 
 def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too(

@@ -400,7 +400,6 @@ def test_a_lens_shows_where_photos_had_detail_and_its_versions(page: Page, learn
     page.get_by_text("All versions").click()
     versions = page.get_by_role("region", name="Calibration history")
     expect(versions.locator("tbody tr").first).to_be_visible()
-    expect(page.locator("section[aria-labelledby=coverage-title] .zones li")).to_have_count(3)
 
 
 def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(
@@ -685,13 +684,6 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_role("button", name="It is the same lens").click()
     expect(page.locator(".facts").first).to_contain_text("3 photos")
     assert service.get(f"/v1/lenses/{made[1]}")["samples"] > before["samples"]
-    page.goto(f"/lenses/{made[1]}/tests")
-    page.get_by_text("All versions").click()
-    page.get_by_role("button", name=f"Go back to {before['version']}").click()
-    with page.expect_navigation():
-        page.get_by_role("dialog").get_by_role("button", name="Go back").click()
-    page.goto(f"/lenses/{made[1]}")
-    expect(page.locator(".facts").first).to_contain_text("2 photos")
     page.get_by_text("Rename, merge").click()
     page.get_by_role("button", name="Delete lens").click()
     page.get_by_role("button", name="Delete the lens").click()

@@ -75,19 +75,6 @@ def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -
     assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
 
 
-def test_going_back_leaves_out_what_joined_later(client: TestClient, steps: Steps) -> None:
-    photos = [steps.counted() for _ in range(3)]
-    lens = steps.lens_id(photos[0])
-
-    back = client.patch(f"/v1/lenses/{lens}", json={"back_to": 1}).json()
-
-    assert (back["photos"], back["version"]) == (1, 5)
-    assert [steps.fresh(photo).state for photo in photos] == ["counted", "excluded", "excluded"]
-    assert client.patch(f"/v1/lenses/{lens}", json={"back_to": 5}).status_code == 422
-    again = client.patch(f"/v1/photos/{photos[1].public_id}", json={"excluded": False})
-    assert again.json()["state"] == "counted"
-
-
 @pytest.mark.usefixtures("reading")
 def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, store: Store) -> None:
     lens = steps.lens_id(steps.counted(patches=4))

@@ -73,7 +73,6 @@ class Owner:
             lambda: photos.change(photo, "local", {}, lens=other),
             lambda: photos.give_up_file(photo, ()),
             lambda: lenses.merge(lens, other, "local"),
-            lambda: lenses.go_back(lens, "local", 1),
         ]
         self.chance.choice(deeds)()
 

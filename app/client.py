@@ -142,7 +142,7 @@ class Client:
 
     def photos(self, *, lens_id: str | None = None, state: s.PhotoState | None = None) -> list[s.PhotoOut]:
         """Return all photos, newest first."""
-        return list(self._pages(s.PhotoPage, "/v1/photos", {"lens_id": lens_id, "state": state}))
+        return list(self._pages(s.Page[s.PhotoOut], "/v1/photos", {"lens_id": lens_id, "state": state}))
 
     def change_photo(self, /, photo_id: str, **changes: object) -> s.PhotoOut:
         """Name the lens of a photo, correct its settings, or exclude it: fields of `PhotoChange`."""
@@ -239,7 +239,7 @@ class Client:
 
     def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
         """Return all lenses, newest first, optionally of one model or serial."""
-        return list(self._pages(s.LensPage, "/v1/lenses", {"model": model, "serial": serial}))
+        return list(self._pages(s.Page[s.LensOut], "/v1/lenses", {"model": model, "serial": serial}))
 
     def lens(self, lens_id: str) -> s.LensOut:
         """Return one lens."""
@@ -283,10 +283,8 @@ class Client:
             raise (ServiceProblemError(ended.job.error) if ended.job.error else ended) from ended
         return self.lens(lens_id)
 
-    def save_report(self, /, lens_id: str, path: str | Path, **query: str | float | None) -> Path:
+    def save_report(self, lens_id: str, path: str | Path) -> Path:
         """Save the test report of a lens in the form that `path` ends with: `.json`, `.csv` or `.pdf`.
-
-        With `against`, another lens, or `against_aperture` it is a comparison, also at an `aperture`.
 
         Raises
         ------
@@ -294,7 +292,7 @@ class Client:
             With the code `not_ready` while a worker has yet to make it.
         """
         target = Path(path)
-        return self._save(f"/v1/lenses/{lens_id}/report{target.suffix.lower()}", target, query)
+        return self._save(f"/v1/lenses/{lens_id}/report{target.suffix.lower()}", target)
 
     def get(self, path: str, **query: str | float | bool | None) -> Any:  # noqa: ANN401 - JSON of any shape
         """Return the JSON of any other address of the service, such as `/v1/account`."""
@@ -302,8 +300,8 @@ class Client:
 
     # --- requests ---------------------------------------------------------------------------------
 
-    def _save(self, address: str, target: Path, query: Query | None = None) -> Path:
-        with self._http.stream("GET", address, params=_present(query) if query else None) as answer:
+    def _save(self, address: str, target: Path) -> Path:
+        with self._http.stream("GET", address) as answer:
             if answer.is_error:
                 answer.read()
             _require_success(answer)

@@ -121,7 +121,16 @@ PhotoState = Literal[
 ]
 
 
-class UploadFields(Question):
+class Settings(Question):
+    """At which settings of its lens a photo was taken."""
+
+    aperture: Aperture | None = None
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: PixelPitch | None = None
+
+
+class UploadFields(Settings):
     """What an owner may say about a photo.
 
     The lens that it names goes before that of the file; a setting counts where the file says none.
@@ -139,10 +148,6 @@ class UploadFields(Question):
     lens_serial: Name | None = None
     lens_model: Name | None = None
     lens_maker: Name | None = None
-    aperture: Aperture | None = None
-    focal_length_mm: FocalLength | None = None
-    focus_distance_m: FocusDistance | None = None
-    pixel_pitch_um: PixelPitch | None = None
 
     @field_validator("*", mode="before")
     @classmethod
@@ -156,7 +161,7 @@ class NewLens(Question):
     label: Name
 
 
-class PhotoChange(Question):
+class PhotoChange(Settings):
     """What to change about a photo; at least one field. It goes before what the file says."""
 
     lens_id: Id | None = None
@@ -164,10 +169,6 @@ class PhotoChange(Question):
     lens_model: Name | None = None
     lens_maker: Name | None = None
     new_lens: NewLens | None = None
-    aperture: Aperture | None = None
-    focal_length_mm: FocalLength | None = None
-    focus_distance_m: FocusDistance | None = None
-    pixel_pitch_um: PixelPitch | None = None
     excluded: bool | None = None
     calibrate: bool | None = Field(
         None, description="true: learn the lens from a photo that was stored without"
@@ -237,14 +238,6 @@ class PatchOut(Model):
     score: float | None
     state: str
     reason: str | None
-
-
-class PhotoPage(Page[PhotoOut]):
-    """Some photos, newest first."""
-
-
-class PatchPage(Page[PatchOut]):
-    """The patches of a photo."""
 
 
 CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -321,10 +314,6 @@ class CorrectionOut(Model):
         return {"self": own, "job": f"{V1}/jobs/{self.id}", "result": result}
 
 
-class CorrectionPage(Page[CorrectionOut]):
-    """Some corrections, newest first."""
-
-
 JobState = Literal["queued", "running", "waiting", "succeeded", "failed", "cancelled"]
 
 
@@ -351,10 +340,6 @@ class JobOut(Model):
     started_at: datetime | None
     finished_at: datetime | None
     links: Links
-
-
-class JobPage(Page[JobOut]):
-    """Some jobs, newest first."""
 
 
 SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
@@ -413,14 +398,6 @@ class LateralOut(Model):
     photos: int
     red: tuple[float, float, float, float]
     blue: tuple[float, float, float, float]
-
-
-class LensPage(Page[LensOut]):
-    """Some lenses, newest first."""
-
-
-class CalibrationPage(Page[CalibrationOut]):
-    """Some versions of a lens, oldest first."""
 
 
 class PsfQuery(Question):
@@ -510,11 +487,6 @@ class FieldQuery(Question):
     grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
     size: KernelSize = 55
     aspect: float = Field(1.5, ge=0.2, le=5, description="width over height of the picture")
-    view: str = Field(
-        "0,0,1,1",
-        pattern=r"^(0|1|0?\.\d{1,6})(,(0|1|0?\.\d{1,6})){3}$",
-        description="part of the picture that is shown: left, top, width and height as shares of it",
-    )
     version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
     gamma: float = Field(0.5, ge=0.1, le=2, description="brightness ~ value^gamma")
     focal_length_mm: FocalLength | None = None

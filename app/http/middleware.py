@@ -34,6 +34,7 @@ MAX_PROFILE_BYTES: Final = 64 * MIB  # largest profile (chosen): twenty times th
 MAX_FORM_BYTES: Final = 64 * 1024  # all form fields of an upload (chosen): far more than they can have
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+MALFORMED: Final = "?"  # a host name that cannot be read; no host has it
 CLOSE: Final = {"Connection": "close"}  # of a refusal before the body is read: the rest is not waited for
 
 _PHOTO: Final = re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements")
@@ -119,18 +120,8 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers, changes = Headers(scope=scope), scope["method"] not in SAFE
+        headers, changes, received = Headers(scope=scope), scope["method"] not in SAFE, 0
         most, too_long = self._limit(scope)
-        try:
-            self._check_host(headers)
-            if changes:
-                self._check_site(headers)
-                _check_body(headers, most, too_long)
-        except BodyError as refusal:
-            answer = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
-            await answer(scope, receive, send)
-            return
-        received = 0
 
         async def counted() -> Message:
             nonlocal received
@@ -140,12 +131,25 @@ class Guard:
                 raise too_long
             return message
 
-        await self._app(scope, counted if changes else receive, send)
+        try:
+            self._check_host(headers)
+            if changes:
+                self._check_site(headers)
+                _check_body(headers, most, too_long)
+        except BodyError as refusal:
+            answer = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
+            await answer(scope, receive, send)
+        else:
+            await self._app(scope, counted if changes else receive, send)
 
     def _check_host(self, headers: Headers) -> None:
         host = headers.get("host", "")
-        name = host_name(host)
-        if name is None or not (is_local(name) or name in self._allowed):
+        name = _host_name(host)
+        # addresses and local names, which no stranger can own
+        local = (
+            "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()
+        )
+        if name == MALFORMED or not (local or name in self._allowed):
             raise BodyError(
                 400,
                 "invalid_parameter",
@@ -155,12 +159,10 @@ class Guard:
 
     def _check_site(self, headers: Headers) -> None:
         origin = headers.get("origin")
-        same = headers.get("sec-fetch-site", "none") in {"same-origin", "none"}
-        if same and origin is not None:
-            place = origin.partition("://")[2].lower()
-            name = host_name(place)
-            same = bool(name) and (place == headers.get("host", "").lower() or name in self._allowed)
-        if not same:
+        place = "" if origin is None else origin.partition("://")[2].lower()
+        ours = origin is None or (place and place == headers.get("host", "").lower())
+        allowed = ours or _host_name(place) in self._allowed
+        if not allowed or headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
             raise BodyError(
                 403,
                 "cross_site",
@@ -199,17 +201,12 @@ def declared_length(headers: Headers) -> int | None:
     return int(declared) if declared.isdecimal() and len(declared) <= 18 else None
 
 
-def host_name(host: str) -> str | None:
-    """Return the name in a Host header, without its port; None where there is none that can be read."""
+def _host_name(host: str) -> str:
+    """Return the name in a Host header, without its port."""
     try:
         return (urlsplit(f"//{host}").hostname or "").lower()
     except ValueError:
-        return None
-
-
-def is_local(name: str) -> bool:
-    """Say whether a host name is an address or a local name, which no stranger can own."""
-    return "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()
+        return MALFORMED
 
 
 @asynccontextmanager

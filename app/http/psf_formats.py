@@ -5,11 +5,10 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import Image
 
 from app.http.model_cache import Fitted
@@ -20,8 +19,6 @@ from lensmodel.model import PsfAnswer
 from lensmodel.report.lens_report import UNKNOWN
 
 SIDE: Final = 1000  # height of the frame of a map in pixels (chosen): only its aspect ratio matters
-# Part of a picture: left, top, width and height as fractions of it
-View: TypeAlias = tuple[float, float, float, float]
 DIGITS: Final = 10  # decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001
 SCALE: Final = "X-PSF-Scale"
 ANSWERED_BY: Final = "X-PSF-Answered-By"
@@ -69,21 +66,21 @@ def psf(
         values = np.round(kernel, DIGITS).tolist()
         full = described.model_copy(update={"psf": described.psf.model_copy(update={"data": values})})
         return full.model_dump_json().encode(), {}
+    at, headers, buffer = described.query, {ANSWERED_BY: described.support.answered_by}, io.BytesIO()
+    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
+    name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{form}"
+    headers["Content-Disposition"] = f'inline; filename="{name}"'
     if form == "npy":
-        buffer = io.BytesIO()
         np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
-        return buffer.getvalue(), _headers(described, "npy")
-    if form == "tiff":
-        buffer = io.BytesIO()
+    elif form == "tiff":
         text = described.model_dump_json(exclude={"psf"})  # tifffile would interpret a "shape" in it
-        tifffile.imwrite(
-            buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
-        )
-        return buffer.getvalue(), _headers(described, "tiff")
-    peak = float(kernel.max())
-    scaled = np.round(kernel / peak * 65535).astype(np.uint16)
-    headers = {SCALE: f"max={peak:.9g}; gamma=1"}
-    return _png(Image.fromarray(scaled)), headers | _headers(described, "png")
+        pixels = kernel.astype(np.float32)
+        tifffile.imwrite(buffer, pixels, photometric="minisblack", description=text, metadata=None)
+    else:
+        peak = float(kernel.max())
+        headers[SCALE] = f"max={peak:.9g}; gamma=1"
+        Image.fromarray(np.round(kernel / peak * 65535).astype(np.uint16)).save(buffer, "PNG")
+    return buffer.getvalue(), headers
 
 
 def field_map(
@@ -93,48 +90,23 @@ def field_map(
     rows: int,
     size: int,
     gamma: float,
-    aspect: float = 1.5,
-    view: View = (0.0, 0.0, 1.0, 1.0),
+    aspect: float,
 ) -> tuple[bytes, Mapping[str, str]]:
-    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak."""
-    # `ask` answers with a kernel of side `size`. Where too little is known the cell is hatched, as in
-    # reports.
+    """Draw kernels of side `size` on a grid over the field as an 8-bit PNG, each scaled to its own peak."""
+    # Where too little is known the cell is hatched, as in reports.
     frame = Frame(SIDE, round(SIDE * aspect))
-    left_edge, top_edge, wide, high = view
     pitch = size + GAP_PX
     sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
     hatched = np.where(np.add.outer(np.arange(size), np.arange(size)) % HATCH_PX < 2, 110, 40)
     made: Counter[str] = Counter()
-    for row in range(rows):
-        for column in range(columns):
-            down, across = top_edge + (row + 0.5) / rows * high, left_edge + (column + 0.5) / columns * wide
-            place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
-            answer = ask(place)
-            made[answer.answered_by] += 1
-            top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
-            known = answer.predicted_error < UNKNOWN and not answer.extrapolated
-            cell = _bright(answer.kernel, gamma) if known else hatched
-            sheet[top : top + size, left : left + size] = cell
-    return _png(Image.fromarray(sheet)), _made(made)
-
-
-def _bright(kernel: Kernel, gamma: float) -> NDArray[np.uint8]:
-    return np.round((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
-
-
-def _png(image: Image.Image) -> bytes:
+    for row, column in np.ndindex(rows, columns):
+        down, across = (row + 0.5) / rows, (column + 0.5) / columns
+        answer = ask(frame.position(down * (frame.height - 1), across * (frame.width - 1)))
+        made[answer.answered_by] += 1
+        top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
+        known = answer.predicted_error < UNKNOWN and not answer.extrapolated
+        bright = np.round((answer.kernel / answer.kernel.max()) ** gamma * 255)
+        sheet[top : top + size, left : left + size] = bright if known else hatched
     buffer = io.BytesIO()
-    image.save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-def _made(counts: Counter[str]) -> dict[str, str]:
-    return {ANSWERED_BY: "; ".join(name for name, _ in counts.most_common())}
-
-
-def _headers(described: PsfOut, suffix: str) -> dict[str, str]:
-    at = described.query
-    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
-    name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{suffix}"
-    made = Counter([described.support.answered_by])
-    return {"Content-Disposition": f'inline; filename="{name}"'} | _made(made)
+    Image.fromarray(sheet).save(buffer, "PNG")
+    return buffer.getvalue(), {ANSWERED_BY: "; ".join(name for name, _ in made.most_common())}

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from fastapi import Request
-from starlette.datastructures import FormData, UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException
 
 from app.blobs.storage import CHUNK, Storage
 from app.errors import ServiceError
-from app.http.middleware import MAX_FORM_BYTES
+from app.http.middleware import MAX_FORM_BYTES, BodyError
 from app.schemas import UploadFields
 from app.store.tables import PROFILE_FILE
 from lensmodel import photo
@@ -111,23 +112,24 @@ async def _pieces(file: UploadFile) -> AsyncIterator[bytes]:
 @asynccontextmanager
 async def read_form(request: Request) -> AsyncIterator[tuple[UploadFile, dict[str, str]]]:
     """Provide the file of a form, and its fields."""
-    limits = {"max_files": 1, "max_fields": MAX_PARTS, "max_part_size": MAX_FORM_BYTES}
-    parser = MultiPartParser(request.headers, request.stream(), **limits)
     try:
-        yield _parts(await parser.parse())
-    except MultiPartException as error:
-        text = f"the form cannot be read ({error.message}): {REMEDY}"
-        raise ServiceError(text, code="malformed_upload") from error
+        form = await request.form(max_files=1, max_fields=MAX_PARTS, max_part_size=MAX_FORM_BYTES)
+    except (MultiPartException, HTTPException) as error:
+        if isinstance(error, BodyError):
+            raise
+        why = error.message if isinstance(error, MultiPartException) else error.detail
+        raise _unreadable(why) from error
+    try:
+        file, entries = form.get(FILE_FIELD), form.multi_items()
+        fields = {name: value for name, value in entries if isinstance(value, str)}
+        if not isinstance(file, UploadFile):
+            raise _unreadable("no part `file`, or no last boundary")
+        if len(fields) != len(entries) - 1:
+            raise _unreadable("a field is there twice")
+        yield file, fields
     finally:
-        for opened in parser._files_to_close_on_error:  # noqa: SLF001 - also those of parts that never ended
-            opened.close()
+        await form.close()
 
 
-def _parts(form: FormData) -> tuple[UploadFile, dict[str, str]]:
-    file, entries = form.get(FILE_FIELD), form.multi_items()
-    fields = {name: value for name, value in entries if isinstance(value, str)}
-    if not isinstance(file, UploadFile):
-        raise MultiPartException("no part `file`, or no last boundary")
-    if len(fields) != len(entries) - 1:
-        raise MultiPartException("a field is there twice")
-    return file, fields
+def _unreadable(why: str) -> ServiceError:
+    return ServiceError(f"the form cannot be read ({why}): {REMEDY}", code="malformed_upload")

@@ -112,24 +112,16 @@ def lens_charts(
     if against.startswith("at "):
         second_test = test
         second_aperture = _aperture(against.removeprefix("at "))
-        query = {"aperture": aperture, "against_aperture": against.removeprefix("at ")}
     else:
         second_test = stored_report(call, find_lens(call, against))
         second_aperture = chosen if chosen in second_test.apertures else None
-        query = {"aperture": aperture, "against": against}
     first_tested, second_tested = test.at(chosen), second_test.at(second_aperture)
     sides = [
         Side(name if second_test is not test else words.f_stop(tested.settings.aperture or 0.0), tested)
         for name, tested in ((test.name, first_tested), (second_test.name, second_tested))
     ]
     comparison = compare(*sides)
-    return page(
-        "_charts.html",
-        comparison=comparison,
-        charts=comparison_charts(comparison),
-        comparison_link=f"/v1/lenses/{lens_id}/report",
-        comparison_query=urlencode({name: value for name, value in query.items() if value}),
-    )
+    return page("_charts.html", comparison=comparison, charts=comparison_charts(comparison))
 
 
 def _aperture(text: str) -> float | None:

@@ -28,7 +28,7 @@ from app.routes.common import (
     problems,
 )
 from app.routes.photos import SEND_AGAIN, check_usage, find_photo
-from app.schemas import V1, CorrectionIn, CorrectionOut, CorrectionPage
+from app.schemas import V1, CorrectionIn, CorrectionOut, Page
 from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
@@ -158,12 +158,12 @@ def find_correction(call: Call, correction_id: str) -> CorrectionRow:
 @router.get("/corrections", operation_id="listCorrections")
 def list_corrections(
     call: CallDep, limit: Limit = 50, cursor: Cursor = None, photo_id: OnlyId = None
-) -> CorrectionPage:
+) -> Page[CorrectionOut]:
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)
     rows = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1, photo=photo)
     page, following = cut(rows, limit)
-    return CorrectionPage(items=[*map(views.correction_out, page)], next=next_link(call, following))
+    return Page[CorrectionOut](items=[*map(views.correction_out, page)], next=next_link(call, following))
 
 
 @router.get("/corrections/{correction_id}", operation_id="getCorrection")

@@ -17,7 +17,7 @@ from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, next_link
 from app.routes.photos import SEND_AGAIN, candidates
-from app.schemas import JobOut, JobPage
+from app.schemas import JobOut, Page
 
 router = APIRouter(tags=["jobs"], route_class=OneSession)
 
@@ -45,14 +45,14 @@ def fingerprint(job: JobOut) -> str:
 
 
 @router.get("/jobs", operation_id="listJobs")
-def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> JobPage:
+def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> Page[JobOut]:
     """List jobs of photos and corrections, newest first."""
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
     corrections = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1)
     jobs = [*map(views.photo_job, photos), *map(views.correction_job, corrections)]
     newest = sorted(jobs, key=lambda job: job.id, reverse=True)
     following = newest[limit - 1].id if len(newest) > limit else None
-    return JobPage(items=newest[:limit], next=next_link(call, following))
+    return Page[JobOut](items=newest[:limit], next=next_link(call, following))
 
 
 @router.get("/jobs/{job_id}", operation_id="getJob", response_model=JobOut, responses=NOT_CHANGED)

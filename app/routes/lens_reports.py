@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import replace
-from typing import Annotated, Any, Final, Literal
+from typing import Final, Literal
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Response, status
 
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
 from app.routes.common import NOT_CHANGED, file_headers, find_lens, matches_tag
-from app.schemas import Aperture, OptionalId
 from app.store.lenses import report_key
 from app.store.tables import LensRow
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import camera_name
-from lensmodel.core.types import Channel
-from lensmodel.report import Comparison, LensReport, Side, compare, provenance
+from lensmodel.report import LensReport, provenance
 from lensmodel.report.tables import to_csv
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
@@ -60,37 +57,21 @@ def read_report(
     lens_id: str,
     form: Form,
     call: CallDep,
-    against: Annotated[OptionalId, Query(description="another lens to compare it with")] = None,
-    aperture: Annotated[Aperture | None, Query(description="of a comparison")] = None,
-    against_aperture: Annotated[Aperture | None, Query(description="of the other one")] = None,
-    channel: Channel = "g",
 ) -> Response:
-    """Return the test of a lens, or with `against` or `against_aperture` a comparison.
-
-    The first sentence is for photographers; the rest is what lens testers expect.
-    """
+    """Return the test of a lens: its first sentence is for photographers, the rest what testers expect."""
     lens = find_lens(call, lens_id)
     test = stored_report(call, lens)
-    compared = against is not None or against_aperture is not None
-    second_lens = lens if against in {None, lens_id} else find_lens(call, str(against))
-    second_state = f"{second_lens.public_id} {second_lens.version} {second_lens.rebuild_epoch}"
-    question = f"{form} {second_state} {aperture} {against_aperture}"
-    digest = hashlib.sha256(f"{question} {channel} {compared}".encode()).hexdigest()[:12]
-    tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{digest}"'
+    tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{form}"'
     headers = {"ETag": tag, **file_headers(f"{test.name}-report.{form}", inline=form == "pdf")}
     if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    if compared:
-        second_test = test if second_lens is lens else stored_report(call, second_lens)
-        body = _compared(test, second_test, aperture, against_aperture, channel, form)
-    else:
-        photos = call.store.photos.page(call.owner, before=None, limit=MOST, lens_id=lens_id, state="counted")
-        details = provenance(
-            lens.serial,
-            [camera_name(photo.camera_maker, photo.camera_model) for photo in photos],
-            [photo.filename for photo in photos],
-        )
-        body = _written(replace(test, details=details), form)
+    photos = call.store.photos.page(call.owner, before=None, limit=MOST, lens_id=lens_id, state="counted")
+    details = provenance(
+        lens.serial,
+        [camera_name(photo.camera_maker, photo.camera_model) for photo in photos],
+        [photo.filename for photo in photos],
+    )
+    body = _written(replace(test, details=details), form)
     return Response(body, media_type=MEDIA_TYPES[form], headers=headers)
 
 
@@ -102,46 +83,3 @@ def _written(test: LensReport, form: Form) -> bytes:
     from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
 
     return to_pdf(pages(test))
-
-
-def _compared(
-    first: LensReport,
-    second: LensReport,
-    aperture: float | None,
-    second_aperture: float | None,
-    channel: Channel,
-    form: Form,
-) -> bytes:
-    first_curves, second_curves = (
-        first.at(aperture, channel),
-        second.at(second_aperture if second_aperture is not None else aperture, channel),
-    )
-    comparison = compare(
-        Side(_named(first, first_curves.settings.aperture, second), first_curves, first.facts),
-        Side(_named(second, second_curves.settings.aperture, first), second_curves, second.facts),
-    )
-    if form == "pdf":
-        from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
-
-        return to_pdf([comparison_page(comparison)])
-    if form == "json":
-        return json.dumps(_figures(comparison)).encode()
-    rows = ["zone,first_c_px,second_c_px,difference"]
-    rows += [f"{c.zone},{c.first:.6g},{c.second:.6g},{c.second - c.first:.6g}" for c in comparison.zones]
-    return ("\n".join(rows) + "\n").encode()
-
-
-def _named(test: LensReport, aperture: float | None, other: LensReport) -> str:
-    at = "" if aperture is None else f"f/{aperture:g}"
-    if test.name == other.name:
-        return at or test.name
-    return f"{test.name} {at}".strip()
-
-
-def _figures(comparison: Comparison) -> dict[str, Any]:
-    return {
-        "first": comparison.first.name,
-        "second": comparison.second.name,
-        "verdict": comparison.verdict,
-        "zones": to_json(comparison.zones),
-    }

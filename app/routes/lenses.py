@@ -13,7 +13,7 @@ from app.http import views
 from app.http.dependencies import CallDep, OneSession
 from app.other_lens import REMEDY, difference
 from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link
-from app.schemas import MAX_VERSION, CalibrationPage, Id, LateralOut, LensOut, LensPage, Name, Question
+from app.schemas import MAX_VERSION, CalibrationOut, Id, LateralOut, LensOut, Name, Page, Question
 from lensmodel.core.errors import NoSamplesError
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
@@ -22,13 +22,13 @@ router = APIRouter(tags=["lenses"], route_class=OneSession)
 @router.get("/lenses", operation_id="listLenses")
 def list_lenses(
     call: CallDep, limit: Limit = 50, cursor: Cursor = None, model: OnlyName = None, serial: OnlyName = None
-) -> LensPage:
+) -> Page[LensOut]:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
     page, following = cut(rows, limit)
     coverage = call.store.lenses.coverage_of(page)
     items = [views.lens_out(row, *coverage[row.id]) for row in page]
-    return LensPage(items=items, next=next_link(call, following))
+    return Page[LensOut](items=items, next=next_link(call, following))
 
 
 @router.get("/lenses/{lens_id}", operation_id="getLens")
@@ -98,13 +98,13 @@ def list_calibrations(
     call: CallDep,
     limit: Limit = 200,
     cursor: Annotated[int, Query(ge=0, le=MAX_VERSION, description="from `next` of the page before")] = 0,
-) -> CalibrationPage:
+) -> Page[CalibrationOut]:
     """Return the history of a lens, oldest first: one item for each version."""
     lens = find_lens(call, lens_id)
     rows = call.store.lenses.history(lens, after=cursor, limit=limit + 1)
     following = str(rows[limit - 1].version) if len(rows) > limit else None
     items = [views.calibration_out(row) for row in rows[:limit]]
-    return CalibrationPage(items=items, next=next_link(call, following))
+    return Page[CalibrationOut](items=items, next=next_link(call, following))
 
 
 @router.get("/lenses/{lens_id}/lateral-colour", operation_id="getLateralColour")

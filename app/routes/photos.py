@@ -21,10 +21,10 @@ from app.routes.common import Cursor, Limit, OnlyId, cut, find_lens, next_link, 
 from app.runtime.settings import MIB, Settings
 from app.schemas import (
     V1,
-    PatchPage,
+    Page,
+    PatchOut,
     PhotoChange,
     PhotoOut,
-    PhotoPage,
     PhotosChange,
     PhotoState,
     UploadFields,
@@ -269,11 +269,11 @@ def list_photos(
     cursor: Cursor = None,
     lens_id: OnlyId = None,
     state: PhotoState | None = None,
-) -> PhotoPage:
+) -> Page[PhotoOut]:
     """List photos, newest first."""
     rows = call.store.photos.page(call.owner, before=cursor, limit=limit + 1, lens_id=lens_id, state=state)
     page, following = cut(rows, limit)
-    return PhotoPage(items=[views.photo_out(row) for row in page], next=next_link(call, following))
+    return Page[PhotoOut](items=[views.photo_out(row) for row in page], next=next_link(call, following))
 
 
 @router.get("/photos/{photo_id}", operation_id="getPhoto")
@@ -283,10 +283,10 @@ def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
 
 
 @router.get("/photos/{photo_id}/patches", operation_id="listPatches")
-def list_patches(photo_id: str, call: CallDep) -> PatchPage:
+def list_patches(photo_id: str, call: CallDep) -> Page[PatchOut]:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
     photo = find_photo(call, photo_id)
-    return PatchPage(items=[views.patch_out(row) for row in call.store.photos.windows(photo.public_id)])
+    return Page[PatchOut](items=[views.patch_out(row) for row in call.store.photos.windows(photo.public_id)])
 
 
 @router.delete("/photos/{photo_id}", operation_id="deletePhoto", status_code=status.HTTP_204_NO_CONTENT)
@@ -345,7 +345,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
 
 
 @router.patch("/photos", operation_id="changePhotos")
-def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
+def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 
     Each photo changes as by itself; where one is gone nothing changes.
@@ -363,4 +363,4 @@ def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
     lens = change.lens_id if change.new_lens is None else NewCopy(change.new_lens.label)
     call.store.photos.change_several(keys, call.owner, given, lens)
     items = [described_photo(call, find_photo(call, key)) for key in keys]
-    return PhotoPage(items=items, next=None)
+    return Page[PhotoOut](items=items, next=None)

@@ -118,15 +118,8 @@ def _answer(lens_id: str, form: Format, call: Call) -> Response:
             f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
             "cover: upload photos that do, or ask without strict"
         )
-    question = QueryOut(
-        r=position.r,
-        phi=at.phi if -math.pi < at.phi <= math.pi else position.phi,
-        aperture=at.aperture,
-        channel=at.channel,
-        size=at.size,
-        focal_length_mm=at.focal_length_mm,
-        focus_distance_m=at.focus_distance_m,
-    )
+    phi = at.phi if -math.pi < at.phi <= math.pi else position.phi
+    question = QueryOut.model_validate(at.model_dump(include=set(QueryOut.model_fields)) | {"phi": phi})
     pitch = at.pixel_pitch_um or fitted.model.pitch_um
     described = psf_formats.describe(lens_id, fitted, question, answer, pitch)
     body, more = psf_formats.psf(form, answer.kernel, described)
@@ -164,11 +157,6 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
             f"{MAX_FIELD_PIXELS / 1e6:g} may be: ask for fewer or smaller kernels"
         )
     state = _known(call, lens_id)
-    left, top, wide, high = (float(share) for share in at.view.split(","))
-    if not (wide > 0 and high > 0 and left + wide <= 1.000001 and top + high <= 1.000001):
-        raise InvalidParameterError(
-            f"view {at.view} is no part of the picture: left, top, width, height in 0..1"
-        )
     fitted = call.models.get(lens_id, at.version, state=state)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
@@ -183,6 +171,5 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
         size=at.size,
         gamma=at.gamma,
         aspect=at.aspect,
-        view=(left, top, wide, high),
     )
     return Response(picture, media_type="image/png", headers={**headers, **more})

@@ -2,8 +2,6 @@
 
 import { acting, ask, byId, confirmed, send, withItsLens } from "./common.js";
 
-const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
-
 // Brightness as the square root of light, as the map has it: faint tails stay visible.
 function draw(canvas, rows) {
   const size = rows.length;
@@ -53,7 +51,6 @@ export function setUpField() {
   const aspect = Number(field.dataset.aspect);
   const [columns, rows] = gridFor(aspect, field.clientWidth);
   const dots = byId("coverage");
-  let view = { left: 0, top: 0, size: 1 }; // the part of the picture that is shown, in shares of it
   let [x, y] = [1 - 0.5 / columns, 0.5 / rows]; // the point, in shares of the picture
   let asked = 0;
   const settings = () => {
@@ -62,8 +59,7 @@ export function setUpField() {
     return chosen;
   };
   const showPoint = async () => {
-    spot.style.left = `${((x - view.left) / view.size) * 100}%`;
-    spot.style.top = `${((y - view.top) / view.size) * 100}%`;
+    [spot.style.left, spot.style.top] = [`${x * 100}%`, `${y * 100}%`];
     const [right, up] = [(2 * x - 1) * aspect, 1 - 2 * y];
     const r = Math.min(1, Math.hypot(right, up) / Math.hypot(aspect, 1));
     const query = settings();
@@ -104,48 +100,24 @@ export function setUpField() {
     const query = settings();
     query.set("grid", `${columns}x${rows}`);
     query.set("aspect", aspect.toFixed(4));
-    query.set("view", [view.left, view.top, view.size, view.size].map((share) => String(Number(share.toFixed(6)))).join(","));
     map.src = `${lens}/field.png?${query}`;
-    dots.setAttribute("viewBox", `${view.left} ${view.top} ${view.size} ${view.size}`);
     showPoint();
-  };
-  const zoom = (factor) => {
-    const size = Math.min(1, Math.max(LEAST_VIEW, view.size * factor));
-    const within = (at) => Math.min(1 - size, Math.max(0, at - size / 2));
-    view = { left: within(x), top: within(y), size };
-    showField();
-  };
-  const follow = () => {
-    const outside = x < view.left || x > view.left + view.size || y < view.top || y > view.top + view.size;
-    if (outside) zoom(1);
-    else showPoint();
   };
   for (const kind of ["load", "error"]) map.addEventListener(kind, () => field.classList.remove("loading"));
   map.addEventListener("load", () => (map.alt = "The blur of the lens over the picture"));
   field.addEventListener("click", (event) => {
     const box = field.getBoundingClientRect();
-    x = view.left + (view.size * (event.clientX - box.left)) / box.width;
-    y = view.top + (view.size * (event.clientY - box.top)) / box.height;
+    [x, y] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     showPoint();
   });
-  field.addEventListener("dblclick", () => zoom(0.5));
   field.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    const factor = { "+": 0.5, "=": 0.5, "-": 2 }[event.key];
-    if (!step && !factor) return;
+    if (!step) return;
     event.preventDefault();
-    if (factor) {
-      zoom(factor);
-      return;
-    }
-    x = Math.min(1, Math.max(0, x + (step[0] * view.size) / (2 * columns)));
-    y = Math.min(1, Math.max(0, y + (step[1] * view.size) / (2 * rows)));
-    follow();
+    x = Math.min(1, Math.max(0, x + step[0] / (2 * columns)));
+    y = Math.min(1, Math.max(0, y + step[1] / (2 * rows)));
+    showPoint();
   });
-  for (const button of controls.querySelectorAll("[data-zoom]")) {
-    button.disabled = false;
-    button.addEventListener("click", () => zoom(Number(button.dataset.zoom)));
-  }
   controls.addEventListener("change", showField);
   controls.addEventListener("submit", (event) => event.preventDefault());
   const seen = byId("show-coverage");

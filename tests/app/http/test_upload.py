@@ -123,6 +123,10 @@ def test_a_body_in_small_pieces_arrives_whole(client: TestClient, settings: Sett
             (form(('name="file"; filename="a"', TIFF), end=False), FORM),
             (400, "malformed_upload"),
             id="cut-off",
+            # Starlette leaves the file of a part that never ended to the collector
+            marks=pytest.mark.filterwarnings(
+                "ignore:.*SpooledTemporaryFile:pytest.PytestUnraisableExceptionWarning"
+            ),
         ),
         pytest.param(
             (form(('name="file"; filename="a"', b"")), FORM), (400, "malformed_upload"), id="empty-file"

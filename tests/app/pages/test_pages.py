@@ -377,9 +377,6 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     with page.expect_response(lambda answer: "aperture=5.6" in answer.url and "psf.json" in answer.url):
         page.locator("#field-controls [name=aperture]").select_option("5.6")
     assert page.locator("#field-controls [name=aperture] option").all_inner_texts() == ["f/2.8", "f/5.6"]
-    with page.expect_response(lambda answer: "view=" in answer.url and "0.5" in answer.url) as closer:
-        page.locator("#field-controls").get_by_role("button", name="Larger").click()
-    assert closer.value.ok
     with page.expect_response(
         lambda answer: "channel=b" in answer.url and "field.png" in answer.url
     ) as answered:

@@ -102,7 +102,6 @@ class Problem(Model):
     instance: str | None = None
     errors: list[FieldError] = []
     request_id: str | None = None
-    candidates: list[str] | None = Field(default=None, description="Lenses that the photo may belong to.")
 
 
 MeasurementKind = Literal["target", "pair", "points", "edges"]

@@ -1,4 +1,4 @@
-"""Small pictures that children make: of a photo before it is developed, and of its r-map afterwards."""
+"""Small pictures of photos that children make before these are developed."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import rawpy
 import tifffile
 from PIL import Image, ImageOps
 
-from lensmodel.patches import r_map
-from lensmodel.photo import LinearPhoto, upright
+from lensmodel.photo import upright
 
 # Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen
 THUMBNAIL_SIDE: Final = 480
-MAP_SIDE: Final = 1600  # longer side of the picture in pixels at most (chosen): fills a usual screen
 _EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}  # libRaw's `flip` as EXIF orientation
 _PLAIN: Final = frozenset({"jpeg", "png"})
 _ORIENTATION: Final = 0x0112  # EXIF 2.3, tag Orientation
@@ -68,20 +66,3 @@ def _small(image: Image.Image) -> bytes:
     out = io.BytesIO()
     shown.save(out, "JPEG", quality=82)
     return out.getvalue()
-
-
-def confidence_map(developed: LinearPhoto) -> bytes:
-    """Render the r-map of the green plane as a PNG: bright at informative edges."""
-    step = _step(developed)
-    values = r_map(np.ascontiguousarray(developed.planes[1][::step, ::step]))
-    scaled = (255 * np.clip(values / max(float(np.quantile(values, 0.99)), 1e-6), 0, 1)).astype(np.uint8)
-    heat = np.stack([scaled, scaled // 2, np.zeros_like(scaled)], axis=-1)
-    out = io.BytesIO()
-    turned = upright(heat, developed.encoding.orientation)
-    Image.fromarray(np.ascontiguousarray(turned)).save(out, "PNG", compress_level=3)
-    return out.getvalue()
-
-
-def _step(developed: LinearPhoto) -> int:
-    short, long = sorted((developed.frame.height, developed.frame.width))
-    return min(-(-long // MAP_SIDE), short // 2)  # at least two rows of a panorama

@@ -71,7 +71,7 @@ def status_of(error: library.LensModelError) -> int:
     return next((STATUS_OF_CODE[code] for code in codes if code in STATUS_OF_CODE), 500)
 
 
-def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ()) -> Problem:
+def problem_of(code: str, detail: str | None) -> Problem:
     """Return the error of a job as the problem of a response."""
     status = STATUS_OF_CODE.get(code, 500)
     return Problem(
@@ -80,7 +80,6 @@ def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ())
         status=status,
         detail=detail or "",
         code=code,
-        candidates=list(candidates) or None,
     )
 
 

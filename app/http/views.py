@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import datetime
 from typing import Final, TypeVar
 
@@ -37,7 +36,7 @@ def _of(model: type[M], row: Base, **more: object) -> M:
     return model.model_validate({**shared, **more})
 
 
-def photo_out(row: PhotoRow, candidates: Sequence[str] = ()) -> s.PhotoOut:
+def photo_out(row: PhotoRow) -> s.PhotoOut:
     """Describe a photo."""
     camera = " ".join(part for part in (row.camera_maker, row.camera_model) if part)
     return _of(
@@ -51,19 +50,18 @@ def photo_out(row: PhotoRow, candidates: Sequence[str] = ()) -> s.PhotoOut:
         kind=row.given.get("kind"),
         reference_id=row.given.get("reference_id"),
         patches={"total": row.patches_total, "done": row.patches_done, "rejected": row.patches_rejected},
-        error=_photo_problem(row, candidates),
+        error=_photo_problem(row),
         created_at=row.received_at,
     )
 
 
-def _photo_problem(row: PhotoRow, candidates: Sequence[str]) -> s.Problem | None:
+def _photo_problem(row: PhotoRow) -> s.Problem | None:
     if row.state == "needs_lens":
         return problem_of(
             "metadata_missing",
             row.error_detail
             or f"the photo does not say which copy of a lens took it ({row.lens_model or 'model unknown'}): "
             "choose a lens, give its serial with the model, or name a new one",
-            candidates=candidates,
         )
     if row.state == "cancelled":
         return problem_of("cancelled", "cancelled by its owner; send the photo again to start anew")
@@ -75,7 +73,7 @@ def patch_out(row: PatchRow) -> s.PatchOut:
     return _of(s.PatchOut, row, index=row.idx)
 
 
-def photo_job(row: PhotoRow, candidates: Sequence[str] = ()) -> s.JobOut:
+def photo_job(row: PhotoRow) -> s.JobOut:
     """Describe the work on a photo."""
     state = JOB_STATES[row.state]
     estimating = row.state == "estimating"
@@ -89,7 +87,7 @@ def photo_job(row: PhotoRow, candidates: Sequence[str] = ()) -> s.JobOut:
         progress={"done": row.patches_done, "total": row.patches_total, "unit": "patches"},
         eta_seconds=_eta(row.stage_at, row.patches_done, row.patches_total) if estimating else None,
         attempt=max(row.attempt, 1),
-        error=_photo_problem(row, candidates),
+        error=_photo_problem(row),
         created_at=row.received_at,
         links={
             "self": f"{V1}/jobs/{row.public_id}",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from app.blobs.storage import Storage
-from app.jobs.task_files import R_MAP, SHOWN
+from app.jobs.task_files import SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
@@ -204,9 +204,8 @@ class JobContext:
                 }
                 reads = [path, *siblings]
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=reads)
-                for name in (R_MAP, SHOWN):
-                    if (folder / name).is_file():
-                        self.storage.put_file(f"{photo.folder}{name}", folder / name)
+                if (folder / SHOWN).is_file():
+                    self.storage.put_file(f"{photo.folder}{SHOWN}", folder / SHOWN)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete, or absent
             return target

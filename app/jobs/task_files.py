@@ -12,7 +12,6 @@ PLACE: Final = "place"  # whether the file of a photo said where it was taken: n
 CLEANED: Final = "cleaned"  # the file of a photo without the place where it was taken
 REPORT: Final = "report.json"  # the report of a lens test
 # Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`
-R_MAP: Final = "r-map.png"
 # Small picture of a photo before it is developed, by `app.blobs.small_pictures`; stored ones too
 THUMBNAIL: Final = "glance.jpg"
 SHOWN: Final = "shown.tiles"  # the developed photo in full size, by `app.blobs.tiles`

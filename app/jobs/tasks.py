@@ -25,7 +25,7 @@ from app import distances
 from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
-from app.jobs.task_files import CLEANED, LAYER_FILES, PLACE, R_MAP, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
+from app.jobs.task_files import CLEANED, LAYER_FILES, PLACE, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
 from app.jobs.warming import warm
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import correction, photo
@@ -111,7 +111,6 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     siblings = [Path(name) for name in arguments.get("siblings", ())]
     developed = photo.develop(Path(arguments["path"]), limits=limits, siblings=siblings)
     sampling.save_developed(developed, folder)
-    (folder / R_MAP).write_bytes(small_pictures.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 

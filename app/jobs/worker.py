@@ -29,7 +29,7 @@ from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler
-from app.jobs.task_files import R_MAP, SHOWN, THUMBNAIL
+from app.jobs.task_files import SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.outage import Patience, is_outage
@@ -358,7 +358,7 @@ class Worker:
         for owner_key in self._store.accounts.to_erase():
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
-            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, R_MAP, SHOWN)))
+            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, SHOWN)))
         for photo_id in self._store.photos.read_profiles():
             self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))
         for photo in self._store.photos.unsearched():

@@ -52,7 +52,7 @@ def home(call: Call, _: str = "") -> Part:
 
 
 def _photo(call: Call, photo_id: str) -> Part:
-    photo = photo_routes.described_photo(call, photo_routes.find_photo(call, photo_id))
+    photo = photo_routes.read_photo(photo_id, call)
     return "_photo_state.html", {"photo": photo}, not words.active(photo)
 
 

@@ -46,11 +46,8 @@ def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
 def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
     row = photo_routes.find_photo(call, photo_id)
-    photo = photo_routes.described_photo(call, row)
-    patches = [views.patch_out(patch) for patch in call.store.photos.windows(photo_id)]
-    if row.height and row.width:
-        turned = row.orientation or 1
-        patches = [pictures.upright_patch(patch, row.height, row.width, turned) for patch in patches]
+    photo = views.photo_out(row)
+    patches = call.store.photos.windows(photo_id)
     left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
     candidates = []
     if photo.lens_id is None:
@@ -68,7 +65,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         photo=_upright(photo, row),
         can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
         gently=row.kind == "jpeg",
-        patches=patches,
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
@@ -125,7 +121,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     plan = correction_routes.find_correction(call, correction_id)
     correction = views.correction_out(plan)
     report = correction.report or {}
-    photo, row = photo_routes.described_photo(call, plan.photo), plan.photo
+    photo, row = views.photo_out(plan.photo), plan.photo
     can_look = correction.roi is None and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
     changed = not report.get("nothing_to_correct")
     can_look = can_look and changed

@@ -14,10 +14,10 @@ from app.blobs import tiles
 from app.blobs.storage import Storage
 from app.errors import InvalidParameterError, NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
-from app.jobs.task_files import LAYER_FILES, R_MAP, SHOWN, SIDES, THUMBNAIL
+from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.routes import corrections as correction_routes
 from app.routes import photos as photo_routes
-from app.schemas import PatchOut, Region
+from app.schemas import Region
 from app.store.tables import CorrectionRow
 
 Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
@@ -55,13 +55,6 @@ def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
     with suppress(NotReadyError):
         return _picture(tiles.whole(call.storage, f"{folder}{SHOWN}"))
     return Response(NOTHING, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
-
-
-@router.get("/ui/photos/{photo_id}/r-map.png")
-def photo_r_map(photo_id: str, call: CallDep) -> Response:
-    """Show where the edges of a photo tell about the blur."""
-    key = f"{photo_routes.find_photo(call, photo_id).folder}{R_MAP}"
-    return _picture(_stored(call, key), "image/png")
 
 
 def _tiles_of(call: CallDep, kind: Kind, subject: str, which: Which) -> str:
@@ -110,12 +103,6 @@ def correction_layer(
     if name in {"smooth", "clean"} and not row.params.get("layers"):
         raise InvalidParameterError(f"correction {correction_id} has no layers")
     return _picture(_stored(call, f"{row.run_folder}{LAYER_FILES[name]}"), "image/png")
-
-
-def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:
-    """Return a window in the coordinates of the upright picture."""
-    row, col = _turned(patch.row, patch.col, height - patch.size, width - patch.size, orientation)
-    return patch.model_copy(update={"row": row, "col": col})
 
 
 def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:

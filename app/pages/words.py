@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from app.pages.shown import WaitingGroup
-from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
+from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
 from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
@@ -178,14 +178,6 @@ def refusal(status: int, detail: str) -> tuple[str, str]:
 def reason_words(reason: str | None) -> str:
     """Say why a window was left out."""
     return REASONS.get(reason or "", reason or "no reason noted")
-
-
-def patch_words(patch: PatchOut) -> str:
-    """Describe one window of the overlay."""
-    place = f"{round(100 * patch.r)} % of the way to the corner"
-    if patch.state in {"rejected", "failed"}:
-        return f"Left out: {reason_words(patch.reason)} ({place})"
-    return f"Used ({place})" if patch.state == "done" else f"Still to be measured ({place})"
 
 
 def error_words(error: Mapping[str, float | None] | float | None) -> str:

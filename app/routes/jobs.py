@@ -16,7 +16,7 @@ from app.errors import ConflictError, UnknownError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, next_link
-from app.routes.photos import SEND_AGAIN, candidates
+from app.routes.photos import SEND_AGAIN
 from app.schemas import JobOut, Page
 
 router = APIRouter(tags=["jobs"], route_class=OneSession)
@@ -32,7 +32,7 @@ def find_job(call: Call, job_id: str) -> JobOut:
     """Return the job of a photo or of a correction."""
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None:
-        return views.photo_job(photo, candidates(call, photo))
+        return views.photo_job(photo)
     correction = call.store.jobs.correction(job_id, call.owner)
     if correction is None:
         raise UnknownError("job", job_id)

@@ -219,7 +219,7 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> 
         calibrate=fields.calibrate,
         given=given,
     )
-    return described_photo(call, received.photo), received.fresh
+    return views.photo_out(received.photo), received.fresh
 
 
 def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  # noqa: ANN401 - of `receive`
@@ -240,18 +240,6 @@ def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  
 
 def _folder(key: str) -> str:
     return f"{key.rpartition('/')[0]}/"
-
-
-def described_photo(call: Call, photo: PhotoRow) -> PhotoOut:
-    """Return a photo with its lens, or with the candidates."""
-    return views.photo_out(photo, candidates(call, photo))
-
-
-def candidates(call: Call, photo: PhotoRow) -> list[str]:
-    """Return the lenses that a waiting photo may belong to."""
-    if photo.state != "needs_lens" or photo.lens_id is not None:
-        return []
-    return [lens.public_id for lens in call.store.lenses.candidates(photo)]
 
 
 def find_photo(call: Call, photo_id: str) -> PhotoRow:
@@ -279,7 +267,7 @@ def list_photos(
 @router.get("/photos/{photo_id}", operation_id="getPhoto")
 def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
-    return described_photo(call, find_photo(call, photo_id))
+    return views.photo_out(find_photo(call, photo_id))
 
 
 @router.get("/photos/{photo_id}/patches", operation_id="listPatches")
@@ -325,7 +313,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
             "only counted ones can be excluded"
         )
-    return described_photo(call, photo)
+    return views.photo_out(photo)
 
 
 def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName | str | None:
@@ -362,5 +350,5 @@ def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
     lens = change.lens_id if change.new_lens is None else NewCopy(change.new_lens.label)
     call.store.photos.change_several(keys, call.owner, given, lens)
-    items = [described_photo(call, find_photo(call, key)) for key in keys]
+    items = [views.photo_out(find_photo(call, key)) for key in keys]
     return Page[PhotoOut](items=items, next=None)

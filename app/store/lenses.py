@@ -112,14 +112,6 @@ class Lenses(Repository):
         return set(session.scalars(query.distinct()))
 
     @reads
-    def candidates(self, session: Session, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
-        """Return the owner's lenses that a photo without a serial may belong to."""
-        query = select(LensRow).where(LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
-        if photo.lens_model:
-            query = query.where(func.lower(LensRow.model) == photo.lens_model.lower())
-        return list(session.scalars(query.order_by(LensRow.public_id.desc()).limit(limit)))
-
-    @reads
     def by_identity(self, session: Session, photo: PhotoRow) -> LensRow | None:
         """Return the lens that the serial of an inspected photo identifies, if it exists by now."""
         if photo.lens_serial is None:

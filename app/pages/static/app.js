@@ -5,7 +5,6 @@ import { setUpForms, setUpGroups } from "./forms.js";
 import { setUpCharts, setUpField, setUpLensActions } from "./lens.js";
 import { keepPlace, setUpLive } from "./live.js";
 import { setUpMeasure } from "./measure.js";
-import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
 import { setUpSignIn, setUpSignOut } from "./session.js";
 import { setUpUpload } from "./upload.js";
@@ -19,7 +18,6 @@ const parts = [
   setUpField,
   setUpCharts,
   setUpLensActions,
-  setUpPhoto,
   setUpMeasure,
   setUpSignIn,
   setUpSignOut,

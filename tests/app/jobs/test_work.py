@@ -27,7 +27,7 @@ from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Status
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import KERNELS, R_MAP, SAMPLES
+from app.jobs.task_files import KERNELS, SAMPLES, SHOWN
 from app.runtime.settings import Settings
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
@@ -354,14 +354,14 @@ def test_a_photo_focused_at_infinity_says_so_to_the_model(
 def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
     work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted
 ) -> None:
-    def with_a_map(arguments: dict[str, Any], folder: Path) -> Outcome:
-        (folder / R_MAP).write_bytes(b"a small picture")
+    def with_a_picture(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / SHOWN).write_bytes(b"a small picture")
         return develop(arguments, folder)
 
-    sandbox.answers["develop"] = [with_a_map]
+    sandbox.answers["develop"] = [with_a_picture]
     work.photo(photo.public_id, 1)
 
-    assert context.storage.get(f"photos/{photo.public_id}/{R_MAP}") == b"a small picture"
+    assert context.storage.get(f"photos/{photo.public_id}/{SHOWN}") == b"a small picture"
 
 
 def test_running_a_finished_photo_again_changes_nothing(

@@ -22,7 +22,7 @@ from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
 from app.jobs.inspection import body_key
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import R_MAP, SHOWN, SIDES, THUMBNAIL
+from app.jobs.task_files import SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.batch import unused_name
 from app.pages.pictures import in_sensor, upright_point
@@ -47,7 +47,7 @@ def opened(client: TestClient, path: str) -> Image.Image:
     return Image.open(io.BytesIO(answer.content))
 
 
-def test_a_preview_and_an_r_map_come_from_the_blobs_upright(
+def test_a_developed_photo_comes_from_the_blobs_upright(
     client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
 ) -> None:
     scene = np.random.default_rng(1).integers(0, 255, (90, 120, 3), dtype=np.uint8)
@@ -56,11 +56,9 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright(
     Image.fromarray(scene).save(tmp_path / "p.jpg", exif=exif, quality=95)
     tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
     photo = steps.counted()
-    for name in (SHOWN, R_MAP):
-        Storage(settings.storage).put_file(f"{photo.folder}{name}", tmp_path / name)
+    Storage(settings.storage).put_file(f"{photo.folder}{SHOWN}", tmp_path / SHOWN)
 
-    for name in ("tiles/before/whole.jpg", R_MAP):
-        assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
+    assert opened(client, f"/ui/photos/{photo.public_id}/tiles/before/whole.jpg").size == (90, 120)
 
 
 def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
@@ -68,7 +66,7 @@ def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
 
     tasks.develop({"path": str(tmp_path / "p.png"), "max_megapixels": 1.0}, tmp_path, ignore_step)
 
-    assert {SHOWN, R_MAP} <= {path.name for path in tmp_path.iterdir()}
+    assert (tmp_path / SHOWN).is_file()
 
 
 def a_picture() -> NDArray[np.uint8]:

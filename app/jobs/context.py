@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from app.blobs.storage import Storage
 from app.jobs.task_files import SHOWN
@@ -37,6 +37,9 @@ CRASHES: Final = 3
 BACKOFF_S: Final = 0.5
 # Address space in MiB of a task besides its picture (chosen): what libraries reserve, and room to spare
 SPARE_MB: Final = 768
+COMPUTING: Final = frozenset(
+    {"estimate", "correct", "measure", "measure-lens", "profile"}
+)  # by compiled loops
 SIBLINGS: Final = 7  # photos that tell of the defects of a sensor (chosen): more tell hardly more
 # Size of the cache at most (chosen: some seventy photos of 24 megapixels as planes of float32), or half of
 # the free disk if that is less
@@ -63,7 +66,7 @@ class JobContext:
     store: Store
     storage: Storage
     sandbox: Sandbox
-    warmed: threading.Event = field(default_factory=threading.Event)  # whether loops are compiled for all
+    warmed: threading.Event = field(default_factory=threading.Event)  # whether loops are compiled
     _locks: defaultdict[str, threading.Lock] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -79,15 +82,13 @@ class JobContext:
         limits: TaskLimits,
         wanted: Callable[[], bool],
         reads: Sequence[Path] = (),
-        compiles_for: int | None = None,
         on_progress: ProgressHook = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task, with retries where they can help; return its result."""
         # After a death by signal the task is retried after a pause, after too little memory once with twice
         # as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
-        # `JobFailedError`, or `OutageError` where the machine lacks disk space or memory. `compiles_for` is
-        # the owner whose compiled code it may use and add to.
-        if compiles_for is not None:
+        # `JobFailedError`, or `OutageError` where the machine lacks disk space or memory.
+        if task in COMPUTING:
             self.warmed.wait()  # else it would compile the same at the same time
         wanted = _patient(wanted)
         crashes = 0
@@ -99,7 +100,6 @@ class JobContext:
                 folder=folder,
                 limits=limits,
                 reads=reads,
-                compiles=None if compiles_for is None else str(compiles_for),
                 wanted=wanted,
                 on_progress=on_progress,
             )
@@ -107,7 +107,7 @@ class JobContext:
             if outcome.ending == "ok":
                 return outcome.value
             if outcome.ending == "cancelled":
-                self._give_way()
+                raise NotWantedError
             if outcome.ending == "outage":
                 raise OutageError(f"task {task}: {outcome.detail}")
             doubled_mb = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
@@ -127,16 +127,8 @@ class JobContext:
         end = time.monotonic() + BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5)  # noqa: S311
         while time.monotonic() < end:
             if not wanted():
-                self._give_way()
+                raise NotWantedError
             time.sleep(0.05)
-
-    def _give_way(self) -> NoReturn:
-        """Leave a job: for good if it was cancelled, else until another worker takes it over."""
-        # While this process shuts down the job must not look finished to the engine, so its thread waits here
-        # until the process ends
-        while self.sandbox.stopping:
-            time.sleep(1.0)
-        raise NotWantedError
 
     def limits(self, photo: PhotoRow, seconds: float, bytes_per_pixel: int) -> TaskLimits:
         """Return limits that grow with the photo; 12 bytes a pixel are the mapped planes alone."""

@@ -104,7 +104,6 @@ class CorrectionWork:
                 limits=limits,
                 wanted=wanted,
                 reads=[developed],
-                compiles_for=photo.owner_id,
                 on_progress=self._progress_of(run),
             )
             done = checked(Corrected, done)
@@ -175,7 +174,6 @@ class CorrectionWork:
                     folder=folder,
                     limits=limits,
                     wanted=wanted,
-                    compiles_for=lens.owner_id,
                 )
                 metrics = checked(Measured, metrics)
                 if (folder / REPORT).is_file():

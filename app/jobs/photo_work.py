@@ -126,7 +126,6 @@ class PhotoWork:
                 limits=limits,
                 wanted=wanted,
                 reads=[developed],
-                compiles_for=photo.owner_id,
             )
             places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
             return _checked(listed, folder, places)
@@ -459,7 +458,6 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
                 limits=limits,
                 wanted=wanted,
                 reads=[path],
-                compiles_for=file.owner_id,
             )
         except JobFailedError as error:
             if error.code != "invalid_parameter":

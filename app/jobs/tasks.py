@@ -26,7 +26,6 @@ from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import CLEANED, LAYER_FILES, PLACE, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
-from app.jobs.warming import warm
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import correction, photo
 from lensmodel import measured as lens_measure
@@ -306,7 +305,6 @@ TASKS: Final[Mapping[str, Task]] = {
     "measure": measure,
     "measure-lens": measure_lens,
     "profile": profile,
-    "warm": warm,
 }
 
 for _registry in (estimators, selectors, correction.deconvolvers):

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import math
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Final
 
 from structlog.contextvars import bound_contextvars
@@ -24,7 +25,7 @@ from structlog.contextvars import bound_contextvars
 import lensmodel
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
-from app.jobs.context import SPARE_MB, JobContext, JobFailedError, drop_developed
+from app.jobs.context import JobContext, JobFailedError, drop_developed
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
@@ -33,20 +34,23 @@ from app.jobs.task_files import SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.outage import Patience, is_outage
-from app.runtime.processes import end_with_parent, is_running, on_signals, started_at
+from app.runtime.processes import PARENT, end_with_parent, is_running, started_at
 from app.runtime.settings import Settings
 from app.sandbox import account, confine
-from app.sandbox.outcome import TaskLimits
-from app.sandbox.runner import COMMON, Budget, Sandbox
+from app.sandbox.child import clean_environment
+from app.sandbox.runner import Budget, Sandbox
 from app.store import Store
 from app.store.database import new_id
 from app.store.jobs import Job, Kind
 from app.store.owners import ANY_OWNER
+from lensmodel.cli import ending
+from lensmodel.cli.ending import InterruptedByUser
 
 log = logging.getLogger(__name__)
 
 # Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)
 EXIT_FENCED: Final = 70
+WARMING = "app.jobs.warming"  # module that compiles what tasks need; tests replace it
 # seconds between two rounds of a duty, all chosen
 SWEEP_S: Final = 0.1  # of the tables for new work, which people wait for: a read of two indexes
 RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
@@ -67,7 +71,7 @@ def ending_of(error: BaseException) -> JobFailedError:
     return JobFailedError(OUTAGE, text)
 
 
-_SUBJECT: Final = {
+_SUBJECT: Final[Mapping[Kind, str]] = {
     "photo": "photo_id",
     "cell": "photo_id",
     "correction": "correction_id",
@@ -75,34 +79,53 @@ _SUBJECT: Final = {
 }
 
 
-@dataclass
-class JobRecord:
-    """Kind and ending of one job."""
+def durable(kind: Kind, handler: Handler, give_up: Callable[[Job, JobFailedError], None]) -> Handler:
+    """Wrap a job: failures are retried, and after the last one it is given up with a reason."""
 
-    kind: str
-    ending: str = "done"
+    def run(*arguments: str | int) -> None:
+        job, began, how = Job(kind, arguments), monotonic(), "done"
+        with bound_contextvars(job_id=job.id, **{_SUBJECT[kind]: str(arguments[0])}):
+            reason = _tried(handler, job)
+            if reason is not None:
+                how = reason.code
+                _insist(lambda: give_up(job, reason))
+        metrics.JOB_SECONDS.labels(kind, how).observe(monotonic() - began)
 
-    def retries(self, error: BaseException) -> None:
-        """Count a retry of the job after an error."""
-        metrics.RETRIES.labels(self.kind, "outage" if is_outage(error) else "unforeseen").inc()
+    return run
 
 
-@contextmanager
-def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[JobRecord]:
-    """Provide the record of a job; inside, each log line carries the ids of the job and its subject."""
-    record = JobRecord(kind)
-    ids = {"job_id": "/".join([kind, *map(str, arguments)])}
-    if kind in _SUBJECT:
-        ids[_SUBJECT[kind]] = str(arguments[0])
-    began = time.monotonic()
-    with bound_contextvars(**ids):
+def _tried(handler: Handler, job: Job) -> JobFailedError | None:
+    """Do a job, if need be several times; return why it is given up."""
+    patience = Patience(OUTAGE_S)
+    while True:
         try:
-            yield record
-        except BaseException:
-            record.ending = "raised"
-            raise
-        finally:
-            metrics.JOB_SECONDS.labels(kind, record.ending).observe(time.monotonic() - began)
+            handler(*job.arguments)
+        except Exception as error:
+            outage = is_outage(error)
+            log.warning("%s: %s", type(error).__name__, error, exc_info=None if outage else error)
+            pause = patience.pause_after(error)
+            if pause is None:
+                return ending_of(error)
+            metrics.RETRIES.labels(job.kind, "outage" if outage else "unforeseen").inc()
+            sleep(pause)
+        else:
+            return None
+
+
+def _insist(call: Callable[[], object]) -> None:
+    """Do something that needs the database, and wait for the database as long as it takes."""
+    patience = Patience(math.inf)
+    while True:
+        try:
+            call()
+        except Exception as error:
+            pause = patience.pause_after(error)
+            if pause is None or not is_outage(error):
+                raise
+            log.warning("waiting %.0f s: %s", pause, error)
+            sleep(pause)
+        else:
+            return
 
 
 class Worker:
@@ -131,8 +154,7 @@ class Worker:
             self._sandbox,
         )
         self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
-        self._stop = threading.Event()
-        self._last_beat = time.monotonic()
+        self._last_beat = monotonic()
         self._files = {path: _identity(path) for path in self._database_files()}
 
     def _task_account(self, data: Path) -> account.SystemAccount | None:
@@ -148,20 +170,30 @@ class Worker:
         return task_account
 
     def run(self) -> None:
-        """Work until `stop` is called."""
+        """Work until the process is told to end."""
+        try:
+            self._begin()
+            threading.Event().wait()
+        except InterruptedByUser:
+            shutil.rmtree(self._scratch / self.id, ignore_errors=True)
+            self._do(lambda: self._store.jobs.bury(self.id))
+            logging.shutdown()
+            os._exit(0)  # threads in the middle of a job must not go on to report it finished
+
+    def _begin(self) -> None:
         log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
         host = socket.gethostname()
         began = started_at(os.getpid())
-        self._insist(
+        _insist(
             lambda: self._store.jobs.register(
                 self.id, host=host, pid=os.getpid(), pid_started=began, confined=self._confined
             )
         )
-        self._last_beat = time.monotonic()
+        self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
-        lease = self._start_thread(beat_s, self._keep_lease)
-        self._insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
+        self._start_thread(beat_s, self._keep_lease)
+        _insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
         photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
         handlers: dict[Kind, Handler] = {
             "photo": photos.photo,
@@ -171,42 +203,23 @@ class Worker:
         }
         self._context.warmed.clear()
         threading.Thread(target=self._do, args=(self._warm,), daemon=True).start()
-        self._engine.start({kind: self._safe(handler, kind) for kind, handler in handlers.items()})
+        self._engine.start({kind: durable(kind, handler, self._end) for kind, handler in handlers.items()})
         self._take_over_gone(host)
         self._start_thread(SWEEP_S, self._sweep)
         self._start_thread(beat_s, self._take_over_silent)
         self._start_thread(RECONCILE_S, self._reconcile, first_s=RECONCILE_S)
         self._start_thread(TIDY_S, self._tidy)
-        self._stop.wait()
-        lease.join(beat_s)  # or it would see our row dead and conclude that others had taken over
-        self._leave()
 
-    def _start_thread(
-        self, period_s: float, duty: Callable[[], None], *, first_s: float = 0.0
-    ) -> threading.Thread:
+    def _start_thread(self, period_s: float, duty: Callable[[], None], *, first_s: float = 0.0) -> None:
         """Do a duty again and again, so that none delays another."""
 
         def repeat() -> None:
-            self._stop.wait(first_s)
-            while not self._stop.is_set():
+            sleep(first_s)
+            while True:
                 self._do(duty)
-                self._stop.wait(period_s)
+                sleep(period_s)
 
-        thread = threading.Thread(target=repeat, daemon=True)
-        thread.start()
-        return thread
-
-    def stop(self) -> None:
-        """Stop soon: running jobs are left to the next worker."""
-        self._sandbox.stop()
-        self._stop.set()
-
-    def _leave(self) -> None:
-        self._sandbox.stop()
-        self._do(lambda: self._store.jobs.bury(self.id))
-        shutil.rmtree(self._scratch / self.id, ignore_errors=True)
-        logging.shutdown()
-        os._exit(0)  # threads in the middle of a job must not go on to report it finished
+        threading.Thread(target=repeat, daemon=True).start()
 
     def _do(self, duty: Callable[[], object]) -> None:
         try:
@@ -215,64 +228,6 @@ class Worker:
             log.exception("a duty of the worker failed; it is tried again")
 
     # --- jobs ---------------------------------------------------------------------------------
-
-    def _insist(self, call: Callable[[], object]) -> None:
-        """Do something that needs the database, and wait for the database as long as it takes."""
-        patience = Patience(math.inf)
-        while not self._stop.is_set():
-            try:
-                call()
-            except Exception as error:
-                pause = patience.pause_after(error)
-                if pause is None or not is_outage(error):
-                    raise
-                log.warning("waiting %.0f s: %s", pause, error)
-                self._stop.wait(pause)
-            else:
-                return
-
-    def _hold_while_stopping(self) -> None:
-        """Keep the thread of a job until the process ends: returning would report the job as done."""
-        while self._stop.is_set():
-            time.sleep(1.0)
-
-    def _safe(self, handler: Handler, kind: Kind) -> Handler:
-        """Wrap a job: failures are retried, and the last one ends the job with a reason."""
-
-        def run(*arguments: str | int) -> None:
-            with accounted(kind, arguments) as record:
-                work(record, *arguments)
-
-        def work(record: JobRecord, *arguments: str | int) -> None:
-            patience = Patience(OUTAGE_S)
-            while True:
-                try:
-                    handler(*arguments)
-                except Exception as error:
-                    self._hold_while_stopping()
-                    pause = patience.pause_after(error)
-                    name = f"{kind}{arguments}"
-                    if is_outage(error):
-                        log.warning("job %s: %s: %s", name, type(error).__name__, error)
-                    else:
-                        log.exception("job %s", name)
-                    if pause is None:
-                        ending = ending_of(error)
-                        record.ending = ending.code
-                        break
-                    record.retries(error)
-                    self._rest(pause)
-                else:
-                    return
-            self._insist(lambda: self._end(Job(kind, arguments), ending))
-            self._hold_while_stopping()
-
-        return run
-
-    def _rest(self, seconds: float) -> None:
-        """Wait before the next try."""
-        self._stop.wait(seconds)
-        self._hold_while_stopping()
 
     def _end(self, job: Job, ending: JobFailedError) -> None:
         """End the work of a job with a reason; changes nothing where that has ended meanwhile."""
@@ -304,13 +259,13 @@ class Worker:
         try:
             alive = self._store.jobs.beat(self.id)
         except Exception as error:
-            late = time.monotonic() - self._last_beat > self._settings.lease_seconds
+            late = monotonic() - self._last_beat > self._settings.lease_seconds
             if late and is_outage(error):
                 self._die("the database did not answer for a whole lease")
             raise
         if not alive:
             self._die("this worker was silent for too long and others took over its work")
-        self._last_beat = time.monotonic()
+        self._last_beat = monotonic()
 
     def _take_over_silent(self) -> None:
         """Take over from workers whose lease has expired."""
@@ -374,18 +329,19 @@ class Worker:
         drop_developed(developed, self._context.store.photos.existing, self._settings.task_seconds)
 
     def _warm(self) -> None:
-        """Compile the inner loops for all owners, unless that was done for this program."""
+        """Compile the inner loops for all tasks, unless that was done for this program."""
         try:
             cache = self._sandbox.cache
-            if cache is None or (done := cache / COMMON / f"warm-{fingerprint()}").exists():
+            if cache is None or (done := cache / f"warm-{fingerprint()}").exists():
                 return
-            limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=self._settings.task_seconds)
-            with self._sandbox.folder() as folder:
-                outcome = self._sandbox.run("warm", {}, folder=folder, limits=limits, compiles=COMMON)
-            if outcome.ending == "ok":
-                done.touch()
-            else:
-                log.warning("the inner loops were not compiled: %s", outcome.detail)
+            own = {"NUMBA_CACHE_DIR": str(cache), PARENT: str(os.getpid())}
+            subprocess.run(  # noqa: S603 - our own interpreter, our own module
+                [sys.executable, "-m", WARMING],
+                env=clean_environment() | own,
+                check=True,
+                timeout=self._settings.task_seconds,
+            )
+            done.touch()
         finally:
             self._context.warmed.set()
 
@@ -431,6 +387,6 @@ def main() -> None:
     confine.keep_private()
     if settings.metrics_address:
         metrics.publish(settings.metrics_address)
-    worker = Worker(settings)
-    on_signals(lambda _: worker.stop())
-    worker.run()
+    ending.install()
+    with contextlib.suppress(InterruptedByUser):
+        Worker(settings).run()

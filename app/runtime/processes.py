@@ -1,19 +1,13 @@
-"""Processes: identified by id and start time, ended with their parent, stopped by signals."""
+"""Processes: identified by id and start time, ended with their parent."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import signal
 import sys
-import threading
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Final
-
-STOPPING: Final = (signal.SIGTERM, signal.SIGINT)
 
 PARENT: Final = "LENSMODEL_PARENT"  # environment variable with the process id of the supervisor
 _PR_SET_PDEATHSIG: Final = 1  # of linux/prctl.h
@@ -48,25 +42,3 @@ def end_with_parent() -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != int(parent):
         sys.exit("the supervisor has ended already")
-
-
-def on_signals(stop: Callable[[signal.Signals], None], numbers: Sequence[int] = STOPPING) -> None:
-    """Call `stop` in a thread of its own each time that one of the signals comes."""
-    # A handler runs between two instructions of the main thread. If it set the very event that this thread is
-    # waiting for, or wrote to the log that this thread is writing to, it could wait for a lock that its own
-    # thread holds, for ever. So it writes one byte, which takes no lock.
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        del frame
-        with contextlib.suppress(BlockingIOError):  # the pipe is full of signals already
-            os.write(writing, bytes([number]))
-
-    def listen() -> None:
-        while number := os.read(reading, 1):
-            stop(signal.Signals(number[0]))
-
-    threading.Thread(target=listen, name="signals", daemon=True).start()
-    for number in numbers:
-        signal.signal(number, handle)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
-from collections.abc import Iterator
 from typing import Final
 
 import uvicorn
 
 from app.runtime import logs
-from app.runtime.processes import end_with_parent, on_signals
+from app.runtime.processes import end_with_parent
 from app.runtime.settings import Settings
 from app.sandbox import confine
 
@@ -36,41 +34,15 @@ def run(settings: Settings, listener: socket.socket) -> None:
         timeout_graceful_shutdown=GRACE_S,
         limit_concurrency=MAX_CONNECTIONS,
     )
-    _Server(config).run(sockets=[listener])
-
-
-class _Server(uvicorn.Server):
-    """Exits with status 0 on a signal: uvicorn would raise the signal again afterwards."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Let signals of the process stop the server, and the streams that are open."""
-        on_signals(lambda number: self.handle_exit(number, None))
-        yield
+    uvicorn.Server(config).run(sockets=[listener])
 
 
 def listen(host: str, port: int) -> socket.socket:
     """Open a listening socket; port 0 takes a free one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(2048)
-    except OSError:
-        listener.close()
-        raise
-    return listener
-
-
-def main() -> None:
-    """Serve on the socket that the environment names."""
-    end_with_parent()
-    settings = Settings()
-    number = os.environ.pop(SOCKET, None)
-    listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))
-    run(settings, listener)
+    return socket.create_server((host, port), family=family, backlog=2048)
 
 
 if __name__ == "__main__":
-    main()
+    end_with_parent()
+    run(Settings(), socket.socket(fileno=int(os.environ.pop(SOCKET))))

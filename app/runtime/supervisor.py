@@ -8,40 +8,34 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import http.client
 import json
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from app.runtime import server
-from app.runtime.processes import PARENT, on_signals
+from app.runtime.processes import PARENT
 from app.runtime.settings import PREFIX, Settings
 from app.sandbox import confine
 from app.store import migrate
 from app.store.accounts import Accounts
 from app.store.database import Database
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.ending import InterruptedByUser, UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-POLL_S: Final = 0.1  # seconds between two looks at the members (chosen): two calls of waitpid
-# Seconds between two requests of `/readyz` during the start (chosen): few beside a start of some seconds
-READY_POLL_S: Final = 0.25
-# How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`
-STOP_S: Final = 15.0
+# How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`, and less
+# than a command that was interrupted may take (`lensmodel.cli.ending`)
+STOP_S: Final = 8.0
 # Modules of the members; tests replace the worker
 WORKER, API = "app.runtime.worker_main", "app.runtime.server"
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -54,14 +48,14 @@ def serve(settings: Settings) -> int:
     require_sandbox(settings)
     with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
         _prepare(settings)
-        return _Supervisor(settings, listener).run()
+        return _run(settings, listener)
 
 
 def run_api(settings: Settings) -> None:
     """Run one API process in this process."""
     confine.keep_private()
     _prepare(settings)
-    with contextlib.closing(_listener(settings)) as listener:
+    with contextlib.closing(_listener(settings)) as listener, contextlib.suppress(InterruptedByUser):
         server.run(settings, listener)
 
 
@@ -154,79 +148,43 @@ def alone(data_dir: Path) -> Iterator[None]:
         yield
 
 
-@dataclass
-class _Supervisor:
-    """Starts the members, waits, and stops them."""
-
-    settings: Settings
-    listener: socket.socket
-    _stopping: threading.Event = field(default_factory=threading.Event)
-
-    def run(self) -> int:
-        """Run until stopped, or until one of the members ends; return the exit status."""
-        on_signals(self._on_signal)
-        members = {name: self._start(module) for name, module in (("worker", WORKER), ("api", API))}
-        self._write(members)
-        threading.Thread(target=self._announce, daemon=True).start()
-        try:
-            while not self._stopping.wait(POLL_S):
-                for name, process in members.items():
-                    status = process.poll()
-                    if status is not None:
-                        log.error(
-                            "the %s process ended with status %d, and with it the service", name, status
-                        )
-                        return 1
-        finally:
-            self._stopping.set()
-            _end(list(members.values()))
-            self._file.unlink(missing_ok=True)
-        return 0
-
-    def _on_signal(self, number: signal.Signals) -> None:
-        log.info("%s: stopping", number.name)
-        self._stopping.set()
-
-    @property
-    def _file(self) -> Path:
-        return self.settings.data_dir / "service.json"
-
-    @property
-    def url(self) -> str:
-        """Where the service listens."""
-        host, port = self.listener.getsockname()[:2]
-        return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-
-    def _start(self, module: str) -> subprocess.Popen[bytes]:
-        inherited = {server.SOCKET: str(self.listener.fileno()), PARENT: str(os.getpid())}
-        return subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
-            [sys.executable, "-m", module],
-            env=os.environ | environment(self.settings) | ONE_THREAD | inherited,
-            pass_fds=(self.listener.fileno(),),
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which stops them
-        )
-
-    def _write(self, members: Mapping[str, subprocess.Popen[bytes]]) -> None:
-        """Write the address of the service and the ids of its processes to a file."""
+def _run(settings: Settings, listener: socket.socket) -> int:
+    """Run both processes until one of them ends, or the service is told to stop; return the exit status."""
+    members: dict[str, subprocess.Popen[bytes]] = {}
+    file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
+    host, port = listener.getsockname()[:2]
+    url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    try:
+        for name, module in (("worker", WORKER), ("api", API)):
+            members[name] = _start(settings, listener, module)
         pids = {f"{name}_pid": process.pid for name, process in members.items()}
-        text = json.dumps({"url": self.url, "pid": os.getpid(), **pids}, indent=2)
-        write_atomically(self._file, (text + "\n").encode())
+        text = json.dumps({"url": url, "pid": os.getpid(), **pids}, indent=2)
+        write_atomically(file, (text + "\n").encode())
+        # it answers once the API is up: connections wait in the socket until then
+        print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+        for name, process in members.items():
+            if process.poll() is not None:
+                log.error(
+                    "the %s process ended with status %d, and with it the service", name, process.poll()
+                )
+    except InterruptedByUser:
+        return 0
+    finally:
+        _end(list(members.values()))
+        file.unlink(missing_ok=True)
+    return 1
 
-    def _announce(self) -> None:
-        """Print the address once the service can be used."""
-        host, port = self.listener.getsockname()[:2]
-        while not self._stopping.is_set():
-            with contextlib.suppress(OSError, http.client.HTTPException):
-                connection = http.client.HTTPConnection(host, port, timeout=5)
-                with contextlib.closing(connection):
-                    connection.request("GET", "/readyz")
-                    if connection.getresponse().status == http.client.OK:
-                        break
-            self._stopping.wait(READY_POLL_S)
-        else:
-            return
-        print(f"lensmodel is ready: {self.url}  (data in {self.settings.data_dir.resolve()})", flush=True)  # noqa: T201
+
+def _start(settings: Settings, listener: socket.socket, module: str) -> subprocess.Popen[bytes]:
+    inherited = {server.SOCKET: str(listener.fileno()), PARENT: str(os.getpid())}
+    return subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
+        [sys.executable, "-m", module],
+        env=os.environ | environment(settings) | ONE_THREAD | inherited,
+        pass_fds=(listener.fileno(),),
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which stops them
+    )
 
 
 def _end(members: list[subprocess.Popen[bytes]]) -> None:

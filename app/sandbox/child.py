@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from app.sandbox import confine
 from app.sandbox.account import SystemAccount
@@ -32,7 +32,6 @@ ProgressHook: TypeAlias = Callable[[int, int], None]
 # Called as `task(arguments, folder, progress)`; returns what JSON can write
 Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
 RESULT: Final = "result.json"
-COMPILED: Final = "compiled"  # folder in that of a task with what it has compiled, as Numba keeps it
 # Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes
 MAX_TEXT: Final = 4000
 _MIB: Final = 1024 * 1024  # bytes
@@ -52,15 +51,14 @@ _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREAD
 def main(order: dict[str, Any], line: Connection, said: Connection) -> None:
     """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions."""
     # `reads` are files and folders that it may read; None leaves the file system, the network and other
-    # programs open to it. `cache` is one of them with compiled code, `account` the uid and gid that it
-    # changes to, if any. What it prints goes to `said`.
+    # programs open to it. `account` is the uid and gid that it changes to, if any. What it prints goes to
+    # `said`.
     for stream in (1, 2):
         os.dup2(said.fileno(), stream)
     said.close()
     folder = Path(order["folder"])
     tasks = importlib.import_module(order["module"])  # our own code, not readable after this
-    if order["cache"]:
-        _keep_compiled(order["cache"], folder / COMPILED)
+    _save_nothing_compiled()
     _write_in_place()
     contain(folder, order["limits"], order["niceness"])
     if order["reads"] is not None:
@@ -112,43 +110,13 @@ def _write_in_place() -> None:
     vars(files)["replacing"] = in_place
 
 
-def _keep_compiled(kept: str, own: Path) -> None:
-    """Let Numba load compiled code from a folder of the owner, and save its own to that of the task."""
-    # The worker adds that to the owner's: a task that could replace files there could hide what it writes,
-    # and code that one owner's photo could write must not run beside the photos of another
-    try:
+def _save_nothing_compiled() -> None:
+    """Let Numba load compiled code and save none: a task writes to nothing but its own folder."""
+    with contextlib.suppress(ImportError):
         caching = importlib.import_module("numba.core.caching")
-        dispatcher = importlib.import_module("numba.core.dispatcher")
-    except ImportError:
-        return
-    file = caching.IndexDataCacheFile
-    load_index = file._load_index  # noqa: SLF001 - Numba has no public way, as below
-
-    def moved(path: str) -> Path:
-        return own / Path(path).parent.name / Path(path).name
-
-    @contextlib.contextmanager
-    def open_for_write(_: object, path: str) -> Iterator[BinaryIO]:
-        moved(path).parent.mkdir(parents=True, exist_ok=True)
-        with moved(path).open("wb") as out:
-            yield out
-
-    def load_own_index(self: Any) -> Any:  # noqa: ANN401 - of Numba
-        path = self._index_path
-        self._index_path = str(moved(path)) if moved(path).is_file() else path
-        try:
-            return load_index(self)
-        finally:
-            self._index_path = path
-
-    file._open_for_write, file._load_index = open_for_write, load_own_index  # noqa: SLF001
-    caching._CacheLocator.ensure_cache_path = lambda _: None  # noqa: SLF001 - it tries to write
-    vars(importlib.import_module("numba.core.config"))["CACHE_DIR"] = kept
-    for name, module in list(sys.modules.items()):
-        if not name.startswith(("numba", "numpy", "scipy")):
-            for value in list(vars(module).values()) if module is not None else ():
-                if isinstance(value, dispatcher.Dispatcher):
-                    value.enable_caching()
+        # Numba has no public way: the one tries to write, the other writes
+        caching._CacheLocator.ensure_cache_path = lambda _: None  # noqa: SLF001
+        caching.FunctionCache.save_overload = lambda *_: None
 
 
 def _confine(folder: Path, order: dict[str, Any]) -> None:

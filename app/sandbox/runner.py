@@ -34,13 +34,11 @@ from typing import Any, Final
 from app.sandbox import child
 from app.sandbox.account import SystemAccount
 from app.sandbox.outcome import Outcome, TaskLimits, ended, outcome_of
-from lensmodel.core.files import replacing
 from lensmodel.core.types import ignore_step
 
 # Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not
 MAX_MESSAGE: Final = 64 * 1024
 MAX_NUMBER: Final = 2**31 - 1
-COMMON: Final = "common"  # whose compiled code all owners begin with: that of tasks which read no photo
 
 TASKS_MODULE = "app.jobs.tasks"  # default module of the tasks; tests of the workers replace it
 # Bytes of the standard error of a task that are logged at most (chosen): an honest one says a few lines
@@ -154,15 +152,12 @@ class Sandbox:
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
         self._alone = threading.Lock()  # the exit status of a child can be read only once
-        self._stopping = threading.Event()
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
         if self.cache is not None:
             self.cache.mkdir(parents=True, exist_ok=True)
         if self.account is not None:
             self.account.lets_through(scratch)
-            if self.cache is not None:
-                self.account.lets_through(self.cache)
         self._serve()
 
     def _serve(self) -> None:
@@ -195,15 +190,6 @@ class Sandbox:
         finally:
             shutil.rmtree(path, ignore_errors=True)
 
-    def stop(self) -> None:
-        """Kill all children and start no more; their outcome is `cancelled`."""
-        self._stopping.set()
-
-    @property
-    def stopping(self) -> bool:
-        """Whether `stop` was called."""
-        return self._stopping.is_set()
-
     def run(
         self,
         task: str,
@@ -212,50 +198,31 @@ class Sandbox:
         folder: Path,
         limits: TaskLimits,
         reads: Sequence[Path] = (),
-        compiles: str | None = None,
         wanted: Callable[[], bool] = lambda: True,
         on_progress: child.ProgressHook = ignore_step,
     ) -> Outcome:
         """Run one task to its end."""
-
-        def still_wanted() -> bool:
-            return not self._stopping.is_set() and wanted()
-
-        with self.budget.share(limits.memory_mb, still_wanted) as entered:
+        with self.budget.share(limits.memory_mb, wanted) as entered:
             if not entered:
                 return ended("cancelled")
             line, far_end = self._context.Pipe(duplex=True)
             said, far_said = self._context.Pipe(duplex=False)
             with line, said:
                 order = self._order(task, arguments, folder, limits)
-                cache = self._cache_of(compiles)
-                reads = [*reads, *([] if cache is None else [cache])]
+                reads = [*reads, *([] if self.cache is None else [self.cache])]
                 order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
-                order["cache"] = None if cache is None else str(cache)
                 self._open_to_child(folder, reads)
                 process = self._start(order, far_end, far_said)
                 try:
                     watched = _Watched(process, line, said, folder, time.monotonic() + limits.wall_s)
-                    cut = self._watch(watched, limits, still_wanted, on_progress)
+                    cut = self._watch(watched, limits, wanted, on_progress)
                     status = 0 if cut else self._exit_status(process)
                 finally:
                     self._end(process)
                 while said.poll() and watched.receive():  # not until all ends are closed: one may live on
                     pass
                 _leave_plain_files(folder)
-                outcome = cut or outcome_of(watched.ended, status, folder, limits)
-                if cache is not None and outcome.ending == "ok":
-                    _keep_compiled(folder / child.COMPILED, cache)
-                return outcome
-
-    def _cache_of(self, owner: str | None) -> Path | None:
-        if owner is None or self.cache is None:
-            return None
-        folder = (self.cache / owner).resolve()
-        folder.mkdir(parents=True, exist_ok=True)
-        if owner != COMMON:
-            _keep_compiled(self.cache / COMMON, folder)
-        return folder
+                return cut or outcome_of(watched.ended, status, folder, limits)
 
     def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
         if self.account is not None:
@@ -350,17 +317,6 @@ def _overflows(written: Path, limits: TaskLimits) -> bool:
             if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
                 return True
     return any(isinstance(error, PermissionError) for error in hidden)
-
-
-def _keep_compiled(compiled: Path, cache: Path) -> None:
-    """Add to an owner's cache what was compiled since; each file appears complete."""
-    for path in compiled.glob("*/*"):
-        kept = cache / path.parent.name / path.name
-        if kept.exists() and kept.stat().st_mtime >= path.stat().st_mtime:
-            continue
-        (cache / path.parent.name).mkdir(exist_ok=True)
-        with replacing(cache / path.parent.name / path.name) as part:
-            shutil.copyfile(path, part)
 
 
 def _leave_plain_files(folder: Path) -> None:

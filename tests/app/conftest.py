@@ -216,7 +216,6 @@ class TasksHere:
     """A sandbox without children: runs tasks in this process."""
 
     account = None
-    stopping = False
 
     def __init__(self, scratch: Path) -> None:
         self.scratch, self.budget = scratch, Budget(1, 4096)

@@ -70,7 +70,7 @@ class Service:
         self.http = httpx2.Client(timeout=stretched(60.0))
 
     def start(self) -> None:
-        """Start, or start again, and wait until it says that it is ready."""
+        """Start, or start again, and wait until it is ready."""
         if self.process is not None and self.process.stdout is not None:
             self.process.stdout.close()  # of a service that ended by itself
         with self.log.open("a") as log:
@@ -83,8 +83,12 @@ class Service:
             )
         assert self.process.stdout is not None
         said = self.process.stdout.readline()
-        assert "ready" in said, self.log.read_text()[-4000:]
+        assert "runs at" in said, self.log.read_text()[-4000:]
         self.http.base_url = httpx2.URL(self.info()["url"])
+        deadline = Deadline(PATIENCE_S)
+        while self.http.get("/readyz").status_code != 200:
+            assert not deadline.passed(), self.log.read_text()[-4000:]
+            time.sleep(0.1)
 
     def stop(self) -> int:
         """Stop as Ctrl-C does; return the exit status."""

@@ -317,5 +317,5 @@ def test_example_serves_until_it_is_told_to_stop(line: str, folder: Path) -> Non
         process.send_signal(signal.SIGINT)
         status = process.wait(stretched(PATIENCE_S))
 
-    assert said.startswith("lensmodel is ready: http://127.0.0.1:")
+    assert said.startswith("lensmodel runs at http://127.0.0.1:")
     assert status == 0

@@ -9,7 +9,6 @@ import random
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ from starlette.testclient import TestClient
 from uploads import receive
 
 from app.blobs.storage import Storage
-from app.jobs.worker import Worker
+from app.jobs.worker import Worker, durable
 from app.runtime.outage import Patience, is_outage
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
@@ -37,6 +36,7 @@ from app.store.jobs import Job
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import EventRow, PhotoRow, SampleRow
+from lensmodel.cli.ending import InterruptedByUser
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
@@ -122,16 +122,15 @@ class Away:
 
 @pytest.fixture
 def worker(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Worker:
-    made = Worker(settings)
-    monkeypatch.setattr(made, "_rest", lambda _: None)
-    return made
+    monkeypatch.setattr("app.jobs.worker.sleep", lambda _: None)
+    return Worker(settings)
 
 
 def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> None:
     photo = steps.receive()
     job = Away(exc.OperationalError("SELECT", {}, psycopg.OperationalError("away")), times=9)
 
-    worker._safe(job, "photo")(photo.public_id, 1)
+    durable("photo", job, worker._end)(photo.public_id, 1)
 
     assert job.runs == 10
     assert steps.fresh(photo).state == "received"
@@ -144,7 +143,7 @@ def test_a_job_that_waited_in_vain_ends_as_such(
     photo = steps.receive()
     steps.inspect(photo)
 
-    worker._safe(Away(OSError(errno.ENOSPC, "full"), times=10**6), "cell")(photo.public_id, 1, 0)
+    durable("cell", Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._end)(photo.public_id, 1, 0)
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", "outage")
@@ -153,7 +152,7 @@ def test_a_job_that_waited_in_vain_ends_as_such(
 def test_a_bug_ends_the_job_after_three_tries(worker: Worker, steps: Any) -> None:
     photo, job = steps.receive(), Away(KeyError("a bug"), times=10)
 
-    worker._safe(job, "photo")(photo.public_id, 1)
+    durable("photo", job, worker._end)(photo.public_id, 1)
 
     assert (steps.fresh(photo).error_code, job.runs) == ("internal_error", 3)
 
@@ -171,15 +170,14 @@ def test_a_worker_keeps_its_lease_while_its_engine_starts(
             while store.jobs.workers()[0].heartbeat_at == first and time.monotonic() < end:
                 time.sleep(0.02)
             beats.append(store.jobs.workers()[0].heartbeat_at > first)
-            worker.stop()
+            raise InterruptedByUser(15)
 
     beats: list[bool] = []
     monkeypatch.setattr(worker, "_engine", Slow())
     monkeypatch.setattr(worker, "_settings", worker._settings.model_copy(update={"lease_seconds": 1.0}))
-    monkeypatch.setattr(worker, "_leave", lambda: None)
-    monkeypatch.setattr(worker, "_take_over_gone", lambda _: None)
 
-    worker.run()
+    with pytest.raises(InterruptedByUser):
+        worker._begin()
 
     assert beats == [True]
 
@@ -370,19 +368,6 @@ def test_a_lens_named_by_hand_keeps_its_name_after_a_retry(
     client.post(f"/v1/jobs/{photo.public_id}/retry")
 
     assert steps.fresh(photo).given["lens_id"] == lens_id
-
-
-def test_a_job_that_breaks_while_its_worker_stops_does_not_look_done(worker: Worker, steps: Any) -> None:
-    photo = steps.receive()
-    job = worker._safe(Away(KeyError("a bug"), times=10), "photo")
-    worker.stop()
-
-    thread = threading.Thread(target=job, args=(photo.public_id, 1), daemon=True)
-    thread.start()
-    thread.join(2.0)
-
-    assert thread.is_alive()
-    assert steps.fresh(photo).state == "received"
 
 
 def test_a_worker_that_gets_no_connection_for_a_lease_stops(

@@ -107,7 +107,6 @@ class Scripted:
         self.scratch = scratch
         self.budget = Budget(2, 2048)
         self.account = None
-        self.stopping = False
         self.limits: list[TaskLimits] = []
         self.ran: list[str] = []
         self.seen: dict[str, dict[str, Any]] = {}
@@ -135,7 +134,6 @@ class Scripted:
         limits: TaskLimits,
         reads: Sequence[Path],
         wanted: Callable[[], bool],
-        compiles: str | None = None,
         on_progress: ProgressHook = ignore_step,
     ) -> Outcome:
         self.ran.append(task)
@@ -593,11 +591,11 @@ def test_an_unforeseen_exception_is_not_tried_again(context: JobContext, sandbox
 def test_what_needs_compiled_loops_waits_while_they_are_compiled_for_all(
     context: JobContext, sandbox: Scripted
 ) -> None:
-    sandbox.answers["task"] = [ok("done")]
+    sandbox.answers["task"] = sandbox.answers["measure"] = [ok("done")]
     context.warmed.clear()
     with ThreadPoolExecutor() as pool, context.sandbox.folder() as folder:
         waits = {"folder": folder, "limits": TaskLimits(500, 10), "wanted": lambda: True}
-        computed = pool.submit(context.attempt, "task", {}, compiles_for=1, **waits)
+        computed = pool.submit(context.attempt, "measure", {}, **waits)
         assert context.attempt("task", {}, **waits) == "done"  # that only decodes
         assert (computed.done(), sandbox.ran) == (False, ["task"])
         context.warmed.set()

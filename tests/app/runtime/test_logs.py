@@ -14,7 +14,7 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.jobs.worker import accounted
+from app.jobs.worker import durable
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
@@ -58,8 +58,7 @@ def test_a_record_is_one_object_on_one_line_whatever_it_holds(lines: io.StringIO
 
 
 def test_a_line_of_a_job_names_the_job_and_its_photo(lines: io.StringIO) -> None:
-    with accounted("cell", ("PHOTO", 1, 4)):
-        logging.getLogger("app.jobs").info("at work")
+    durable("cell", lambda *_: logging.getLogger("app.jobs").info("at work"), print)("PHOTO", 1, 4)
     logging.getLogger("app.jobs").info("at rest")
 
     during, after = read(lines)
@@ -69,15 +68,13 @@ def test_a_line_of_a_job_names_the_job_and_its_photo(lines: io.StringIO) -> None
 
 
 def test_lines_for_people_name_them_too() -> None:
-    record = logging.LogRecord("app", logging.INFO, "", 0, "at work\nforged", (), None)
+    record, written = logging.LogRecord("app", logging.INFO, "", 0, "at work\nforged", (), None), list[str]()
 
-    def written() -> str:
-        with accounted("photo", ("PHOTO", 1)):
-            return logs.OneRecord("%(message)s").format(record)
+    def work(*_: object) -> None:
+        written.append(logs.OneRecord("%(message)s").format(record))
 
-    assert contextvars.Context().run(written) == (
-        f"at work job_id=photo/PHOTO/1 photo_id=PHOTO{logs.CONTINUED}forged"
-    )
+    contextvars.Context().run(durable("photo", work, print), "PHOTO", 1)
+    assert written == [f"at work job_id=photo/PHOTO/1 photo_id=PHOTO{logs.CONTINUED}forged"]
 
 
 def test_the_line_of_a_request_says_what_was_asked_and_answered(

@@ -10,7 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
-from app.jobs.worker import accounted
+from app.jobs.worker import durable
 from app.runtime import metrics
 from app.runtime.outage import OutageError
 
@@ -68,9 +68,17 @@ def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
     assert not any(lens in name or "somewhere" in name for name in after)
 
 
-def test_a_worker_tells_its_own_where_it_has_an_address() -> None:
-    with accounted("photo", ("p", 1)) as record:
-        record.retries(OutageError())
+def test_a_worker_tells_its_own_where_it_has_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.jobs.worker.sleep", lambda _: None)
+    failures = iter([OutageError(), *[KeyError()] * 3])
+
+    def fail(*_: object) -> None:
+        error = next(failures, None)
+        if error is not None:
+            raise error
+
+    durable("photo", fail, lambda *_: None)("p", 1)
+    durable("photo", fail, lambda *_: None)("p", 1)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -78,19 +86,6 @@ def test_a_worker_tells_its_own_where_it_has_an_address() -> None:
     metrics.publish(address)
 
     values = numbers(httpx2.get(f"http://{address}/metrics").text)
-    assert values["lensmodel_job_seconds_count{'ending': 'done', 'kind': 'photo'}"] >= 1
+    for ending in ("done", "internal_error"):
+        assert values[f"lensmodel_job_seconds_count{{'ending': '{ending}', 'kind': 'photo'}}"] >= 1
     assert values["lensmodel_job_retries_total{'cause': 'outage', 'kind': 'photo'}"] >= 1
-
-
-@pytest.mark.parametrize(("ending", "error"), [("done", None), ("raised", RuntimeError)])
-def test_a_job_is_timed_however_it_ends(ending: str, error: type[Exception] | None) -> None:
-    name = f"lensmodel_job_seconds_count{{'ending': '{ending}', 'kind': 'measure'}}"
-    before = numbers(metrics.generate_latest(metrics.WORKER).decode()).get(name, 0.0)
-    try:
-        with accounted("measure", ("lens", 1)):
-            if error is not None:
-                raise error
-    except RuntimeError:
-        pass
-
-    assert numbers(metrics.generate_latest(metrics.WORKER).decode())[name] == before + 1

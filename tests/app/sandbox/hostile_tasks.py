@@ -254,23 +254,20 @@ def forge(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
 
 
 def compile_one(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[str]:
-    import numba  # noqa: PLC0415 - others need it not
-
-    from lensmodel.core.jit import jit  # noqa: PLC0415 - same
+    from lensmodel.core.jit import jit  # noqa: PLC0415 - others need it not
 
     twice = jit(_twice)
     twice(1)
     found = []
-    for name in arguments["caches"]:
-        for what, attempt in (
-            ("reads", lambda p: list(p.iterdir())),
-            ("plants", lambda p: (p / "x").touch()),
-        ):
-            with contextlib.suppress(OSError):
-                attempt(Path(name))
-                found.append(f"{what} {name}")
+    for what, attempt in (
+        ("reads", lambda p: list(p.iterdir())),
+        ("plants", lambda p: (p / "x").touch()),
+    ):
+        with contextlib.suppress(OSError):
+            attempt(Path(arguments["cache"]))
+            found.append(what)
     loaded = "loaded" if twice.stats.cache_hits else "compiled"  # type: ignore[attr-defined]  # a dispatcher
-    return [loaded, str(numba.config.CACHE_DIR), *found]
+    return [loaded, *found]
 
 
 def _twice(number: int) -> int:

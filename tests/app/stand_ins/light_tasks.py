@@ -8,4 +8,4 @@ from app.jobs import tasks
 
 quick_tasks.SECONDS = 0.05
 
-TASKS = tasks.TASKS | {name: quick_tasks.TASKS[name] for name in ("estimate", "measure", "warm")}
+TASKS = tasks.TASKS | {name: quick_tasks.TASKS[name] for name in ("estimate", "measure")}

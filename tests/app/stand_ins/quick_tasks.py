@@ -72,8 +72,4 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return {"error": {}, "coverage": {}}
 
 
-def warm(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    return {}
-
-
-TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure, warm)}
+TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure)}

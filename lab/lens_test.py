@@ -32,6 +32,7 @@ from lensmodel.photo import develop
 from lensmodel.quality import tangential_sagittal_mtf50
 from lensmodel.quality.edge import edge_area
 from lensmodel.report import lens_report
+from lensmodel.report.lens_report import Range
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo
 
 MARGIN: Final = 40  # pixels of scene beyond the frame
@@ -116,11 +117,12 @@ def true_mtf50(lens: CameraLens, place: FieldPosition, normal: float, pitch_um: 
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
-    """T and S at a place, MTF50 in cycles/pixel, and whether a report calls them a guess."""
+    """T and S at a place, MTF50 in cycles/pixel, a report's ranges, and whether it calls them a guess."""
 
     place: FieldPosition
     tangential: float
     sagittal: float
+    ranges: tuple[Range, Range] | None = None
     guessed: bool = False
 
 
@@ -172,20 +174,25 @@ def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:
             known.shot(number, path)
         model = calibrate(shots, aperture=known.settings.aperture).model
     found = lens_report(model, "", channels=("g",)).tested[0]
-    rows = zip(found.positions, found.tangential, found.sagittal, found.unknown, strict=True)
+    ranges = zip(found.tangential_range, found.sagittal_range, strict=True)
+    rows = zip(found.positions, found.tangential, found.sagittal, ranges, found.unknown, strict=True)
     return [Sharpness(*row) for row in rows]
 
 
 def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:
-    """Medians of T and S, those of the truth at the same places, and the median error of a place."""
+    """Medians of T and S, those of the truth at the same places, the median error, and what ranges hold."""
     words = []
-    for name, turn in (("T", 0.0), ("S", math.pi / 2)):
+    for way, (name, turn) in enumerate((("T", 0.0), ("S", math.pi / 2))):
         figures = [one.sagittal if turn else one.tangential for one in found]
         true = [min(true_mtf50(lens, one.place, one.place.phi + turn, pitch_um), 0.5) for one in found]
         seen = np.minimum(figures, 0.5)
         median, truth = np.median(seen), np.median(true)
         off = np.median(np.abs(seen / true - 1.0))
-        words.append(f"{name} {median:.3f} truth {truth:.3f} ({median / truth - 1.0:+.0%}, places {off:.0%})")
+        ranges = [one.ranges[way] for one in found if one.ranges is not None]
+        held = [low <= value <= high for value, (low, high) in zip(true, ranges, strict=False)]
+        own = [f"{median / truth - 1.0:+.0%}", f"places {off:.0%}"]
+        own += [f"ranges hold {np.mean(held):.0%}"] if held else []
+        words.append(f"{name} {median:.3f} truth {truth:.3f} ({', '.join(own)})")
     guessed = sum(one.guessed for one in found) / len(found)
     return ", ".join([*words, *([f"hatched {guessed:.0%}"] if guessed else [])])
 

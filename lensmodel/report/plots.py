@@ -153,7 +153,7 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
     at = f", {found.at}" if found.at else ""
     panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
     panels += [
-        (f"Expected error of the blur, %{at}", _on(error_map, found)),
+        (f"MTF50, give or take %{at}", _on(error_map, found)),
         (f"Contrast over the picture{at}: sagittal solid, tangential dashed", _on(contrast, found)),
         (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(side_softer, found)),
@@ -244,9 +244,10 @@ def sharpness_map(ax: Axes, found: ApertureReport, values: Sequence[float], *, f
 
 
 def error_map(ax: Axes, found: ApertureReport) -> None:
-    """Draw by how much the blur is expected to be wrong at each place."""
-    shown = np.nan_to_num(np.array(found.predicted_error), nan=1.0)
-    _map(ax, found, shown, [f"{100.0 * error:.0f}" for error in shown], "Greys", (0.0, 1.0))
+    """Draw by how much MTF50 may be off at each place, in percent."""
+    shown = np.array(found.give_or_take)
+    words = [f"{100.0 * share:.0f}" for share in shown]
+    _map(ax, found, np.minimum(shown, 1.0), words, "Greys", (0.0, 1.0))
 
 
 def _map(
@@ -411,7 +412,7 @@ def _points(place: Place, found: ApertureReport) -> None:
         weight = "bold" if spot is found.worst else "normal"
         ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=weight, loc="center")
         ax.set(xticks=[], yticks=[])
-        ax.set_xlabel(spot.words, fontsize=7.5)
+        ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
         ax.grid(visible=False)
 
 

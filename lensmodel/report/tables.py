@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from typing import Final
 
 from lensmodel.core.types import FieldPosition
-from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
+from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport, Range
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
-    *("direction", "value", "unit", "predicted_error", "extrapolated"),
+    *("direction", "value", "low", "high", "unit", "predicted_error", "extrapolated"),
 )
 
 
@@ -25,9 +25,12 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
         found = report.at(aperture)
         for spot in (found.spots[0], *found.sides, *found.spots[1:]):
             figures = [
-                report.sensor.words(value, unit)
+                report.sensor.words(value, unit, between)
                 for unit in units
-                for value in (spot.tangential, spot.sagittal)
+                for value, between in (
+                    (spot.tangential, spot.tangential_range),
+                    (spot.sagittal, spot.sagittal_range),
+                )
             ]
             rows.append([found.at or "unknown", spot.place.removeprefix("the "), *figures])
     return head, rows
@@ -58,23 +61,28 @@ def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
     for zone, value in found.zones.items():
         yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": "c/px"}
     for spot in (*found.spots, *found.sides):
-        own = {"quantity": f"MTF50 at {spot.place}", "unit": "c/px"} | _at(spot.position)
+        own = {"quantity": f"MTF50 at {spot.place}"} | _at(spot.position)
         own |= {"predicted_error": _number(spot.predicted_error)}
-        yield own | {"direction": "tangential", "value": _number(spot.tangential)}
-        yield own | {"direction": "sagittal", "value": _number(spot.sagittal)}
-    for direction, values in (("tangential", found.tangential), ("sagittal", found.sagittal)):
-        for i, (place, value) in enumerate(zip(found.positions, values, strict=True)):
+        yield own | {"direction": "tangential"} | _figure(spot.tangential, spot.tangential_range)
+        yield own | {"direction": "sagittal"} | _figure(spot.sagittal, spot.sagittal_range)
+    for direction, values, ranges in (
+        ("tangential", found.tangential, found.tangential_range),
+        ("sagittal", found.sagittal, found.sagittal_range),
+    ):
+        for i, (place, value, between) in enumerate(zip(found.positions, values, ranges, strict=True)):
             row, col = divmod(i, found.cols)
-            yield _at(place) | {
-                "quantity": "MTF50",
-                "direction": direction,
-                "row": str(row),
-                "col": str(col),
-                "value": _number(value),
-                "unit": "c/px",
-                "predicted_error": _number(found.predicted_error[i]),
-                "extrapolated": str(int(found.extrapolated[i])),
-            }
+            yield (
+                _at(place)
+                | _figure(value, between)
+                | {
+                    "quantity": "MTF50",
+                    "direction": direction,
+                    "row": str(row),
+                    "col": str(col),
+                    "predicted_error": _number(found.predicted_error[i]),
+                    "extrapolated": str(int(found.extrapolated[i])),
+                }
+            )
     for curve in found.curves:
         known = {
             "quantity": "MTF",
@@ -88,6 +96,10 @@ def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
 
 def _at(place: FieldPosition) -> dict[str, str]:
     return {"r": _number(place.r), "phi": _number(place.phi)}
+
+
+def _figure(value: float, between: Range) -> dict[str, str]:
+    return {"value": _number(value), "low": _number(between[0]), "high": _number(between[1]), "unit": "c/px"}
 
 
 def _number(value: float | None) -> str:

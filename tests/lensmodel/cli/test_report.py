@@ -102,7 +102,7 @@ def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone
     for words in (
         "<h1>my-24mm</h1>",
         "would help most",
-        "Expected error of the blur",
+        "MTF50, give or take",
         "60 blur samples",
     ):
         assert words in page

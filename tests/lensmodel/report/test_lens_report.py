@@ -20,7 +20,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel, ModelSettings, PsfAnswer
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import LensReport, SensorGeometry, Side, compare, filled_aspect, lens_report
@@ -90,6 +90,7 @@ def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() ->
     sensor = SensorGeometry(5.0, 4000)
 
     assert [sensor.words(0.2, unit) for unit in sensor.units] == [".200", "800", "40"]
+    assert sensor.words(0.2, "lp/mm", (0.15, 0.6)) == "40 (30 to over 100)"
     assert sensor.words(1.0) == "at least .500"
     assert SensorGeometry().units == ("c/px",)
     assert SensorGeometry().words(0.2, "lp/mm") == "unknown"
@@ -115,6 +116,34 @@ def test_figures_are_those_of_the_true_kernels() -> None:
     for curve in found.curves:
         expected = math.exp(-2.0 * (math.pi * 0.8 * curve.frequency) ** 2) * np.sinc(curve.frequency)
         assert curve.sagittal == pytest.approx([expected] * len(found.radii), abs=0.03)
+
+
+@pytest.mark.parametrize("answered_by", ["network", "regression"])
+def test_a_figure_has_a_range_as_wide_as_the_blur_is_unsure(
+    monkeypatch: pytest.MonkeyPatch, answered_by: str
+) -> None:
+    query = LensModel.query
+
+    def unsure(model: LensModel, place: FieldPosition, *given: object, **options: object) -> PsfAnswer:
+        answer = query(model, place, *given, **options)  # type: ignore[arg-type]
+        share = 0.1 if place.r < 0.6 else 0.4
+        return replace(
+            answer,
+            predicted_error=share,
+            ring_error=np.full(8, share / 4),
+            answered_by=answered_by,  # type: ignore[arg-type]
+        )
+
+    monkeypatch.setattr(LensModel, "query", unsure)
+    found = lens_report(LensModel.fit(samples(1), QUICK), "A lens", rows=3, size=SIZE, channels=("g",))
+
+    center, worst = found.tested[0].spots[0], found.tested[0].worst
+    for spot, least, most in ((center, 0.05, 0.2), (worst, 0.2, 0.6)):
+        low, high = spot.sagittal_range
+        assert low < spot.sagittal < high
+        assert least < (high - low) / 2.0 / spot.sagittal < most
+    low, high = found.tested[0].spots[0].mean_range
+    assert f"{center.mean:.3f} ({low:.3f} to {high:.3f})".replace("0.", ".") in found.verdict
 
 
 def test_tangential_and_sagittal_are_told_apart() -> None:
@@ -153,7 +182,7 @@ def test_sides_are_given_apart_and_their_two_directions_too() -> None:
 
     head, rows = place_table(found)
     assert head[:4] == ["Aperture", "Place", "T, c/px", "S, c/px"]
-    table = {row[1]: [float(cell.removeprefix("at least ")) for cell in row[2:4]] for row in rows}
+    table = {row[1]: [float(cell.split(" (")[0]) for cell in row[2:4]] for row in rows}
     assert list(table)[:5] == ["centre", "left", "right", "top", "bottom"]
     assert table["left"][1] > 1.1 * table["right"][1]
     assert table["left"][0] < 0.8 * table["left"][1]
@@ -218,9 +247,9 @@ def test_the_error_stands_beside_the_maps_and_the_worst_corner_among_the_points(
     maps, errors = charts(soft, None)[:2]
 
     assert soft.tested[0].worst.side.removeprefix("the ") in points
-    assert errors.title == "Expected error of the blur, %, f/2.8"
+    assert errors.title == "MTF50, give or take %, f/2.8"
     figures = [float(text) for text in ET.fromstring(errors.svg).itertext() if text.strip().isdigit()]
-    assert figures == [round(100.0 * error) for error in soft.tested[0].predicted_error]
+    assert figures == [round(100.0 * share) for share in soft.tested[0].give_or_take]
     assert "tangential" in " ".join(ET.fromstring(maps.svg).itertext())
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -22,7 +21,6 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.model import LensProfile, save_profile
 from lensmodel.patches import selectors
-from lensmodel.photo.values import ENDINGS
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.calibrating import AHEAD
 from lensmodel.workflow.lens import Lens
@@ -89,54 +87,14 @@ def calibrate(
 
     Exit status: 0 all photos counted, 1 some did not, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
-    run(
-        photos,
-        files.named(profile),
-        CalibrationOptions(
-            aperture,
-            estimator,
-            workers,
-            any_lens=any_lens,
-            force=force,
-            model=model,
-            kernel_size=kernel_size,
-            scheduler=scheduler,
-            selector=selector,
-        ),
-        shown,
-        as_json=json_output,
-    )
-
-
-_ZIP: Final = b"PK"  # First bytes of a profile, damaged or not: the signature of a ZIP file
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationOptions:
-    """The options of the command."""
-
-    aperture: float | None
-    estimator: str | None
-    workers: int | None
-    any_lens: bool
-    force: bool
-    scheduler: str | None = None
-    selector: str = "r-map"
-    model: str | None = None
-    kernel_size: int | None = None
-
-
-def run(
-    names: Sequence[str], target: Path, options: CalibrationOptions, display: Display, *, as_json: bool
-) -> None:
-    """Add photos to a profile, one after the other, and save it after each."""
-    paths = files.photos(names)
-    _refuse(target, paths)
+    shown, target = Display.of(context, quiet=quiet, verbose=verbose), files.named(profile)
+    paths = files.photos(photos)
+    files.refuse_photo(target, paths)
     with files.as_usage():
-        _config(options).check()
+        config = sampling.Config(LensSettings(aperture=aperture), model, estimator, kernel_size, selector)
+        config.check()
     results: list[dict[str, Any]] = []
-    with display.progress() as bars:
+    with shown.progress() as bars:
         task = bars.add_task("", total=len(paths))
 
         def on_event(event: sampling.CalibrationEvent) -> None:
@@ -145,52 +103,39 @@ def run(
                 task, description=f"{event.photo.name}: {event.stage}", completed=len(results) + share
             )
 
-        with (
-            executor_of(options.scheduler) as (executor, ahead),
-            processes.pool(None, options.workers) as pool,
-        ):
-            calibration = calibration_of(target, options, pool)
+        with executor_of(scheduler) as (executor, ahead), processes.pool(None, workers) as pool:
+            store = ProfileFile(target, model, force=force)
+            calibration = calibrating.Calibration(store, config, any_lens=any_lens, pool=pool)
             for verdict in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
-                result = _result(verdict, display)
-                results.append({"photo": str(verdict.photo), **result})
+                results.append({"photo": str(verdict.photo), **_result(verdict, shown)})
                 bars.update(task, completed=len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
-    summary = {
-        "profile": str(target) if lens else None,
-        "photos": len(lens.profile.photos) if lens else 0,
-        "samples": len(lens.samples) if lens else 0,
-        "coverage": coverage,
-        "model": preset_of(lens.model).name if lens else None,
-        "results": results,
-    }
-    if as_json:
-        display.document(summary)
-    elif lens is not None and any(result["state"] != "failed" for result in results):
+    photo_count, sample_count = (len(lens.profile.photos), len(lens.samples)) if lens else (0, 0)
+    failed = [result for result in results if result["state"] == "failed"]
+    if json_output:
+        shown.document(
+            {
+                "profile": str(target) if lens else None,
+                "photos": photo_count,
+                "samples": sample_count,
+                "coverage": coverage,
+                "model": preset_of(lens.model).name if lens else None,
+                "results": results,
+            }
+        )
+    elif lens is not None and len(failed) < len(results):
         cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
-        display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
+        shown.result(f"{target}: photos {photo_count}, samples {sample_count} ({cover})")
     if lens is None:
-        display.error(
+        shown.error(
             "no photo could be used, so there is no profile; the lines above say what each photo needs"
         )
-    if any(result["state"] == "failed" for result in results):
+    if failed:
         raise typer.Exit(1)
 
 
-def calibration_of(target: Path, options: CalibrationOptions, pool: Executor) -> calibrating.Calibration:
-    """Return the work on a profile, which may be there already, by the processes of a pool."""
-    store = ProfileFile(target, options)
-    return calibrating.Calibration(store, _config(options), any_lens=options.any_lens, pool=pool)
-
-
-def _config(options: CalibrationOptions) -> sampling.Config:
-    return sampling.Config(
-        LensSettings(aperture=options.aperture),
-        model=options.model,
-        estimator=options.estimator,
-        kernel_size=options.kernel_size,
-        selector=options.selector,
-    )
+_ZIP: Final = b"PK"  # First bytes of a profile, damaged or not: the signature of a ZIP file
 
 
 def _result(verdict: calibrating.PhotoVerdict, display: Display) -> dict[str, Any]:
@@ -205,17 +150,6 @@ def _result(verdict: calibrating.PhotoVerdict, display: Display) -> dict[str, An
     return {"state": "counted", "samples": verdict.samples}
 
 
-def _refuse(target: Path, photos: Sequence[Path]) -> None:
-    """Refuse to replace a folder or a photo."""
-    if target.is_dir():
-        raise UsageError(f"{target} is a folder; give the file of a lens profile")
-    # a shell expands `--profile holiday/*.dng` to a profile and photos
-    if target.suffix.lower() in ENDINGS or any(files.same(target, path) for path in photos):
-        raise UsageError(
-            f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
-        )
-
-
 class ProfileFile:
     """The store of a lens in a file.
 
@@ -223,21 +157,21 @@ class ProfileFile:
     changed, so that no run drops what another one learned.
     """
 
-    def __init__(self, target: Path, options: CalibrationOptions) -> None:
-        self._target, self._options = target, options
+    def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
+        self._target, self._model = target, model
         self._lens: Lens | None = None
-        self._stamp_read = _stamp(target) if options.force else None
+        self._stamp_read = _stamp(target) if force else None
 
     def lens(self) -> Lens | None:
         """Return the lens, read anew if another run changed the file."""
         stamp = _stamp(self._target)
         if stamp not in {None, self._stamp_read}:
             profile = _opened(self._target)
-            learned, asked = preset_of(profile.model).name, self._options.model
-            if asked not in {None, learned}:  # its kernels are the other model's: the two would be mixed
+            learned = preset_of(profile.model).name
+            if self._model not in {None, learned}:  # its kernels are the other model's: both would be mixed
                 raise InvalidInputError(
-                    f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "
-                    "after --profile and give its photos again, or replace the file with --force"
+                    f"the lens in {self._target.name} has the model {learned}, not {self._model}: name a new "
+                    "file after --profile and give its photos again, or replace the file with --force"
                 )
             self._lens, self._stamp_read = Lens(profile), stamp
         return self._lens

@@ -104,18 +104,16 @@ class Display:
     @contextmanager
     def progress(self) -> Iterator[Progress]:
         """Bars with counts and the time left; plain lines now and then where no terminal can show them."""
-        if not self.quiet and not sys.stderr.isatty():
-            with ProgressLines() as lines:
-                yield lines
-            return
-        bars = Progress(
+        terminal = sys.stderr.isatty()
+        bars = PacedProgress(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TimeLeft(),
+            say=None if self.quiet or terminal else _to_standard_error,
             console=Console(file=sys.stderr),
-            disable=self.quiet,
+            disable=self.quiet or not terminal,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
         )
@@ -148,7 +146,6 @@ AGREE: Final = 2.0
 # Of a task, whichever comes first, before its pace is believed (chosen): of one photo what comes before its
 # tiles, of many the first ones
 LEAST_SHARE, LEAST_COUNT = 0.05, 3.0
-_MARKS: Final = 512  # of a task's past (chosen): enough to halve any time
 
 
 class Pace:
@@ -165,12 +162,9 @@ class Pace:
             self._times.clear()
             self._done.clear()
         self._total = total
-        if self._done and done == self._done[-1]:
-            return
-        self._times.append(now)
-        self._done.append(done)
-        if len(self._times) > _MARKS:
-            del self._times[1:-1:2], self._done[1:-1:2]
+        if not self._done or done > self._done[-1]:
+            self._times.append(now)
+            self._done.append(done)
 
     def left(self, now: float) -> float | None:
         """Seconds left; None before both halves of the time agree on the pace within a factor of two."""
@@ -186,30 +180,18 @@ class Pace:
         return max((end - start) * (self._total - last) / (last - first) - (now - end), 0.0)
 
 
-class TimeLeft(ProgressColumn):
-    """Column of a bar: the time left, once it can be told."""
+class PacedProgress(Progress):
+    """Bars that know the time left; where no terminal can show bars, a plain line now and then."""
 
-    max_refresh = 0.5
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._paces: dict[TaskID, Pace] = {}
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a task."""
-        pace, now = self._paces.setdefault(task.id, Pace()), task.get_time()
-        pace.mark(now, task.completed, task.total)
-        left = pace.left(now)
-        return Text("" if left is None else f"ETA {clock(left)}")
-
-
-class ProgressLines(Progress):
-    """Stands in for bars: keeps count of tasks as they do, and prints a line now and then."""
-
-    def __init__(self, say: Callable[[str], None] | None = None, *, every_s: float = EVERY_S) -> None:
-        super().__init__(disable=True)
-        self._say = say or _to_standard_error
-        self._every_s = every_s
+    def __init__(
+        self,
+        *columns: ProgressColumn,
+        say: Callable[[str], None] | None = None,
+        every_s: float = EVERY_S,
+        **given: Any,  # noqa: ANN401 - as `Progress` takes them
+    ) -> None:
+        super().__init__(*columns, **given)
+        self._say, self._every_s = say, every_s
         self._began = self._last = time.monotonic()
         self._paces: dict[TaskID, Pace] = {}
 
@@ -219,9 +201,19 @@ class ProgressLines(Progress):
         now, task = time.monotonic(), self._tasks[task_id]
         pace = self._paces.setdefault(task_id, Pace())
         pace.mark(now, task.completed, task.total)
-        if now - self._last >= self._every_s:
+        left = pace.left(now)
+        task.fields["left"] = "" if left is None else f"ETA {clock(left)}"
+        if self._say is not None and now - self._last >= self._every_s:
             self._last = now
-            self._say(line(task, now - self._began, pace.left(now)))
+            self._say(line(task, now - self._began, left))
+
+
+class TimeLeft(ProgressColumn):
+    """Column of a bar: the time left, once it can be told."""
+
+    def render(self, task: Task) -> Text:
+        """Return the text of a task."""
+        return Text(task.fields.get("left", ""))
 
 
 def line(task: Task, seconds: float, left: float | None) -> str:
@@ -236,6 +228,11 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def show_share(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+    """Show that photo `number` is done as far as `done` of `total`."""
+    bars.update(task, completed=number + done / max(total, 1))
 
 
 def _to_standard_error(text: str) -> None:

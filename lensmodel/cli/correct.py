@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 
 from lensmodel.blind import estimators
 from lensmodel.cli import files, folder, outputs
-from lensmodel.cli.console import Display
+from lensmodel.cli.console import Display, show_share
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import (
     ANY_LENS,
@@ -26,8 +26,6 @@ from lensmodel.cli.options import (
     choice,
     rare,
 )
-from lensmodel.core.errors import LensModelError
-from lensmodel.core.types import LensSettings
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.patches import selectors
 from lensmodel.photo import OutputFormat
@@ -181,60 +179,44 @@ def correct(
         raise UsageError(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
         )
-    if profile is not None:
-        _run(photos, profile, output, options, shown, as_json=json_output)
-        return
-    if lens != "auto":
+    if profile is None and lens != "auto":
         raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
-    learning = folder.Learning(profiles, learn_from, estimator, selector)
-    folder.run(photos, output, options, learning, shown, as_json=json_output)
+    targets, twice = outputs.targets_of(files.photos(photos), output, file_format)
+    outputs.check(options)
+    clashed = outputs.clashes(twice, shown)
+    if profile is not None:
+        document = _correct_by(profile, targets, options, shown, as_json=json_output)
+    else:
+        learning = folder.Learning(profiles, learn_from, estimator, selector)
+        base = next(iter({**targets, **twice})).parent
+        document = folder.correct(targets, base, options, learning, shown, as_json=json_output)
+    document["results"][:0] = clashed
+    if json_output:
+        shown.document(document)
+    if any(result["state"] == "failed" for result in document["results"]):
+        raise typer.Exit(1)
 
 
-def _run(
-    names: Sequence[str],
-    source: Path,
-    output: str | None,
+def _correct_by(
+    profile: Path,
+    targets: Mapping[Path, Path],
     options: outputs.CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
-) -> None:
-    """Correct photos, one after the other."""
-    targets, twice = outputs.targets_of(files.photos(names), output, options.file_format)
-    with files.as_usage():
-        if options.method is not None:
-            deconvolvers.create(options.method)
-        settings = LensSettings(aperture=options.aperture)
-    lens = Lens(files.profile_at(source))
-    results = outputs.clashes(twice, display)
+) -> dict[str, Any]:
+    """Correct photos, given by the file that each becomes, one after the other."""
+    lens = Lens(files.profile_at(profile))
+    results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(targets))
         for number, (target, path) in enumerate(targets.items()):
             bars.update(task, description=path.name)
-            try:
-                result = outputs.correct_one(
-                    path,
-                    target,
-                    lens,
-                    settings,
-                    options,
-                    display,
-                    partial(outputs.show_share, bars, task, number),
-                    siblings=targets.values(),
-                )
-            except (LensModelError, OSError) as error:
-                result = files.failed(error)
-                display.error(f"{path}: {result['reason']}")
-            if result["state"] == "kept":
-                display.note(f"{target} is there already and was left alone; --force replaces it")
-            elif result["state"] == "corrected" and not as_json:
+            share = partial(show_share, bars, task, number)
+            result = outputs.correct_one(path, target, lens, options, display, share, targets.values())
+            if result["state"] == "corrected" and not as_json:
                 display.result(str(target))
-            if result["state"] == "corrected":
-                for line in outputs.remarks(result):
-                    display.note(f"{path.name}, {line}")
+            outputs.say(path, target, result, display, display.note)
             results.append({"photo": str(path), "output": str(target), **result})
             bars.update(task, completed=number + 1)
-    if as_json:
-        display.document({"profile": str(source), "results": results})
-    if any(result["state"] == "failed" for result in results):
-        raise typer.Exit(1)
+    return {"profile": str(profile), "results": results}

@@ -13,6 +13,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from types import FrameType
@@ -66,43 +67,19 @@ def _end_workers(number: int) -> None:
     os._exit(128 + number)
 
 
-# Modules by extra, as far as commands import them
-EXTRAS: Final = {
-    "service": (
-        "alembic",
-        "dbos",
-        "fastapi",
-        "httpx2",
-        "jinja2",
-        "obstore",
-        "prometheus_client",
-        "pydantic",
-        "pydantic_settings",
-        "python_multipart",
-        "sqlalchemy",
-        "sse_starlette",
-        "starlette",
-        "structlog",
-        "uvicorn",
-    ),
-    "report": ("matplotlib",),
-}
-
-_WHAT: Final = {"service": "the service", "report": "drawing"}
-
-
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Say what to install for a missing module; None where no extra brings it."""
-    name = missing.name or ""
-    if name.partition(".")[0] in {"app", "lab"}:
-        return "this command is no part of the package: it runs in the source tree" + (
-            " or in the container image" if name.partition(".")[0] == "app" else ""
-        )
-    top = name.partition(".")[0]
-    for extra, modules in EXTRAS.items():
-        if top in modules:
-            return (
-                f"this command needs {_WHAT[extra]}, which is not installed ({top} is missing): "
-                f"pip install 'lensmodel[{extra}]'"
-            )
-    return None
+    top = (missing.name or "").partition(".")[0]
+    if top in {"app", "lab"}:
+        where = " or in the container image" if top == "app" else ""
+        return f"this command is no part of the package: it runs in the source tree{where}"
+    if top == "matplotlib":
+        what, extra = "drawing", "report"
+    elif "app" in sys.modules:
+        what, extra = "the service", "service"
+    else:
+        return None
+    return (
+        f"this command needs {what}, which is not installed ({top} is missing): "
+        f"pip install 'lensmodel[{extra}]'"
+    )

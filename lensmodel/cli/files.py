@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -64,11 +64,6 @@ def _shot(path: Path) -> tuple[Path, str]:
     return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
 
 
-def same(first: Path, second: Path) -> bool:
-    """Tell whether two names are of one file."""
-    return first.exists() and second.exists() and first.samefile(second)
-
-
 def named(profile: Path | None) -> Path:
     """Where the lens is written; it has no usual place, since a person may have several."""
     if profile is None:
@@ -77,6 +72,19 @@ def named(profile: Path | None) -> Path:
             "what is learned of the lens is written there"
         )
     return profile
+
+
+def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
+    """Refuse a profile that would take the place of a folder or a photo."""
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; give the file of a lens profile")
+    # a shell expands `--profile holiday/*.dng` to a profile and photos
+    if target.suffix.lower() in ENDINGS or any(
+        target.exists() and path.exists() and target.samefile(path) for path in photos
+    ):
+        raise UsageError(
+            f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
+        )
 
 
 def profile_at(path: Path) -> LensProfile:

@@ -17,13 +17,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import typer
 from rich.progress import Progress, TaskID
 
 from lensmodel import blind, patches
-from lensmodel import correction as corrections
 from lensmodel.cli import calibrate, files, outputs
-from lensmodel.cli.console import Display, aligned, gain_words
+from lensmodel.cli.console import Display, aligned, gain_words, show_share
 from lensmodel.core import processes
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
 from lensmodel.core.files import atomic
@@ -57,69 +55,40 @@ class Learning:
     selector: str
 
 
-@dataclass(frozen=True, slots=True)
-class GroupResult:
-    """What became of a group of photos; a line of the table."""
-
-    group: PhotoGroup
-    profile: Path
-    learned: int
-    states: Mapping[str, int]
-    gains_db: tuple[float, ...]
-
-    @property
-    def gain_db(self) -> float | None:
-        """Expected gain, the mean over the photos that were corrected in this run."""
-        return sum(self.gains_db) / len(self.gains_db) if self.gains_db else None
-
-
-def run(
-    names: Sequence[str],
-    output: str | None,
+def correct(
+    targets: Mapping[Path, Path],
+    base: Path,
     options: outputs.CorrectionOptions,
     learning: Learning,
     display: Display,
     *,
     as_json: bool,
-) -> None:
-    """Learn the lens of every group of photos and correct them all."""
-    paths = files.photos(names)
-    targets, twice = outputs.targets_of(paths, output, options.file_format)
+) -> dict[str, Any]:
+    """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
+
+    Photos are given by the file that each becomes, `base` is the folder of these files.
+    """
     with files.as_usage():
         blind.estimators.create(learning.estimator)
         patches.selectors.create(learning.selector)
-        if options.method is not None:
-            corrections.deconvolvers.create(options.method)
-        LensSettings(aperture=options.aperture)
-    base = next(iter({**targets, **twice})).parent
-    options = replace(options, least_gain_db=SEEN_DB)
-    shots, failed = _read(list(targets.values()), display)
-    results = [*outputs.clashes(twice, display), *failed]
-    lens_groups = groups(shots)
-    by_path = {path: target for target, path in targets.items()}
-    with processes.pool(None, options.workers) as pool, display.progress() as bars:
-        work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display, pool)
-        work.learn(lens_groups, bars)
-        rows = work.correct(lens_groups, by_path, bars, results, as_json=as_json)
-    if as_json:
-        display.document({"groups": [_document(row) for row in rows], "results": results})
-    else:
-        display.result(_table(rows))
-    if any(result["state"] == "failed" for result in results):
-        raise typer.Exit(1)
-
-
-def _read(paths: Sequence[Path], display: Display) -> tuple[list[Shot], list[dict[str, Any]]]:
-    """Read the headers of the files; those that cannot be read become results."""
     shots: list[Shot] = []
     results: list[dict[str, Any]] = []
-    for path in paths:
+    for path in targets.values():
         try:
             shots.append(Shot.of(path))
         except (LensModelError, OSError) as error:
             results.append({"photo": str(path), "output": None, **files.failed(error)})
             display.error(f"{path}: {files.reason(error)}")
-    return shots, results
+    lens_groups = groups(shots)
+    with processes.pool(None, options.workers) as pool, display.progress() as bars:
+        options = replace(options, least_gain_db=SEEN_DB)
+        work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display, pool)
+        work.learn(lens_groups, bars)
+        by_path = {path: target for target, path in targets.items()}
+        rows = work.correct(lens_groups, by_path, bars, results, as_json=as_json)
+    if not as_json:
+        display.result(_table(rows))
+    return {"groups": rows, "results": results}
 
 
 class _Folder:
@@ -175,15 +144,13 @@ class _Folder:
         self._learned[group.name, group.focal] = counted
 
     def _calibration(self, target: Path) -> calibrating.Calibration:
-        options = calibrate.CalibrationOptions(
-            aperture=self._options.aperture,
+        config = sampling.Config(
+            LensSettings(aperture=self._options.aperture),
             estimator=self._learning.estimator,
-            workers=self._options.workers,
-            any_lens=self._options.any_lens,
-            force=False,
             selector=self._learning.selector,
         )
-        return calibrate.calibration_of(target, options, self._pool)
+        store = calibrate.ProfileFile(target)
+        return calibrating.Calibration(store, config, any_lens=self._options.any_lens, pool=self._pool)
 
     def _learns(
         self,
@@ -223,8 +190,8 @@ class _Folder:
         results: list[dict[str, Any]],
         *,
         as_json: bool,
-    ) -> list[GroupResult]:
-        """Correct the photos of all groups that gain from it; leave the others."""
+    ) -> list[dict[str, Any]]:
+        """Correct the photos that gain from it, leave the others, and return a row for each group."""
         task = bars.add_task("", total=sum(len(group.shots) for group in lens_groups))
         rows, number = [], 0
         for group in lens_groups:
@@ -236,19 +203,36 @@ class _Folder:
             for shot in group.shots:
                 bars.update(task, description=f"2 of 2, correcting {shot.path.name}")
                 target = targets[shot.path]
-                share = partial(outputs.show_share, bars, task, number)
-                result = self._correct_shot(shot, group, target, lens, share)
+                result = self._correct_shot(
+                    shot, group, target, lens, partial(show_share, bars, task, number)
+                )
                 states[result["state"]] += 1
-                left[result.get("reason", "")] += 1
-                often = left[result.get("reason", "")] > _SAID
-                self._say(shot.path, target, result, as_json=as_json, often=often)
                 if result["state"] == "corrected":
                     gains.append(result["expected_gain_db"])
+                    if not as_json:
+                        self._display.detail(f"{target}: {gain_words(gains[-1])} expected")
+                left[result.get("reason", "")] += 1
+                few = result["state"] == "left" and left[result["reason"]] <= _SAID
+                tell = self._display.note if few else self._display.detail
+                outputs.say(shot.path, target, result, self._display, tell)
                 results.append({"photo": str(shot.path), "output": str(target), **result})
                 number += 1
                 bars.update(task, completed=number)
-            learned = self._learned[group.name, group.focal]
-            rows.append(GroupResult(group, profile, learned, states, tuple(gains)))
+            rows.append(
+                {
+                    "camera": group.camera,
+                    "lens": group.lens,
+                    "focal_length": group.focal,
+                    "profile": str(profile) if profile.exists() else None,
+                    "photos": len(group.shots),
+                    "learned_from": self._learned[group.name, group.focal],
+                    "corrected": states["corrected"],
+                    "corrected_before": states["kept"],
+                    "left": states["left"],
+                    "failed": states["failed"],
+                    "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
+                }
+            )
         bars.remove_task(task)
         return rows
 
@@ -275,36 +259,13 @@ class _Folder:
             f"strength {options.strength:g}, {options.bounds}, aperture {options.aperture}, least {SEEN_DB:g}"
         )
         known = self._journal.verdict("left", photo, under)
-        if known is not None and not self._options.force:
+        if known is not None and not options.force:
             return {"state": "left", "reason": known}
-        settings = LensSettings(aperture=self._options.aperture)
-        try:
-            result = outputs.correct_one(
-                shot.path, target, lens, settings, self._options, self._display, on_step, group.paths
-            )
-        except (LensModelError, OSError) as error:
-            return files.failed(error)
+        result = outputs.correct_one(shot.path, target, lens, options, self._display, on_step, group.paths)
         if result["state"] == "left":
             result["reason"] = why_left(result, lossy=shot.lossy)
             self._journal.note("left", photo, under, result["reason"])
         return result
-
-    def _say(
-        self, path: Path, target: Path, result: Mapping[str, Any], *, as_json: bool, often: bool
-    ) -> None:
-        if result["state"] == "failed":
-            self._display.error(f"{path}: {result['reason']}")
-        elif result["state"] == "left":
-            (self._display.detail if often else self._display.note)(
-                f"{path}: left as it is: {result['reason']}"
-            )
-        elif result["state"] == "kept":
-            self._display.detail(f"{target} is there already and was left alone; --force replaces it")
-        else:
-            if not as_json:
-                self._display.detail(f"{target}: {gain_words(result['expected_gain_db'])} expected")
-            for line in outputs.remarks(result):
-                self._display.detail(f"{path.name}, {line}")
 
 
 def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
@@ -328,42 +289,19 @@ def _learning(bars: Progress, task: TaskID, number: int, event: sampling.Calibra
     )
 
 
-def _document(row: GroupResult) -> dict[str, Any]:
-    return {
-        "camera": row.group.camera,
-        "lens": row.group.lens,
-        "focal_length": row.group.focal,
-        "profile": str(row.profile) if row.profile.exists() else None,
-        "photos": len(row.group.shots),
-        "learned_from": row.learned,
-        "corrected": row.states.get("corrected", 0),
-        "corrected_before": row.states.get("kept", 0),
-        "left": row.states.get("left", 0),
-        "failed": row.states.get("failed", 0),
-        "expected_gain_db": row.gain_db,
-    }
-
-
-def _table(rows: Sequence[GroupResult]) -> str:
-    head = [
-        *("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed"),
-        "expected gain",
-    ]
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    head = ("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed")
     lines = [
         [
-            row.group.camera,
-            row.group.lens,
-            row.group.focal,
-            str(len(row.group.shots)),
-            str(row.learned),
-            str(row.states.get("corrected", 0) + row.states.get("kept", 0)),
-            str(row.states.get("left", 0)),
-            str(row.states.get("failed", 0)),
-            "" if row.gain_db is None else gain_words(row.gain_db),
+            *(row[name] for name in ("camera", "lens", "focal_length")),
+            *(str(row[name]) for name in ("photos", "learned_from")),
+            str(row["corrected"] + row["corrected_before"]),
+            *(str(row[name]) for name in ("left", "failed")),
+            "" if row["expected_gain_db"] is None else gain_words(row["expected_gain_db"]),
         ]
         for row in rows
     ]
-    return aligned(head, lines, numbers=range(3, 9))
+    return aligned([*head, "expected gain"], lines, numbers=range(3, 9))
 
 
 # Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths

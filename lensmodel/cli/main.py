@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Final
+from importlib import import_module
+from typing import Annotated, Any, Final
 
 # Before NumPy is imported: the work is parallel over processes, and linear algebra libraries that
 # start threads of their own in each of them only get in one another's way.
@@ -14,11 +15,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from lensmodel.cli import ending
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import InterruptedByUser, UsageError
-from lensmodel.cli.on_demand import CommandEntry, OnDemand
 from lensmodel.core.errors import LensModelError
 
 ending.workers_ignore_it()
@@ -26,86 +27,114 @@ ending.workers_ignore_it()
 RESEARCH: Final = "Research"
 ADMINISTRATION: Final = "Administration"  # Panels of what few people need, after the commands of everyone
 
+COMMANDS: Final[Mapping[str, tuple[str, str, str | None]]] = {
+    "correct": ("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos.", None),
+    "calibrate": (
+        "lensmodel.cli.calibrate:calibrate",
+        "Learn the blur of one lens from photos and write it to a profile.",
+        None,
+    ),
+    "report": (
+        "lensmodel.cli.report:report",
+        "Say how sharp a lens is, whether it is centred, and which photo would help most.",
+        None,
+    ),
+    "measure": (
+        "lensmodel.cli.measure:measure",
+        "Measure the blur of a lens from photos made for the purpose.",
+        None,
+    ),
+    "serve": ("app.commands.service:serve", "Run the whole service: the API and a worker.", None),
+    "target": (
+        "lensmodel.cli.measure:target",
+        "Write the page to print for `lensmodel measure target`.",
+        RESEARCH,
+    ),
+    "psf": (
+        "lensmodel.cli.psf:psf",
+        "Show what the lens makes of a point of light at one place in the picture.",
+        RESEARCH,
+    ),
+    "export": (
+        "lensmodel.cli.report:export_psfs",
+        "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
+        RESEARCH,
+    ),
+    "demo": (
+        "lab.demo.command:demo",
+        "Run the whole process on a simulated lens whose true blur is known.",
+        RESEARCH,
+    ),
+    "reproduce": (
+        "lab.commands.reproduce:reproduce",
+        "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
+        RESEARCH,
+    ),
+    "bench": ("lab.commands.benchmarks:bench", "Measure quality and speed.", RESEARCH),
+    "api": (
+        "app.commands.service:api",
+        "Run only the API process, for installations on many machines.",
+        ADMINISTRATION,
+    ),
+    "worker": (
+        "app.commands.service:worker",
+        "Run only a worker process, for installations on many machines.",
+        ADMINISTRATION,
+    ),
+    "config": (
+        "app.commands.service:config",
+        "Print the effective settings as environment variables; secrets are masked.",
+        ADMINISTRATION,
+    ),
+    "doctor": (
+        "app.commands.upkeep:doctor",
+        "Check an installation, running or not: tables, blobs, and whether a worker is running.",
+        ADMINISTRATION,
+    ),
+    "backup": (
+        "app.commands.upkeep:backup",
+        "Copy all rows and blobs of an installation into a folder, even while it runs.",
+        ADMINISTRATION,
+    ),
+    "keys": (
+        "app.commands.keys:keys",
+        "Make, list and end the keys of a service that others can reach.",
+        ADMINISTRATION,
+    ),
+}
+"""Home, the first sentence of its help, and panel of each command in the order of the list."""
 
-class Commands(OnDemand):
-    """The commands as `--help` lists them; a test holds each against its own help."""
 
-    entries: ClassVar[Mapping[str, CommandEntry]] = {
-        "correct": CommandEntry("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos."),
-        "calibrate": CommandEntry(
-            "lensmodel.cli.calibrate:calibrate",
-            "Learn the blur of one lens from photos and write it to a profile.",
-        ),
-        "report": CommandEntry(
-            "lensmodel.cli.report:report",
-            "Say how sharp a lens is, whether it is centred, and which photo would help most.",
-        ),
-        "measure": CommandEntry(
-            "lensmodel.cli.measure:measure",
-            "Measure the blur of a lens from photos made for the purpose.",
-        ),
-        "serve": CommandEntry("app.commands.service:serve", "Run the whole service: the API and a worker."),
-        "target": CommandEntry(
-            "lensmodel.cli.measure:target",
-            "Write the page to print for `lensmodel measure target`.",
-            panel=RESEARCH,
-        ),
-        "psf": CommandEntry(
-            "lensmodel.cli.psf:psf",
-            "Show what the lens makes of a point of light at one place in the picture.",
-            panel=RESEARCH,
-        ),
-        "export": CommandEntry(
-            "lensmodel.cli.report:export_psfs",
-            "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
-            panel=RESEARCH,
-        ),
-        "demo": CommandEntry(
-            "lab.demo.command:demo",
-            "Run the whole process on a simulated lens whose true blur is known.",
-            panel=RESEARCH,
-        ),
-        "reproduce": CommandEntry(
-            "lab.commands.reproduce:reproduce",
-            "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
-            panel=RESEARCH,
-        ),
-        "bench": CommandEntry("lab.commands.benchmarks:bench", "Measure quality and speed.", panel=RESEARCH),
-        "api": CommandEntry(
-            "app.commands.service:api",
-            "Run only the API process, for installations on many machines.",
-            panel=ADMINISTRATION,
-        ),
-        "worker": CommandEntry(
-            "app.commands.service:worker",
-            "Run only a worker process, for installations on many machines.",
-            panel=ADMINISTRATION,
-        ),
-        "config": CommandEntry(
-            "app.commands.service:config",
-            "Print the effective settings as environment variables; secrets are masked.",
-            panel=ADMINISTRATION,
-        ),
-        "doctor": CommandEntry(
-            "app.commands.upkeep:doctor",
-            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
-            panel=ADMINISTRATION,
-        ),
-        "backup": CommandEntry(
-            "app.commands.upkeep:backup",
-            "Copy all rows and blobs of an installation into a folder, even while it runs.",
-            panel=ADMINISTRATION,
-        ),
-        "keys": CommandEntry(
-            "app.commands.keys:keys",
-            "Make, list and end the keys of a service that others can reach.",
-            panel=ADMINISTRATION,
-        ),
-    }
+class OnDemand(TyperGroup):
+    """`COMMANDS`, each imported when it is called: neither `--help` nor `config` waits for SciPy.
+
+    The home of one is its function, or the `typer.Typer` of a command with commands of its own.
+    """
+
+    def __init__(self, **given: Any) -> None:  # noqa: ANN401 - what Typer passes
+        super().__init__(**given)
+        for name, (_, summary, panel) in COMMANDS.items():
+            self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - Typer's own
+        """Import the command that the words name."""
+        name, stand_in, words = super().resolve_command(ctx, args)
+        return name, stand_in if name is None else self.imported(name), words
+
+    def imported(self, name: str) -> Any:  # noqa: ANN401 - a command or a group of Typer's
+        """Import a command and return it as Typer builds it from its signature."""
+        module, _, attribute = COMMANDS[name][0].partition(":")
+        value = getattr(import_module(module), attribute)
+        alone = typer.Typer(rich_markup_mode=self.rich_markup_mode, add_completion=False)
+        if isinstance(value, typer.Typer):
+            alone.add_typer(value, name=name)
+        else:
+            alone.command(name)(value)
+        return typer.main.get_group(alone).commands[name]
 
 
 app = typer.Typer(
-    cls=Commands,
+    cls=OnDemand,
     name="lensmodel",
     help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
     epilog="""Start with: lensmodel correct FOLDER --lens auto

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
 from lensmodel.cli import files
-from lensmodel.cli.console import Display
+from lensmodel.cli.console import Display, show_share
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import AnyLens, Aperture, Force, Json, Photos, Profile, Quiet, Verbose, choice
+from lensmodel.cli.options import (
+    AnyLens,
+    Aperture,
+    Force,
+    Json,
+    Photos,
+    Profile,
+    Quiet,
+    Verbose,
+    choice,
+    odd,
+    one_of,
+)
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import write_atomically
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 from lensmodel.measured.edges import chart_edges
 from lensmodel.model import save_profile
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
-from lensmodel.photo.values import ENDINGS
 from lensmodel.workflow import measuring, sampling
 from lensmodel.workflow.calibrating import Identity, difference, grown, joined
 from lensmodel.workflow.lens import Lens
@@ -30,26 +44,22 @@ PAPERS: Final = ("a2", "a3", "a4")
 USUAL_DETAIL: Final = 4000
 
 
-@dataclass(frozen=True, slots=True)
-class MeasurementOptions:
-    """The options of the command."""
-
-    kind: str
-    aperture: float | None
-    size: int
-    replace: bool
-    any_lens: bool
-    show: Path | None
-
-
 def measure(
     context: typer.Context,
-    kind: Annotated[str, typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar=f"<{'|'.join(KINDS)}>", parser=one_of("measure", KINDS), help="What the photos show."
+        ),
+    ],
     photos: Photos,
     profile: Profile = None,
     aperture: Aperture = None,
     size: Annotated[
-        int, typer.Option(min=9, max=101, metavar="N", help="Side of a PSF in pixels, an odd number.")
+        int,
+        typer.Option(
+            min=9, max=101, metavar="N", callback=odd, help="Side of a PSF in pixels, an odd number."
+        ),
     ] = 31,
     replace_blind: Annotated[
         bool,
@@ -94,42 +104,45 @@ def measure(
 
     Exit status: 0 all photos were used, 1 some were not, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
-    if kind not in KINDS:
-        raise UsageError(f"measure one of {', '.join(KINDS)}, not {kind!r}")
-    if size % 2 == 0:
-        raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
+    shown, target = Display.of(context, quiet=quiet, verbose=verbose), files.named(profile)
     if show is not None:
         if kind != "edges" or len(photos) != 1:
             raise UsageError("--show is for the edges of one photo: lensmodel measure edges PHOTO --show DIR")
         files.refuse_existing(*(show / name for name in EDGE_FILES), force=force)
-    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens, show)
-    _run(photos, files.named(profile), options, shown, as_json=json_output)
-
-
-def _run(
-    names: list[str], target: Path, options: MeasurementOptions, shown: Display, *, as_json: bool
-) -> None:
-    paths = files.photos(names)
-    if target.is_dir() or target.suffix.lower() in ENDINGS:
-        raise UsageError(f"{target} is no lens profile; name one, for example my-24mm.lensprofile")
+    paths = files.photos(photos)
+    files.refuse_photo(target, paths)
     with files.as_usage():
-        groups = measuring.measurements_of(options.kind, paths)
+        groups = measuring.measurements_of(kind, paths)
     results: list[dict[str, Any]] = []
     with shown.progress() as bars:
         task = bars.add_task("", total=len(groups))
         for number, group in enumerate(groups):
 
-            def on_step(done: int, total: int, number: int = number, name: str = group[0].name) -> None:
-                bars.update(task, description=f"{name}: measuring", completed=number + done / total)
+            def measured(photos: list[LinearPhoto], key: str, number: int = number) -> list[PsfSample]:
+                return measuring.samples_of_developed(
+                    kind,
+                    photos,
+                    photo_id=key,
+                    settings=LensSettings(aperture=aperture),
+                    size=size,
+                    on_step=partial(show_share, bars, task, number),
+                )
 
+            bars.update(task, description=f"{group[0].name}: measuring")
             try:
-                result = _add(group, target, options, on_step)
+                result = _add(
+                    group, target, measured, replace_blind=replace_blind, any_lens=any_lens, show=show
+                )
             except (LensModelError, OSError) as error:
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
             bars.update(task, completed=number + 1)
+    _tell(results, target, shown, as_json=json_output)
+
+
+def _tell(results: list[dict[str, Any]], target: Path, shown: Display, *, as_json: bool) -> None:
+    """Say what became of the photos; some that were not used are a failure."""
     if as_json:
         shown.document({"profile": str(target) if target.exists() else None, "results": results})
     for result in results:
@@ -144,38 +157,39 @@ def _run(
         raise typer.Exit(1)
 
 
-def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
+def _add(
+    group: tuple[Path, ...],
+    target: Path,
+    measured: Callable[[list[LinearPhoto], str], list[PsfSample]],
+    *,
+    replace_blind: bool,
+    any_lens: bool,
+    show: Path | None,
+) -> dict[str, Any]:
     """Measure on the photos of one measurement and save the profile; say what became of it."""
     path, key = group[0], sampling.photo_id(group[0])
     known = Lens.load(target) if target.exists() else None
-    if options.show is None and known is not None and key in known.profile.photos:
+    if show is None and known is not None and key in known.profile.photos:
         return {"state": "known"}
 
     def admit(info: PhotoInfo) -> None:
         why = None
-        if known is not None and not options.any_lens:
+        if known is not None and not any_lens:
             why = difference(known.profile.lens, known.profile.cameras, Identity.of(info.metadata))
         if why is not None:
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
 
     photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
-    if options.show is not None:
-        _show_edges(photos[0], options.show)
+    if show is not None:
+        _show_edges(photos[0], show)
         if known is not None and key in known.profile.photos:
             return {"state": "known"}
     identity = Identity.of(photos[0].info.metadata)
-    samples = measuring.samples_of_developed(
-        options.kind,
-        photos,
-        photo_id=key,
-        settings=LensSettings(aperture=options.aperture),
-        size=options.size,
-        on_step=on_step,
-    )
+    samples = measured(photos, key)
     if target.exists():  # another run may have added to it meanwhile
         known = Lens.load(target)
-    model = joined(None if known is None else known.model, samples, replace=options.replace)
-    profile = grown(known, model, {key: path.name}, [identity], any_lens=options.any_lens).profile
+    model = joined(None if known is None else known.model, samples, replace=replace_blind)
+    profile = grown(known, model, {key: path.name}, [identity], any_lens=any_lens).profile
     left = {sample.photo for sample in model.samples}  # `--replace` may have taken all of a photo
     profile = replace(profile, photos={name: label for name, label in profile.photos.items() if name in left})
     target.parent.mkdir(parents=True, exist_ok=True)

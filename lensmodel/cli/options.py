@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -16,20 +16,23 @@ from lensmodel.core import types
 
 
 def choice(name: str, kinds: Iterable[str], words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
-    """Return the option that takes one of some words; a refusal names the one that was probably meant."""
+    """Return the option that takes one of some words."""
     known = list(kinds)
+    return typer.Option(name, metavar=f"<{'|'.join(known)}>", parser=one_of(name, known), help=words)
+
+
+def one_of(name: str, kinds: Sequence[str]) -> Callable[[str], str]:
+    """Return what takes one of some words; a refusal names the one that was probably meant."""
 
     def parsed(text: str) -> str:
-        if text in known:
+        if text in kinds:
             return text
-        near = difflib.get_close_matches(text, known, n=len(known), cutoff=0.5)
-        likeness = {word: difflib.SequenceMatcher(None, text, word).ratio() for word in near}
-        hint = (
-            f"; did you mean {max(sorted(near, key=known.index), key=likeness.__getitem__)}?" if near else ""
-        )
-        raise UsageError(f"{name} must be {', '.join(known[:-1])} or {known[-1]}, got {text!r}{hint}")
+        likeness = {word: difflib.SequenceMatcher(None, text, word).ratio() for word in kinds}
+        nearest = max(likeness, key=likeness.__getitem__)
+        hint = f"; did you mean {nearest}?" if likeness[nearest] > 0.5 else ""
+        raise UsageError(f"{name} must be {', '.join(kinds[:-1])} or {kinds[-1]}, got {text!r}{hint}")
 
-    return typer.Option(name, metavar=f"<{'|'.join(known)}>", parser=parsed, help=words)
+    return parsed
 
 
 def f_number(text: str) -> float:
@@ -47,7 +50,8 @@ def _radians(angle: float | None) -> float | None:
     return angle
 
 
-def _odd(side: int) -> int:
+def odd(side: int) -> int:
+    """Refuse a kernel without a middle pixel."""
     if side % 2 == 0:
         raise UsageError(f"--size must be odd, got {side}; a PSF has one middle pixel")
     return side
@@ -102,7 +106,7 @@ ANGLE = typer.Option(
     "--phi", metavar="RADIAN", callback=_radians, help="Angle of the place, counter-clockwise from the right."
 )
 Size = Annotated[
-    int, typer.Option(min=3, max=255, metavar="N", callback=_odd, help="Side in pixels, an odd number.")
+    int, typer.Option(min=3, max=255, metavar="N", callback=odd, help="Side in pixels, an odd number.")
 ]
 WORKERS = typer.Option(
     "--workers",

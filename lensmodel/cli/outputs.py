@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import Progress, TaskID
-
 import lensmodel
 from lensmodel import correction
 from lensmodel.api import FORMATS
+from lensmodel.cli import files
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
@@ -86,8 +85,8 @@ def clashes(twice: Mapping[Path, Sequence[Path]], display: Display) -> list[dict
             "name each by itself, and correct them into different folders"
         )
         display.error(why)
-        state = {"state": "failed", "code": InvalidInputError.code, "reason": why}
-        results += [{"photo": str(path), "output": str(target), **state} for path in paths]
+        failed = files.failed(InvalidInputError(why))
+        results += [{"photo": str(path), "output": str(target), **failed} for path in paths]
     return results
 
 
@@ -99,17 +98,39 @@ def _names_a_picture(output: str) -> bool:
     )
 
 
+def check(options: CorrectionOptions) -> None:
+    """Refuse a method or an aperture that there is not, before any work."""
+    with files.as_usage():
+        if options.method is not None:
+            correction.deconvolvers.create(options.method)
+        LensSettings(aperture=options.aperture)
+
+
 def correct_one(
     path: Path,
     target: Path,
     lens: Lens,
-    settings: LensSettings,
     options: CorrectionOptions,
     display: Display,
     on_step: StepHook,
     siblings: Iterable[Path] = (),
 ) -> dict[str, Any]:
-    """Correct one photo; return what became of it: `corrected`, `kept` or `left`."""
+    """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
+    try:
+        return _corrected(path, target, lens, options, display, on_step, siblings)
+    except (LensModelError, OSError) as error:
+        return files.failed(error)
+
+
+def _corrected(
+    path: Path,
+    target: Path,
+    lens: Lens,
+    options: CorrectionOptions,
+    display: Display,
+    on_step: StepHook,
+    siblings: Iterable[Path],
+) -> dict[str, Any]:
     if path.stem.endswith(CORRECTED):
         raise InvalidInputError("it was corrected already; give the original")
     if target.exists() and not options.force:
@@ -123,14 +144,14 @@ def correct_one(
         display.note(f"{path}: {why}; it is corrected all the same, as you asked")
     elif not identity.names_lens and options.least_gain_db is None:  # else it was sorted by its camera
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
-    if settings.aperture is None and said.aperture is None:
+    if options.aperture is None and said.aperture is None:
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
     target.parent.mkdir(parents=True, exist_ok=True)
     corrected = lensmodel.correct(
         path,
         lens,
         target,
-        aperture=settings.aperture,
+        aperture=options.aperture,
         method=options.method,
         strength=options.strength,
         bounds=options.bounds,
@@ -153,11 +174,21 @@ def correct_one(
     }
 
 
-def remarks(result: Mapping[str, Any]) -> list[str]:
-    """Return remarks on a corrected photo."""
-    if result["nothing_to_correct"]:
-        return ["nothing to correct: its pixels stayed as they were"]
-    return [*audited(result["audit"]), *colour_remarks(result["chroma_step"])]
+def say(
+    path: Path, target: Path, result: Mapping[str, Any], display: Display, tell: Callable[[str], None]
+) -> None:
+    """Tell what became of a photo, but for the name of the file that was written."""
+    if result["state"] == "failed":
+        display.error(f"{path}: {result['reason']}")
+    elif result["state"] == "left":
+        tell(f"{path}: left as it is: {result['reason']}")
+    elif result["state"] == "kept":
+        tell(f"{target} is there already and was left alone; --force replaces it")
+    elif result["nothing_to_correct"]:
+        tell(f"{path.name}, nothing to correct: its pixels stayed as they were")
+    else:
+        for line in (*audited(result["audit"]), *colour_remarks(result["chroma_step"])):
+            tell(f"{path.name}, {line}")
 
 
 def colour_remarks(step: tuple[int, int]) -> list[str]:
@@ -178,8 +209,3 @@ def audited(audit: AuditReport) -> list[str]:
         if zone_audit.held_back > HELD
         and (most := sorted(zone_audit.checks, key=lambda name: -zone_audit.checks[name])[:3])
     ]
-
-
-def show_share(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
-    """Show that photo `number` is done as far as `done` of `total`."""
-    bars.update(task, completed=number + done / max(total, 1))

@@ -38,8 +38,7 @@ from app.store.database import Database
 from app.store.migrate import upgrade
 from app.store.tables import KeyRow
 from lab import targets
-from lensmodel.cli.main import app, main
-from lensmodel.cli.on_demand import OnDemand
+from lensmodel.cli.main import OnDemand, app, main
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings

@@ -32,7 +32,7 @@ from typer.testing import CliRunner
 
 from lensmodel import photo
 from lensmodel.cli import files, outputs
-from lensmodel.cli.console import EVERY_S, Pace, ProgressLines
+from lensmodel.cli.console import EVERY_S, Pace, PacedProgress
 from lensmodel.cli.main import app, main
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -74,7 +74,7 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     monkeypatch.chdir(folder)
     # a command that is quick says nothing of its progress, and a busy machine makes none slow
-    monkeypatch.setitem(ProgressLines.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
+    monkeypatch.setitem(PacedProgress.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
 
     def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
         capsys.readouterr()

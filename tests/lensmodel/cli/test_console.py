@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lensmodel.cli import console
-from lensmodel.cli.console import Pace, ProgressLines, aligned, clock, mtf50_words
+from lensmodel.cli.console import Pace, PacedProgress, aligned, clock, mtf50_words
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_columns_are_in_line_and_numbers_to_the_right() -> None:
 
 def test_without_a_terminal_progress_is_told_in_lines() -> None:
     said: list[str] = []
-    with ProgressLines(said.append, every_s=0.0) as lines:
+    with PacedProgress(say=said.append, every_s=0.0, disable=True) as lines:
         task = lines.add_task("learning from a.dng", total=4)
         lines.update(task, completed=1)
 
@@ -45,7 +45,7 @@ def test_time_left_is_told_by_the_pace_of_the_stage_that_runs(monkeypatch: pytes
     said: list[str] = []
     clock_s = iter((0.0, 60.0, 61.0, 64.0, 67.0))
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock_s))
-    lines = ProgressLines(said.append, every_s=0.0)
+    lines = PacedProgress(say=said.append, every_s=0.0, disable=True)
     task = lines.add_task("estimating", total=8)
     for done in (8, 0, 1, 2):  # a minute of one stage, then a photo each three seconds
         lines.update(task, completed=done)
@@ -76,7 +76,7 @@ def test_no_time_left_is_told_before_it_is_right_within_a_factor_of_two(pace: st
 
 def test_quick_work_says_nothing() -> None:
     said: list[str] = []
-    with ProgressLines(said.append) as lines:
+    with PacedProgress(say=said.append, disable=True) as lines:
         lines.update(lines.add_task("a", total=1), completed=1)
 
     assert said == []

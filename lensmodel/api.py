@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable
 from concurrent.futures import Executor
 from pathlib import Path
@@ -14,7 +15,6 @@ from lensmodel import correction, photo
 from lensmodel.blind import PsfEstimator, estimators
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.progress import ProgressLine
 from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
@@ -297,6 +297,28 @@ def correct(
         gps=gps_directory(source) if keep_location and source is not None else None,
     )
     return corrected
+
+
+class ProgressLine:
+    """One line on standard error, shown anew by a terminal; a notebook gets whole lines, others nothing."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._shown = self._terminal or "ipykernel" in sys.modules
+        self._width = 0
+
+    def say(self, text: str) -> None:
+        """Show a step in place of the last one."""
+        if self._terminal:
+            sys.stderr.write(f"\r{text:<{self._width}}")
+            sys.stderr.flush()
+            self._width = len(text)
+
+    def end(self, text: str) -> None:
+        """Show a line that stays."""
+        if self._shown:
+            sys.stderr.write(f"{chr(13) if self._terminal else ''}{text:<{self._width}}\n")
+            self._width = 0
 
 
 def _shown_events() -> EventHook:

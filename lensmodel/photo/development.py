@@ -20,7 +20,7 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.geometry import Frame
 from lensmodel.core.names import name_key, serial_key
-from lensmodel.core.types import NoiseModel, Planes
+from lensmodel.core.types import Planes
 from lensmodel.photo import opcodes
 from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
 from lensmodel.photo.defects import Suspects
@@ -29,7 +29,7 @@ from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
-from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw, stored_levels
+from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw
 from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags, is_centred, metadata_of
 from lensmodel.photo.turned import ORIENTATION, turns_to_sensor
 from lensmodel.photo.values import (
@@ -225,7 +225,9 @@ def _develop_raw(
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,
         sensor_noise=raw.sensor_noise,
-        coding_noise=_coding_noise(raw.planes, header.coarseness),
+        coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1][::257])
+        if header.coarseness
+        else None,
         cfa=raw.cfa,
         grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
         remarks=(
@@ -239,17 +241,6 @@ def _of_defects(count: int) -> tuple[str, ...]:
     if count < 2:
         return ("1 defective pixel of its sensor is replaced",) * count
     return (f"{count} defective pixels of its sensor are replaced",)
-
-
-def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:
-    """Noise of a lossy DNG's compression; `None` where there was none.
-
-    Which light its eight-bit numbers stand for is read from the planes: from the one that shows most of them.
-    """
-    if not coarseness:
-        return None
-    levels = [count for plane in planes if (count := stored_levels(plane)) is not None]
-    return coding_noise(coarseness, max(levels, key=len)) if levels else None
 
 
 def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:

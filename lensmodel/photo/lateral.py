@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,26 +66,6 @@ class LateralColour:
         k = half_diagonal / self.half_diagonal
         red, blue = ((a * k**3, b * k**2, c * k, v) for a, b, c, v in (self.red, self.blue))
         return replace(self, red=red, blue=blue, half_diagonal=half_diagonal)
-
-    def to_json(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, object]) -> LateralColour:
-        """Read what `to_json` wrote."""
-        try:
-            return cls(
-                _polynomial(values["red"]),
-                _polynomial(values["blue"]),
-                float(str(values["half_diagonal"])),
-                int(str(values.get("red_points", 0))),
-                int(str(values.get("blue_points", 0))),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise InvalidInputError(
-                f"not a lateral colour: {values!r}; expected what to_json writes"
-            ) from error
 
 
 def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[float] = 1.0) -> LateralColour:
@@ -271,10 +251,3 @@ def _huber(
         residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8
-
-
-def _polynomial(value: object) -> Polynomial:
-    if not isinstance(value, list | tuple) or len(value) != 4:
-        raise ValueError(value)
-    a, b, c, v = (float(term) for term in value)
-    return (a, b, c, v)

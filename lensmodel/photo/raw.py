@@ -20,7 +20,7 @@ from lensmodel.core.errors import (
     TruncatedImageError,
     UnsupportedFormatError,
 )
-from lensmodel.core.types import BayerPattern, NoiseModel, Plane, Planes
+from lensmodel.core.types import BayerPattern, NoiseModel, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
 from lensmodel.photo.defects import Suspects
 from lensmodel.photo.mosaic import Mosaic
@@ -42,9 +42,6 @@ _FULL: Final = 65535.0  # 16 bits
 
 _ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}
 """How LibRaw says that a picture is turned -> EXIF orientation."""
-
-_FEW_CODES: Final = 1024
-"""Levels of a plane that make rounding the larger part of its noise; sensors count 4096 and more."""
 
 _LEAST_SHARE: Final = 0.25
 """No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
@@ -235,19 +232,13 @@ def _plane_noise(
         shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
     """
     if sensor is None:
-        r, g, b = (estimate_noise(plane, step=1 / _FULL, codes=stored_levels(plane)) for plane in planes)
+        r, g, b = (estimate_noise(plane, step=1 / _FULL) for plane in planes)
         return r, g, b
     weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
     shot = (_NOISE_MIX * weight) @ np.array([model.shot for model in sensor])
     read = (_NOISE_MIX * weight**2) @ np.array([model.read for model in sensor])
     r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
     return r, g, b
-
-
-def stored_levels(plane: Plane) -> NDArray[np.floating] | None:
-    """Levels of a plane where they are as few as in files that were rounded to 8 bits and packed."""
-    levels = np.unique(plane[:: max(1, plane.shape[0] // 256)])
-    return levels if 2 < levels.size <= _FEW_CODES else None
 
 
 def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:

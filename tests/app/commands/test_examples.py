@@ -81,7 +81,7 @@ def test_each_example_is_understood_by_its_command(line: str) -> None:
         assert COMMANDS[name].make_context(name, words).params
 
 
-@pytest.mark.parametrize("name", ROOT.entries)
+@pytest.mark.parametrize("name", ROOT.commands)
 def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: str) -> None:
     listed, command = ROOT.commands[name], ROOT.imported(name)
 
@@ -90,7 +90,7 @@ def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: s
 
 
 def test_five_commands_are_for_everyone_and_twelve_in_panels_of_their_own() -> None:
-    panels = Counter(entry.panel for entry in ROOT.entries.values())
+    panels = Counter(command.rich_help_panel for command in ROOT.commands.values())
 
     assert panels == {None: 5, "Research": 6, "Administration": 6}
 

@@ -1,4 +1,3 @@
-import json
 from collections.abc import Callable
 from functools import cache
 
@@ -117,18 +116,6 @@ def test_displacement_is_outwards_where_v_is_above_one() -> None:
     assert lateral.displacement(1.0, "r") == pytest.approx(1.0)
     assert lateral.displacement(0.5, "b") == pytest.approx(-0.5)
     assert lateral.displacement(0.5, "g") == 0.0
-
-
-def test_lateral_colour_survives_json() -> None:
-    lateral = LateralColour(RED, BLUE, 551.2, 40, 41)
-
-    assert LateralColour.from_json(json.loads(json.dumps(lateral.to_json()))) == lateral
-
-
-@pytest.mark.parametrize("values", [{}, {"red": [1], "blue": [1], "half_diagonal": 3}, {"red": None}])
-def test_json_of_something_else_is_refused(values: dict) -> None:
-    with pytest.raises(InvalidInputError, match="not a lateral colour"):
-        LateralColour.from_json(values)
 
 
 def test_absurd_scale_is_refused() -> None:

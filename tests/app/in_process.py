@@ -9,14 +9,17 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 
 from lensmodel.cli.main import main
 
 
-def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the command in this process, which saves seconds of imports a run."""
+def lensmodel(
+    *words: str | Path, cwd: Path, terminal: TextIO | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run the command in this process, which saves seconds of imports a run; a terminal gets its errors."""
     root, out, err, status = logging.getLogger(), io.StringIO(), io.StringIO(), 0
     handlers, level = list(root.handlers), root.level
     signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -24,10 +27,10 @@ def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         with (
             pytest.MonkeyPatch.context() as patched,
             contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(err),
+            contextlib.redirect_stderr(terminal or err),
         ):
             patched.chdir(cwd)
-            patched.setattr(sys, "argv", ["lensmodel", *words])
+            patched.setattr(sys, "argv", ["lensmodel", *map(str, words)])
             main()
     except SystemExit as end:
         status = int(end.code or 0)

@@ -93,13 +93,6 @@ def test_the_grid_has_an_axis_for_each_dimension_and_is_drawn(tmp_path: Path) ->
     assert (tmp_path / "field.png").stat().st_size > 1000
 
 
-def test_a_question_that_no_photo_can_answer_warns() -> None:
-    stack = [gaussian(9, np.eye(2))] * 4
-    known = Lens.from_kernels(stack, [0.1, 0.12, 0.14, 0.16], [0.0, 0.1, 0.2, 0.3], aperture=2.0)
-    with pytest.warns(UserWarning, match="no photo shows"):
-        known.psf(0.95, 3.0, aperture=22.0, size=9)
-
-
 def test_many_kernels_at_once_are_those_of_single_questions() -> None:
     lens, _ = field_of_gaussians()
 

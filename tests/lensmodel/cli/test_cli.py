@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import in_process
 import numpy as np
 import pytest
 import rawpy
@@ -33,7 +34,7 @@ from typer.testing import CliRunner
 from lensmodel import photo
 from lensmodel.cli import files, outputs
 from lensmodel.cli.console import EVERY_S, Pace, PacedProgress
-from lensmodel.cli.main import app, main
+from lensmodel.cli.main import app
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -50,47 +51,15 @@ def command(*words: str | Path) -> list[str]:
     return [sys.executable, "-m", "lensmodel", *map(str, words)]
 
 
-def lensmodel(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    found = {**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1])}
-    return subprocess.run(
-        command(*words),
-        cwd=cwd,
-        env=found,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=stretched(PATIENCE_S),
-    )
-
-
 Here = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture
-def here(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Here]:
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
     """Run `main` in this process, in that folder: saves two seconds of imports where nothing is lost."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    monkeypatch.chdir(folder)
     # a command that is quick says nothing of its progress, and a busy machine makes none slow
     monkeypatch.setitem(PacedProgress.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
-
-    def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
-        capsys.readouterr()
-        monkeypatch.setattr(sys, "argv", ["lensmodel", *map(str, words)])
-        try:
-            main()
-            status = 0
-        except SystemExit as end:
-            status = int(end.code or 0)
-        said = capsys.readouterr()
-        return subprocess.CompletedProcess(words, status, said.out, said.err)
-
-    yield run
-    root.handlers[:], root.level = handlers, level
-    for number, handler in signals.items():
-        signal.signal(number, handler)
+    return partial(in_process.lensmodel, cwd=folder)
 
 
 def start(*words: str | Path, cwd: Path) -> subprocess.Popen[str]:
@@ -180,9 +149,9 @@ def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
 
 
 @pytest.mark.slow
-def test_calibrate_force_begins_anew(folder: Path) -> None:
+def test_calibrate_force_begins_anew(folder: Path, here: Here) -> None:
     write_photo(folder / "one.dng", 1)
-    done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "default", "--force", cwd=folder)
+    done = here("calibrate", "one.dng", "-p", PROFILE, "--estimator", "default", "--force")
 
     assert done.returncode == 0, done.stderr
     assert list(load_profile(folder / PROFILE).photos.values()) == ["one.dng"]
@@ -712,11 +681,10 @@ def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
         seen: list[bytes] = []
         reader = threading.Thread(target=lambda: seen.extend(iter(partial(_read, ours), b"")))
         reader.start()
-        with os.fdopen(theirs, "w") as terminal, monkeypatch.context() as patch:
-            patch.setenv("TERM", "xterm")
-            patch.setenv("COLUMNS", "120")
-            patch.setattr(sys, "stderr", terminal)
-            said = here(*words).stdout
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "120")
+        with os.fdopen(theirs, "w") as terminal:
+            said = here(*words, terminal=terminal).stdout
         reader.join()
         os.close(ours)
         return said, b"".join(seen).decode()

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import logging
-import signal
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from in_process import lensmodel as command
 from running import write_photo
 
 import lensmodel
-from lensmodel.cli.main import main
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
 from lensmodel.workflow import sampling
 
@@ -33,17 +29,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path) -> Path:
     (tmp_path / "holiday").mkdir()
     write_photo(tmp_path / "holiday" / "one.dng", 1)
-    monkeypatch.chdir(tmp_path)
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield tmp_path
-    root.handlers[:], root.level = handlers, level
-    for number, handler in signals.items():
-        signal.signal(number, handler)
+    return tmp_path
 
 
 class Everywhere:
@@ -73,28 +62,17 @@ def test_the_library_takes_a_name_or_an_object(folder: Path, asked: list[object]
     ("option", "taken"), [(("--selector", "good-regions"), "good-regions"), ((), "r-map")]
 )
 def test_the_command_passes_its_option_on(
-    words: tuple[str, ...],
-    option: tuple[str, ...],
-    taken: str,
-    folder: Path,
-    asked: list[object],
-    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...], option: tuple[str, ...], taken: str, folder: Path, asked: list[object]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["lensmodel", *words, *option, "--workers", "1"])
-    with pytest.raises(SystemExit):  # the photo did not count
-        main()
+    command(*words, *option, "--workers", "1", cwd=folder)
 
     assert asked == [taken]
 
 
-def test_a_selector_that_is_not_there_is_refused_by_name(
-    folder: Path, asked: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_selector_that_is_not_there_is_refused_by_name(folder: Path, asked: list[object]) -> None:
     words = ("calibrate", "holiday/one.dng", "--profile", "new.lensprofile", "--selector", "best")
-    monkeypatch.setattr(sys, "argv", ["lensmodel", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
+    done = command(*words, cwd=folder)
 
-    assert ended.value.code == 2
-    assert "good-regions" in capsys.readouterr().err
+    assert done.returncode == 2
+    assert "good-regions" in done.stderr
     assert asked == []

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def test_raw_numbers_become_linear_light_with_saturation_at_one(tmp_path: Path, 
     assert (developed.planes[:, 32, 32] == 1.0).all()
 
 
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG"])
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, pattern: str) -> None:
     mosaic = raw_numbers(textured(64, 96))
     write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, pattern=pattern)
@@ -70,18 +71,14 @@ def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, p
     developed = photo.develop(tmp_path / "x.dng")
 
     assert developed.cfa is not None
+    assert developed.pipeline == "raw/ahd/1"
+    assert developed.planes.max() < 0.85  # the brightest pixel does not become the white
     assert "".join("RGB"[c] for row in developed.cfa for c in row) == pattern
     rows, cols = np.indices(mosaic.shape)
     channel = np.asarray(developed.cfa)[rows % 2, cols % 2]
     at_sites = np.take_along_axis(developed.planes, channel[None], axis=0)[0]
     inside = (slice(8, -8), slice(8, -8))
     np.testing.assert_allclose(at_sites[inside], ((mosaic - BLACK) / (WHITE - BLACK))[inside], atol=2e-4)
-
-
-def test_the_brightest_pixel_does_not_become_the_white(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
-
-    assert photo.develop(tmp_path / "x.dng").planes.max() < 0.85
 
 
 def test_saturation_is_where_the_clipped_pixels_pile_up_and_not_where_the_file_says(tmp_path: Path) -> None:
@@ -135,17 +132,6 @@ def test_white_balance_is_told_but_not_applied(tmp_path: Path) -> None:
     assert (r, b) == pytest.approx((g, g), abs=2e-3)
 
 
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_colours_land_in_the_planes_of_their_names(tmp_path: Path, pattern: str) -> None:
-    levels = {"R": 0.6, "G": 0.3, "B": 0.1}
-    mosaic = np.zeros((64, 64))
-    for k, letter in enumerate(pattern):
-        mosaic[k // 2 :: 2, k % 2 :: 2] = levels[letter]
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(mosaic), black=BLACK, white=WHITE, pattern=pattern)
-
-    assert photo.develop(tmp_path / "x.dng").planes[:, 30, 30] == pytest.approx((0.6, 0.3, 0.1), abs=1e-3)
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_raw_stays_in_sensor_orientation(tmp_path: Path, orientation: int) -> None:
     scene = np.full((64, 96), 0.2) + 0.0005 * np.arange(96)
@@ -172,12 +158,6 @@ def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path) -> None
         truth = (grey * share)[16:-16, 16:-16]
         slope = np.polyfit(truth.ravel(), plane.ravel(), 1)[0]
         assert slope == pytest.approx(1.0, abs=0.12)
-
-
-def test_the_pipeline_names_what_was_done(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
-
-    assert photo.develop(tmp_path / "x.dng").pipeline == "raw/ahd/1"
 
 
 def test_a_linear_dng_keeps_its_planes(tmp_path: Path) -> None:
@@ -217,27 +197,6 @@ def test_white_of_a_linear_dng_with_black_levels_is_one(
     assert developed.planes[:, 15, 15] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_raw_data_without_a_picture_are_refused(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "x.dng", np.full((64, 64), 3000, dtype=np.uint16), black=BLACK, white=WHITE)
-    with pytest.raises(RawDecodeError, match="3000"):
-        photo.develop(tmp_path / "x.dng")
-
-
-def test_a_black_frame_is_refused(tmp_path: Path) -> None:
-    dark = np.random.default_rng(0).integers(BLACK - 40, BLACK + 1, (64, 64), dtype=np.uint16)
-    write_bayer_dng(tmp_path / "x.dng", dark, black=BLACK, white=WHITE)
-    with pytest.raises(RawDecodeError, match="black"):
-        photo.develop(tmp_path / "x.dng")
-
-
-def test_empty_rows_mean_that_the_data_were_cut_off(tmp_path: Path) -> None:
-    mosaic = raw_numbers(textured(64, 64))
-    mosaic[40:] = 0
-    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
-    with pytest.raises(TruncatedImageError, match="38% of the rows"):
-        photo.develop(tmp_path / "x.dng")
-
-
 def test_a_saturated_sky_is_no_damage(tmp_path: Path) -> None:
     mosaic = raw_numbers(textured(64, 64))
     mosaic[:20] = WHITE
@@ -246,11 +205,38 @@ def test_a_saturated_sky_is_no_damage(tmp_path: Path) -> None:
     assert photo.develop(tmp_path / "x.dng").planes[1, 5, 5] == 1.0
 
 
-def test_rows_of_random_numbers_mean_that_the_decoding_went_wrong(tmp_path: Path) -> None:
+def _even(mosaic: NDArray[np.uint16]) -> None:
+    mosaic[:] = 3000
+
+
+def _dark(mosaic: NDArray[np.uint16]) -> None:
+    mosaic[:] = np.random.default_rng(0).integers(BLACK - 40, BLACK + 1, mosaic.shape)
+
+
+def _cut_off(mosaic: NDArray[np.uint16]) -> None:
+    mosaic[60:] = 0
+
+
+def _random(mosaic: NDArray[np.uint16]) -> None:
+    mosaic[32:] = np.random.default_rng(0).integers(0, WHITE, (64, 96))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "text"),
+    [
+        (_even, RawDecodeError, "3000"),
+        (_dark, RawDecodeError, "black"),
+        (_cut_off, TruncatedImageError, "38% of the rows"),
+        (_random, RawDecodeError, "random"),
+    ],
+)
+def test_raw_data_that_are_no_picture_are_refused(
+    spoil: Callable[[NDArray[np.uint16]], None], error: type[Exception], text: str, tmp_path: Path
+) -> None:
     mosaic = raw_numbers(textured(96, 96))
-    mosaic[32:] = np.random.default_rng(0).integers(0, WHITE, (64, 96), dtype=np.uint16)
+    spoil(mosaic)
     write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
-    with pytest.raises(RawDecodeError, match="random"):
+    with pytest.raises(error, match=text):
         photo.develop(tmp_path / "x.dng")
 
 
@@ -396,12 +382,6 @@ def test_only_the_first_picture_of_a_stereo_jpeg_is_the_photo(tmp_path: Path) ->
     left.save(tmp_path / "x.jpg", "MPO", save_all=True, append_images=[right])
 
     assert photo.develop(tmp_path / "x.jpg").planes.min() > 0.99
-
-
-def test_a_cmyk_tiff_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path, "tiff", np.zeros((40, 60, 4), dtype=np.uint8), photometric="separated")
-    with pytest.raises(UnsupportedFormatError, match="convert it to RGB"):
-        photo.develop(path)
 
 
 def test_the_curve_of_an_icc_profile_is_used_and_its_primaries_are_kept(tmp_path: Path) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import exifread
 import numpy as np
@@ -21,7 +21,7 @@ SHOT = PhotoMetadata(
     camera_maker="Maker",
     camera_model="Body 1",
     body_serial="B123",
-    lens=LensIdentity("Glass", "Glass 24-70mm f/2.8", "L0045", "exif"),
+    lens=LensIdentity("Glass", "Güte 24-70mm f/2.8", "L0045", "exif"),
     aperture=2.8,
     focal_mm=35.0,
     focus_m=3.25,
@@ -37,20 +37,6 @@ def mosaic(height: int = 64, width: int = 96) -> NDArray[np.uint16]:
     return np.random.default_rng(0).integers(400, 15873, (height, width), dtype=np.uint16)
 
 
-def linear(path: Path) -> NDArray[np.uint16]:
-    """What LibRaw makes of a file without touching levels or colours."""
-    with rawpy.imread(str(path)) as raw:
-        return raw.postprocess(
-            gamma=(1, 1),
-            no_auto_bright=True,
-            adjust_maximum_thr=0.0,
-            output_color=rawpy.ColorSpace.raw,
-            user_wb=[1, 1, 1, 1],
-            user_flip=0,
-            output_bps=16,
-        )
-
-
 @pytest.mark.parametrize("pattern", BAYER_PATTERNS)
 def test_raw_numbers_and_pattern_come_back(tmp_path: Path, pattern: str) -> None:
     written = mosaic()
@@ -62,24 +48,6 @@ def test_raw_numbers_and_pattern_come_back(tmp_path: Path, pattern: str) -> None
         assert letters == pattern
         assert raw.black_level_per_channel == [512] * 4
         assert raw.white_level == 15872
-
-
-def test_bayer_levels_come_back_within_four(tmp_path: Path) -> None:
-    for level in (0.01, 0.37, 0.9):
-        number = round(512 + level * 15360)
-        flat = np.full((32, 48), number, dtype=np.uint16)
-        write_bayer_dng(tmp_path / "flat.dng", flat, black=512, white=15872)
-
-        assert np.abs(linear(tmp_path / "flat.dng") - (number - 512) / 15360 * 65535).max() <= 4
-
-
-def test_linear_levels_come_back_within_four(tmp_path: Path) -> None:
-    ramp = np.linspace(0, 65535, 160).round().astype(np.uint16)
-    planes = np.stack([np.tile(ramp, (40, 1)), np.tile(ramp // 2, (40, 1)), np.tile(ramp[::-1], (40, 1))])
-    write_linear_dng(tmp_path / "l.dng", planes, as_shot_neutral=(0.5, 1.0, 0.6), metadata=SHOT)
-
-    difference = linear(tmp_path / "l.dng").astype(int).transpose(2, 0, 1) - planes
-    assert np.abs(difference).max() <= 4
 
 
 def test_colours_come_out_as_the_matrix_and_the_neutral_say(tmp_path: Path) -> None:
@@ -102,15 +70,18 @@ def test_colours_come_out_as_the_matrix_and_the_neutral_say(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("kind", ["bayer", "linear"])
-def test_every_tag_comes_back(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "tags.dng"
-    if kind == "bayer":
-        write_bayer_dng(path, mosaic(), black=512, white=15872, metadata=SHOT, description="a test")
-    else:
-        write_linear_dng(path, np.zeros((3, 32, 32), dtype=np.uint16), metadata=SHOT, description="a test")
-    with path.open("rb") as file:
-        tags = exifread.process_file(file)
+def test_every_tag_comes_back_and_unknown_ones_are_left_out(tmp_path: Path, kind: str) -> None:
+    def tags_of(metadata: PhotoMetadata) -> dict[str, Any]:
+        path = tmp_path / "tags.dng"
+        if kind == "bayer":
+            write_bayer_dng(path, mosaic(), black=512, white=15872, metadata=metadata, description="a test")
+        else:
+            nothing = np.zeros((3, 32, 32), dtype=np.uint16)
+            write_linear_dng(path, nothing, metadata=metadata, description="a test")
+        with path.open("rb") as file:
+            return exifread.process_file(file)
 
+    tags = tags_of(SHOT)
     wanted = {
         "Image Make": "Maker",
         "Image Model": "Body 1",
@@ -125,100 +96,36 @@ def test_every_tag_comes_back(tmp_path: Path, kind: str) -> None:
         "EXIF DateTimeOriginal": "2026:03:04 05:06:07",
         "EXIF BodySerialNumber": "B123",
         "EXIF LensMake": "Glass",
-        "EXIF LensModel": "Glass 24-70mm f/2.8",
+        "EXIF LensModel": "G?te 24-70mm f/2.8",
         "EXIF LensSerialNumber": "L0045",
         "EXIF FocalPlaneResolutionUnit": "3",
     }
     assert {name: str(tags[name]) for name in wanted} == wanted
     per_cm = tags["EXIF FocalPlaneXResolution"].values[0]
     assert 10_000 / (per_cm.num / per_cm.den) == pytest.approx(4.5)
+    bare = tags_of(PhotoMetadata(focus_m=math.inf))
+    assert str(bare["EXIF SubjectDistance"]) == str(2**32 - 1)  # infinity, as EXIF says it
+    assert not {"LensModel", "LensSerialNumber", "FNumber", "FocalLength", "ISOSpeedRatings"} & {
+        name.removeprefix("EXIF ") for name in bare
+    }
 
 
-def test_unknown_values_are_left_out_not_written_as_zero(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "bare.dng", mosaic(), black=512, white=15872)
-    with (tmp_path / "bare.dng").open("rb") as file:
-        tags = exifread.process_file(file)
-
-    missing = (
-        "LensModel",
-        "LensSerialNumber",
-        "FNumber",
-        "FocalLength",
-        "SubjectDistance",
-        "ISOSpeedRatings",
-    )
-    assert not [name for name in missing if f"EXIF {name}" in tags]
-
-
-def test_focus_at_infinity_is_written_as_exif_says(tmp_path: Path) -> None:
-    write_bayer_dng(
-        tmp_path / "far.dng", mosaic(), black=0, white=65535, metadata=PhotoMetadata(focus_m=math.inf)
-    )
-    with (tmp_path / "far.dng").open("rb") as file:
-        assert str(exifread.process_file(file)["EXIF SubjectDistance"]) == str(2**32 - 1)
-
-
-def test_orientation_turns_the_developed_picture_only(tmp_path: Path) -> None:
-    write_bayer_dng(tmp_path / "turned.dng", mosaic(64, 96), black=512, white=15872, metadata=SHOT)
-
-    with rawpy.imread(str(tmp_path / "turned.dng")) as raw:
-        assert raw.raw_image.shape == (64, 96)
-        assert raw.postprocess().shape == (96, 64, 3)
-    assert linear(tmp_path / "turned.dng").shape == (64, 96, 3)
-
-
-def test_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "kept.dng"
-    target.write_bytes(b"before")
-
-    def no_space(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", no_space)
-    with pytest.raises(OSError, match="No space"):
-        write_bayer_dng(target, mosaic(), black=512, white=15872)
-
-    assert target.read_bytes() == b"before"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_files_are_as_private_as_their_writer_asks(tmp_path: Path) -> None:
-    before = os.umask(0o077)
-    try:
-        write_bayer_dng(tmp_path / "x.dng", mosaic(), black=512, white=15872)
-    finally:
-        os.umask(before)
-
-    assert (tmp_path / "x.dng").stat().st_mode & 0o777 == 0o600
-
-
-def test_texts_beyond_ascii_do_not_break_the_file(tmp_path: Path) -> None:
-    write_bayer_dng(
-        tmp_path / "u.dng",
-        mosaic(),
-        black=512,
-        white=15872,
-        metadata=PhotoMetadata(lens=LensIdentity(model="Güte 50mm")),
-    )
-    with (tmp_path / "u.dng").open("rb") as file:
-        assert str(exifread.process_file(file)["EXIF LensModel"]) == "G?te 50mm"
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "no.dng"
-    with pytest.raises(InvalidInputError, match="even sides"):
-        write_bayer_dng(path, mosaic(63, 96), black=0, white=100)
-    with pytest.raises(InvalidInputError, match="pattern"):
-        write_bayer_dng(path, mosaic(), black=0, white=100, pattern="RGBW")
-    with pytest.raises(InvalidInputError, match="black < white"):
-        write_bayer_dng(path, mosaic(), black=100, white=100)
-    with pytest.raises(InvalidInputError, match="3 x 3"):
-        write_bayer_dng(path, mosaic(), black=0, white=100, color_matrix=np.eye(2))
-    with pytest.raises(InvalidInputError, match="positive"):
-        write_bayer_dng(path, mosaic(), black=0, white=100, as_shot_neutral=(0.0, 1.0, 1.0))
-    with pytest.raises(InvalidInputError, match="shape"):
-        write_linear_dng(path, np.zeros((32, 32, 3), dtype=np.uint16))
-    assert not path.exists()
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"mosaic": mosaic(63, 96)}, "even sides"),
+        ({"pattern": "RGBW"}, "pattern"),
+        ({"black": 100}, "black < white"),
+        ({"color_matrix": np.eye(2)}, "3 x 3"),
+        ({"as_shot_neutral": (0.0, 1.0, 1.0)}, "positive"),
+    ],
+    ids=str,
+)
+def test_wrong_arguments_are_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"mosaic": mosaic(), "black": 0, "white": 100, **change}
+    with pytest.raises(InvalidInputError, match=text):
+        write_bayer_dng(tmp_path / "no.dng", **given)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ METADATA = photo.PhotoMetadata(
     iso=400,
     exposure_s=1 / 160,
     taken_at=datetime(2020, 2, 3, 4, 5, 6),  # noqa: DTZ001  the camera's clock has no zone
+    focus_m=math.inf,
 )
 PLAIN = photo.Encoding(metadata=METADATA)
 FORMATS = ("tiff16", "png16", "png8", "jpeg", "dng")
@@ -269,14 +270,9 @@ def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: ph
     seen = photo.read_metadata(path)
 
     assert seen == METADATA.without_serials()
-
-
-@pytest.mark.parametrize("output", FORMATS)
-def test_focus_at_infinity_stays_there(tmp_path: Path, output: photo.OutputFormat) -> None:
-    far = replace(PLAIN, metadata=replace(METADATA, focus_m=math.inf))
-    photo.write_image(tmp_path / "x", planes(), far, format=output)
-
-    assert photo.read_metadata(tmp_path / "x").focus_m == math.inf
+    assert not [word for word in (b"BODY1", b"LENS1", b"GPS") if word in path.read_bytes()]
+    photo.write_image(tmp_path / "again", planes(), PLAIN, format=output, description="corrected")
+    assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
 @pytest.mark.parametrize("output", ["tiff16", "jpeg", "png8"])
@@ -295,19 +291,6 @@ def test_pillow_reads_the_numbers_in_exif(tmp_path: Path, output: photo.OutputFo
     assert float(exif[0x829D]) == 2.8
     assert float(exif[0x829A]) == pytest.approx(1 / 160)
     assert (exif[0x8827], exif[0xA434]) == (400, "EF24mm f/1.4L")
-
-
-@pytest.mark.parametrize("output", FORMATS)
-def test_serials_positions_and_maker_notes_are_not_written(
-    tmp_path: Path, output: photo.OutputFormat
-) -> None:
-    path = tmp_path / "x"
-    photo.write_image(path, planes(), PLAIN, format=output)
-    data = path.read_bytes()
-
-    assert b"BODY1" not in data
-    assert b"LENS1" not in data
-    assert b"GPS" not in data
 
 
 @pytest.fixture(scope="module")
@@ -389,13 +372,6 @@ def test_jpeg_keeps_the_colour_of_single_pixels(tmp_path: Path) -> None:
     assert back[11, 10, 0] < 25
 
 
-def test_the_same_planes_give_the_same_bytes(tmp_path: Path) -> None:
-    for output in FORMATS:
-        photo.write_image(tmp_path / "a", planes(), PLAIN, format=output)
-        photo.write_image(tmp_path / "b", planes(), PLAIN, format=output)
-        assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes(), output
-
-
 @pytest.mark.parametrize("output", ["tiff16", "png16", "jpeg"])
 def test_a_failed_write_leaves_the_old_file_and_no_remains(
     tmp_path: Path, output: photo.OutputFormat, monkeypatch: pytest.MonkeyPatch
@@ -452,8 +428,6 @@ def test_the_xmp_packet_says_what_was_done_and_which_lens_it_was(
     event = next(one for one in packet.iter(f"{rdf}li") if one.get(f"{events}action"))
     assert event.get(f"{events}parameters") == done
     assert done in [one.text for one in packet.iter(f"{rdf}li")]
-    assert b"LENS1" not in data
-    assert b"BODY1" not in data
 
 
 def test_a_packet_of_names_that_xml_cannot_write_is_still_xml() -> None:

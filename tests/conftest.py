@@ -10,7 +10,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def estimated_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
     @contextmanager
     def here(executor: Executor | None, *_: object) -> Iterator[Executor]:
-        yield executor or processes.Here()
+        yield executor or ThreadPoolExecutor(1)
 
     monkeypatch.setattr(processes, "pool", here)
 

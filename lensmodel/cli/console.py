@@ -91,11 +91,10 @@ class Display:
         if self.verbose and not self.quiet:
             self.error(text)
 
-    def progress_line(self, text: str, seconds: float, left: float | None = None) -> None:
-        """Tell a step of long work, with the time since its start and the time left, on standard error."""
+    def progress_line(self, text: str, seconds: float) -> None:
+        """Tell a step of long work, with the time since its start, on standard error."""
         if not self.quiet:
-            ahead = "" if left is None else f", ETA {clock(left)}"
-            typer.echo(f"[{clock(seconds):>5}{ahead}] {text}", err=True)
+            typer.echo(f"[{clock(seconds):>5}] {text}", err=True)
 
     def error(self, text: str) -> None:
         """Tell what went wrong."""

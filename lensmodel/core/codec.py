@@ -8,7 +8,6 @@ import types
 import typing
 from collections.abc import Mapping
 from datetime import datetime
-from enum import Enum
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,8 +21,6 @@ def to_json(value: Any) -> Any:
     """Turn dataclasses, tuples, mappings, bytes, dates and numbers into what `json` can write."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Enum):
-        return value.value
     if value is None or isinstance(value, (bool, int, float, str)):
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic):
@@ -74,8 +71,6 @@ def _build(kind: Any, stored: Any) -> Any:
         return base64.b64decode(stored["base64"], validate=True)
     if kind is datetime:
         return datetime.fromisoformat(stored)
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        return kind(stored)
     if kind is float and stored is not None:
         return float(stored)
     return stored

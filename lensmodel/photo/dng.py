@@ -77,7 +77,6 @@ def write_linear_dng(
     path: str | Path,
     planes: NDArray[np.uint16],
     *,
-    white: int = 65535,
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
     metadata: PhotoMetadata = UNKNOWN,
@@ -93,7 +92,7 @@ def write_linear_dng(
         raise InvalidInputError(f"planes are uint16 of shape (3, H, W), got {planes.dtype} {planes.shape}")
     tags = _common_tags(3, _LINEAR_RAW, metadata, description, baseline_exposure)
     # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
-    _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
+    _colour_tags(tags, 3, black=0, white=65535, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
     if xmp:
         tags.raw(700, BYTE, xmp)
     for tag, opcodes in zip(_OPCODE_LISTS, (opcodes_2, opcodes_3), strict=True):

@@ -126,16 +126,16 @@ def write_image(
     if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
         color_space = "camera-linear"
     target = _target(encoding, color_space)
+    carried = _Carried(encoding, description, xmp, gps, target.icc)
+    top = {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535)
     with atomic(Path(path)) as file:
+        pixels = _encoded(planes, target, top)
         if format == "jpeg":
-            pixels = _encoded(planes, target, 255)
-            _write_jpeg(file, pixels, target.icc, encoding, description, xmp, gps, quality=quality)
-        elif format in {"tiff16", "tiff32"}:
-            pixels = _encoded(planes, target, 65535 if format == "tiff16" else None)
-            _write_tiff(file, pixels, target.icc, encoding, description, xmp, gps)
+            _write_jpeg(file, pixels, carried, quality)
+        elif format.startswith("tiff"):
+            _write_tiff(file, pixels, carried)
         else:
-            top = 255 if format == "png8" else 65535
-            _write_png(file, _encoded(planes, target, top), target.icc, encoding, description, xmp, gps)
+            _write_png(file, pixels, carried)
 
 
 # --- colour ------------------------------------------------------------------------------------
@@ -195,70 +195,58 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 # --- files -------------------------------------------------------------------------------------
 
 
-def _write_tiff(
-    file: BinaryIO,
-    pixels: Pixels,
-    icc: bytes,
-    encoding: Encoding,
-    description: str,
-    xmp: bytes,
-    gps: Directory | None,
-) -> None:
-    tags = main_directory(encoding.metadata, encoding.orientation, description)
+@dataclass(frozen=True, slots=True)
+class _Carried:
+    """What a file carries beside its pixels."""
+
+    encoding: Encoding
+    description: str
+    xmp: bytes
+    gps: Directory | None
+    icc: bytes
+
+    def exif(self, orientation: int) -> bytes:
+        return exif_block(self.encoding.metadata, orientation, self.description, self.gps)
+
+
+def _write_tiff(file: BinaryIO, pixels: Pixels, carried: _Carried) -> None:
+    metadata = carried.encoding.metadata
+    tags = main_directory(metadata, metadata.orientation, carried.description)
     tags.shorts(258, *(8 * pixels.dtype.itemsize,) * 3)
     tags.shorts(259, 1)  # not compressed
     tags.shorts(262, 2)  # RGB
     tags.shorts(277, 3)
     tags.shorts(284, 1)  # interleaved
     tags.shorts(339, *(3 if pixels.dtype.kind == "f" else 1,) * 3)  # SampleFormat
-    tags.raw(XMP_TAG, BYTE, xmp)
-    tags.raw(ICC_TAG, UNDEFINED, icc)
-    below = {EXIF_POINTER: exif_directory(encoding.metadata), GPS_POINTER: gps or Directory()}
+    tags.raw(XMP_TAG, BYTE, carried.xmp)
+    tags.raw(ICC_TAG, UNDEFINED, carried.icc)
+    below = {EXIF_POINTER: exif_directory(metadata), GPS_POINTER: carried.gps or Directory()}
     write_strip(file, tags, below, pixels)
 
 
-def _write_jpeg(
-    file: BinaryIO,
-    pixels: Pixels,
-    icc: bytes,
-    encoding: Encoding,
-    description: str,
-    xmp: bytes,
-    gps: Directory | None,
-    *,
-    quality: int,
-) -> None:
-    block = exif_block(encoding.metadata, encoding.orientation, description, gps)
+def _write_jpeg(file: BinaryIO, pixels: Pixels, carried: _Carried, quality: int) -> None:
     Image.fromarray(pixels).save(
         file,
         "JPEG",
         quality=quality,
         subsampling=0,
         optimize=True,
-        icc_profile=icc,
-        exif=b"Exif\0\0" + block,
-        xmp=xmp,
+        icc_profile=carried.icc,
+        exif=b"Exif\0\0" + carried.exif(carried.encoding.orientation),
+        xmp=carried.xmp,
     )
 
 
-def _write_png(
-    file: BinaryIO,
-    pixels: Pixels,
-    icc: bytes,
-    encoding: Encoding,
-    description: str,
-    xmp: bytes,
-    gps: Directory | None,
-) -> None:
-    turned = np.ascontiguousarray(upright(pixels, encoding.orientation))
+def _write_png(file: BinaryIO, pixels: Pixels, carried: _Carried) -> None:
+    turned = np.ascontiguousarray(upright(pixels, carried.encoding.orientation))
     data = imagecodecs.png_encode(turned, **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
-    file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
-    file.write(_chunk(b"eXIf", exif_block(encoding.metadata, 1, description, gps)))
-    file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp))
-    if description:
-        file.write(_chunk(b"tEXt", b"Description\0" + description.encode("latin-1", "replace")))
+    file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(carried.icc)))
+    file.write(_chunk(b"eXIf", carried.exif(1)))
+    file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + carried.xmp))
+    if carried.description:
+        file.write(_chunk(b"tEXt", b"Description\0" + carried.description.encode("latin-1", "replace")))
     file.write(data[header_end:])
 
 

@@ -5,9 +5,10 @@ photo, photo, ... -> samples of each (`sampling`) -> added to the model
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -158,6 +159,15 @@ class PhotoVerdict:
     error: LensModelError | OSError | None = None
 
 
+def _verdict(path: Path, learn: Callable[[], int | None]) -> PhotoVerdict:
+    try:
+        return PhotoVerdict(path, learn())
+    except CancelledError:  # is of the whole work, not of one photo
+        raise
+    except (LensModelError, OSError) as error:
+        return PhotoVerdict(path, error=error)
+
+
 class Calibration:
     """A lens that learns from one photo after the other, kept in a store.
 
@@ -195,12 +205,14 @@ class Calibration:
     ) -> Iterator[PhotoVerdict]:
         """Learn from photos in their order, on an executor if there is one, and give what becomes of each."""
         paths = list(paths)
+        if executor is None:
+            for path in paths:
+                yield _verdict(path, partial(self.add, path, siblings=paths, on_event=on_event))
+            return
         orders: dict[Path, tuple[str, Identity]] = {}
 
         def sent(path: Path) -> tuple[Any, ...] | None:
             """What the executor needs; None where there is nothing to send, and `add` says why."""
-            if executor is None:
-                return None
             try:
                 key = photo_id(path)
                 if self._knows(key):
@@ -211,24 +223,11 @@ class Calibration:
             except (LensModelError, OSError):
                 return None
 
-        jobs = processes.in_order(
-            executor or processes.Here(),
-            samples_of_bytes,
-            paths,
-            sent,
-            ahead=1 if executor is None else ahead,
-        )
-        for path, job in jobs:
-            try:
-                if job is None:
-                    verdict = PhotoVerdict(path, self.add(path, siblings=paths, on_event=on_event))
-                else:
-                    verdict = PhotoVerdict(path, self._keep(path, *orders[path], job.result()))
-            except CancelledError:  # is of the whole work, not of one photo
-                raise
-            except (LensModelError, OSError) as error:
-                verdict = PhotoVerdict(path, error=error)
-            yield verdict
+        for path, job in processes.in_order(executor, samples_of_bytes, paths, sent, ahead=ahead):
+            if job is None:
+                yield _verdict(path, partial(self.add, path, siblings=paths, on_event=on_event))
+            else:
+                yield _verdict(path, partial(self._received, path, *orders[path], job))
 
     def add(
         self, path: Path, *, siblings: Iterable[Path] = (), on_event: EventHook = ignore_event
@@ -252,6 +251,10 @@ class Calibration:
             on_event=on_event,
         )
         return self._keep(path, key, identities[0], samples)
+
+    def _received(self, path: Path, key: str, identity: Identity, job: Future[list[PsfSample]]) -> int | None:
+        """Wait for the samples of a photo, and add them."""
+        return self._keep(path, key, identity, job.result())
 
     def _keep(self, path: Path, key: str, identity: Identity, samples: Sequence[PsfSample]) -> int | None:
         """Add the samples of a photo to the lens as it is now."""

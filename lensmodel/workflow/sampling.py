@@ -16,7 +16,7 @@ import logging
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -424,7 +424,7 @@ def samples_of_photo(
         if not alone:
             save_developed(developed, Path(folder))
         source = developed if alone else Path(folder)
-        with processes.pool(processes.Here() if alone else executor, workers, method) as pool:
+        with ThreadPoolExecutor(1) if alone else processes.pool(executor, workers, method) as pool:
             jobs = {pool.submit(_cell_of, source, group, *order): index for index, group in enumerate(groups)}
             try:
                 for job in as_completed(jobs):
@@ -466,4 +466,5 @@ def samples_of_bytes(name: str, data: bytes, config: Config, key: str = "") -> l
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(data)
-        return samples_of_photo(path, config, key=key, executor=processes.Here())
+        with ThreadPoolExecutor(1) as here:
+            return samples_of_photo(path, config, key=key, executor=here)

@@ -21,14 +21,6 @@ from lensmodel.model import load_profile
 from lensmodel.workflow import sampling
 
 
-def test_the_calling_thread_is_an_executor_that_hands_on_errors() -> None:
-    executor = processes.Here()
-
-    assert executor.submit(threading.get_ident).result() == threading.get_ident()
-    with pytest.raises(ZeroDivisionError):
-        executor.submit(lambda: 1 // 0).result()
-
-
 class Counting(ThreadPoolExecutor):
     """Notes how many calls are submitted and not yet taken."""
 
@@ -79,7 +71,7 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
     config = sampling.Config(estimator="default", count=4)
-    here = sampling.samples_of_photo(photo, config, executor=processes.Here())
+    here = sampling.samples_of_photo(photo, config, workers=1)
     with ThreadPoolExecutor(2) as threads:
         beside = sampling.samples_of_photo(photo, config, executor=threads)
     sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), config)

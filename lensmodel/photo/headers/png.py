@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from lensmodel.core.errors import NotAnImageError, TruncatedImageError
-from lensmodel.photo.declared import by_chunks
+from lensmodel.photo.colour import profile_by_chunks
 from lensmodel.photo.headers.header import MAX_BLOCK_BYTES, MAX_SEGMENTS, Header, check_size
 from lensmodel.photo.headers.ifd import Buffer, TiffReader
 from lensmodel.photo.values import Limits
@@ -37,7 +37,7 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
             colour[name] = bytes(buffer[start : start + length])
     if not has_data:
         raise TruncatedImageError("the PNG has no image data")
-    return replace(header, icc=by_chunks(header.icc, colour))
+    return replace(header, icc=profile_by_chunks(header.icc, colour))
 
 
 def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:

@@ -18,7 +18,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from lensmodel.photo.declared import by_tags
+from lensmodel.photo.colour import profile_by_tags
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.ifd import Directory, IfdEntry
 from lensmodel.photo.headers.opening import opened_header
@@ -156,7 +156,7 @@ def declared_by_tags(header: Header) -> bytes | None:
         return () if entry is None else entry.numbers()
 
     space = exif.number(0xA001)
-    return by_tags(
+    return profile_by_tags(
         None if space is None else int(space),
         next(iter(interoperability), None),
         numbers(318),

@@ -26,7 +26,7 @@ from lensmodel.cli.options import (
     odd,
     one_of,
 )
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import write_atomically
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
@@ -34,7 +34,7 @@ from lensmodel.measured.edges import chart_edges
 from lensmodel.model import save_profile
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
 from lensmodel.workflow import measuring, sampling
-from lensmodel.workflow.calibrating import Identity, difference, grown, joined
+from lensmodel.workflow.calibrating import Identity, grown, joined, require_same_lens
 from lensmodel.workflow.lens import Lens
 
 KINDS: Final = ("target", "pair", "points", "edges")
@@ -173,11 +173,8 @@ def _add(
         return {"state": "known"}
 
     def admit(info: PhotoInfo) -> None:
-        why = None
         if known is not None and not any_lens:
-            why = difference(known.profile.lens, known.profile.cameras, Identity.of(info.metadata))
-        if why is not None:
-            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
+            require_same_lens(known, Identity.of(info.metadata))
 
     photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
     if show is not None:

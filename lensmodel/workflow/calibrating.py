@@ -261,7 +261,8 @@ class Calibration:
         if self._knows(key):  # another run has added it meanwhile
             return None
         lens = self.known
-        self._require_same_lens(lens, identity)
+        if lens is not None and not self._any_lens:
+            require_same_lens(lens, identity)
         model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
         self._store.keep(grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens))
         return len(samples)
@@ -274,19 +275,20 @@ class Calibration:
 
     def _admitted(self, metadata: PhotoMetadata) -> Identity:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
-        identity = Identity.of(metadata)
-        self._require_same_lens(self.known, identity)
+        identity, lens = Identity.of(metadata), self.known
+        if lens is not None and not self._any_lens:
+            require_same_lens(lens, identity)
         require_aperture(metadata, self._config.settings)
         return identity
 
-    def _require_same_lens(self, lens: Lens | None, identity: Identity) -> None:
-        if lens is None or self._any_lens:
-            return
-        why = difference(lens.profile.lens, lens.profile.cameras, identity)
-        if why is not None:
-            raise InvalidInputError(
-                f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
-            )
+
+def require_same_lens(lens: Lens, identity: Identity) -> None:
+    """Refuse a photo of another lens."""
+    why = difference(lens.profile.lens, lens.profile.cameras, identity)
+    if why is not None:
+        raise InvalidInputError(
+            f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
+        )
 
 
 def require_original(path: Path) -> None:

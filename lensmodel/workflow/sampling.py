@@ -95,11 +95,6 @@ def preset_of(model: LensModel) -> Preset:
     return PRESETS["paper" if model.settings.mode == PAPER else "default"]
 
 
-def chosen_preset(name: str | None, model: LensModel | None) -> Preset:
-    """Return the preset to learn a lens by: as asked for, else that of its model, else the usual one."""
-    return preset_of(model) if name is None and model is not None else preset_named(name or "default")
-
-
 @dataclass(frozen=True, slots=True)
 class Config:
     """How the samples of a photo are made; what is None is as the lens is learned (its preset)."""
@@ -113,8 +108,8 @@ class Config:
     count: int | None = None  # patches asked for
 
     def of_lens(self, lens: Lens | None) -> Config:
-        """Return it as it holds for a lens."""
-        return replace(self, model=chosen_preset(self.model, None if lens is None else lens.model).name)
+        """Return it as it holds for a lens: by what is asked for, else by the model of the lens."""
+        return self if self.model or lens is None else replace(self, model=preset_of(lens.model).name)
 
     @property
     def preset(self) -> Preset:

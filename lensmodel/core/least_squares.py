@@ -24,7 +24,11 @@ def nonnegative_least_squares(
     *,
     smallest: float = -np.inf,
 ) -> NDArray[np.float64]:
-    """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA)."""
+    """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA).
+
+    `scipy.optimize` (`nnls`, `lsq_linear`) takes the residuals' matrix, of millions of rows; here only its
+    normal equations are known.
+    """
     if not a.any():
         return start.copy()
     largest, lift = _largest_and_lift(a, smallest)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -25,6 +26,9 @@ from lensmodel.photo.headers.header import Header
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col)` or `(row, col, channel)`."""
 
+UNDECODABLE: Final = (Image.DecompressionBombError, OSError, SyntaxError, ValueError)
+"""What Pillow raises at pictures that are damaged or hostile."""
+
 _PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
 
 
@@ -40,20 +44,23 @@ def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
     return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
 
 
+@contextmanager
+def unwarned() -> Iterator[None]:
+    """Silence Pillow on large pictures: our own limit is checked on the header, before it decodes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        yield
+
+
 def _read_with_pillow(path: Path, header: Header) -> Pixels:
     if header.channels == 4 and header.kind == "jpeg":
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
     try:
-        with warnings.catch_warnings():
-            # Our own limit was checked on the header, before this.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=("JPEG", "PNG")) as image:
-                if image.mode not in _PLAIN_MODES:
-                    raise UnsupportedFormatError(
-                        f"pictures of kind {image.mode} are not read; convert it to RGB"
-                    )
-                opaque = "transparency" not in image.info and not image.mode.endswith("A")
-                return np.asarray(image.convert("RGB" if opaque else "RGBA"))
+        with unwarned(), Image.open(path, formats=("JPEG", "PNG")) as image:
+            if image.mode not in _PLAIN_MODES:
+                raise UnsupportedFormatError(f"pictures of kind {image.mode} are not read; convert it to RGB")
+            opaque = "transparency" not in image.info and not image.mode.endswith("A")
+            return np.asarray(image.convert("RGB" if opaque else "RGBA"))
     except Image.DecompressionBombError as error:
         raise ImageTooLargeError(
             f"{header.width} x {header.height} pixels are more than the decoder takes"

@@ -7,7 +7,6 @@ they chose stands in the JPEG that the same file holds.
 from __future__ import annotations
 
 import io
-import warnings
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from PIL import Image
 
 from lensmodel.photo.colour import Matrix, srgb_to_linear
 from lensmodel.photo.mosaic import Mosaic
+from lensmodel.photo.raster import UNDECODABLE, unwarned
 
 Grid = NDArray[np.float64]
 """Means over blocks, `(row, col, colour)`."""
@@ -94,14 +94,13 @@ def _jpeg_of(raw: rawpy.RawPy) -> Image.Image | None:
         thumb = raw.extract_thumb()
         if thumb.format != rawpy.ThumbFormat.JPEG or not isinstance(thumb.data, bytes):
             return None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with unwarned():
             picture = Image.open(io.BytesIO(thumb.data), formats=("JPEG",))
             if picture.width * picture.height > _MOST_JPEG_PIXELS or min(picture.size) < _SMALLEST_JPEG // 2:
                 return None
             picture.draft("RGB", (4 * _BLOCKS, 4 * _BLOCKS))
             return picture.convert("RGB") if picture.mode in {"RGB", "L"} else None
-    except (rawpy.LibRawError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
+    except (rawpy.LibRawError, *UNDECODABLE):
         return None
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import math
-import warnings
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +18,7 @@ from PIL import Image
 
 from lensmodel.core.errors import TurnedPixelsError
 from lensmodel.photo.headers.header import Header
+from lensmodel.photo.raster import UNDECODABLE, unwarned
 from lensmodel.photo.values import PhotoInfo, PhotoMetadata
 
 ORIENTATION: Final = {1: 6, 3: 8}
@@ -41,13 +41,10 @@ def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int 
     if thumbnail is None or thumbnail.height >= thumbnail.width:
         return None
     try:
-        with warnings.catch_warnings():
-            # the limit of the photo's own pixels was checked on its header
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
-                image.draft("L", (256, 256))
-                picture = np.asarray(image.convert("L"), dtype=np.float64)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        with unwarned(), Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+            image.draft("L", (256, 256))
+            picture = np.asarray(image.convert("L"), dtype=np.float64)
+    except UNDECODABLE:
         return None
     aspect = picture.shape[0] / picture.shape[1]
     seen = _sized(_without_bars(np.asarray(thumbnail, dtype=np.float64), aspect), aspect)
@@ -75,12 +72,11 @@ def _thumbnail(header: Header) -> Image.Image | None:
             begin = reader.base + start
             data = bytes(reader.buffer[begin : begin + min(length, _MOST_BYTES)])
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                with unwarned():
                     image = Image.open(io.BytesIO(data), formats=("JPEG",))
                 if image.width * image.height <= _MOST_PIXELS:
                     return image.convert("L")
-            except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            except UNDECODABLE:
                 continue
     return None
 

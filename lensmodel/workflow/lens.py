@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -292,12 +292,7 @@ class Lens:
         """
         wanted = _frequencies_of(frequencies)
         kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
-        angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
-        out = np.empty((2, *angles.shape, len(wanted)))
-        for index in np.ndindex(angles.shape):
-            for row, turn in enumerate((0.0, np.pi / 2.0)):
-                out[(row, *index)] = mtf_from_kernel(kernels[index], float(angles[index]) + turn, wanted)
-        return out
+        return _both_ways(kernels, phi, lambda kernel, angle: mtf_from_kernel(kernel, angle, wanted))
 
     def mtf50_map(
         self,
@@ -333,11 +328,7 @@ class Lens:
         """
         r, phi = field_grid(rows, cols, aspect=aspect)
         kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
-        out = np.empty((2, rows, cols))
-        for index in np.ndindex(rows, cols):
-            for along, turn in enumerate((0.0, np.pi / 2.0)):
-                out[(along, *index)] = mtf50_from_kernel(kernels[index], float(phi[index]) + turn)
-        return out
+        return _both_ways(kernels, phi, mtf50_from_kernel)
 
     def psf_grid(
         self,
@@ -465,6 +456,19 @@ class Lens:
         name = full_name(self.profile.lens.get("maker"), self.profile.lens.get("model"))
         count = len(self.profile.photos)
         return f"{name or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
+
+
+def _both_ways(
+    kernels: NDArray[np.float64], phi: ArrayLike, measure: Callable[[NDArray[np.float64], float], Any]
+) -> NDArray[np.float64]:
+    """Measure kernels, shape (*S, k, k), along the radius and across it; shape (2, *S, ...)."""
+    angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
+    measured = [
+        [measure(kernels[index], float(angles[index]) + turn) for index in np.ndindex(angles.shape)]
+        for turn in (0.0, np.pi / 2.0)
+    ]
+    values = np.array(measured, dtype=np.float64)
+    return values.reshape(2, *angles.shape, *values.shape[2:])
 
 
 def _places_joined(r: ArrayLike, phi: ArrayLike) -> Sequence[NDArray[np.float64]]:

@@ -29,7 +29,7 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
         )
     check_size(width, height, len(buffer), limits)
     header, has_data, colour = Header("png", width, height, channels, bits), False, dict[bytes, bytes]()
-    for name, start, length in _chunks(buffer):
+    for name, start, length in chunks_of(buffer):
         has_data = has_data or name == b"IDAT"
         if name in {b"eXIf", b"iTXt", b"iCCP"} and length <= MAX_BLOCK_BYTES:
             header = _with_chunk(header, name, bytes(buffer[start : start + length]))
@@ -40,7 +40,7 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
     return replace(header, icc=profile_by_chunks(header.icc, colour))
 
 
-def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
+def chunks_of(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
     """Yield name, start and length of the chunks; of a run of image data only the first."""
     at, count, before = 33, 0, b"IHDR"
     while count < MAX_SEGMENTS:

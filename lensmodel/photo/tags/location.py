@@ -10,6 +10,7 @@ Sources: "Exif Version 3.0", CIPA DC-008, 2023, section 4.6.6; "XMP Specificatio
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import zlib
@@ -20,8 +21,10 @@ from typing import Final
 
 import numpy as np
 
+from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, TiffReader
 from lensmodel.photo.headers.opening import opened_header
+from lensmodel.photo.headers.png import chunks_of
 from lensmodel.photo.tags.exif_block import Directory
 from lensmodel.photo.values import Limits
 
@@ -39,10 +42,9 @@ MAX_TAGS: Final = 64
 """Tags of a GPS directory; there are 32. What has more is none."""
 
 # Bounds against files made to cost time (chosen): bytes of a value, of which honest ones have some dozen,
-# places named in XMP, and chunks of a PNG.
+# and places named in XMP.
 MAX_VALUE: Final = 1 << 16
 MAX_WORDS: Final = 1000
-MAX_CHUNKS: Final = 10_000
 
 MAX_CHUNK_BYTES: Final = 16 << 20
 """Chosen like `lensmodel.photo.headers.header.MAX_BLOCK_BYTES`: of what is no image data."""
@@ -92,7 +94,7 @@ def find_location(buffer: Buffer) -> LocationTraces:
                 spans += _directory(buffer, reader, reader.first)
             else:
                 blocks.append(reader)
-    chunks = list(_chunks(buffer)) if buffer[:8] == _PNG else []
+    chunks = _chunks(buffer) if buffer[:8] == _PNG else []
     blocks += [TiffReader.open(buffer, start) for name, start, _ in chunks if name == b"eXIf"]
     for reader in blocks:
         if reader is not None:
@@ -175,18 +177,12 @@ def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Over
     yield Overwrite(start, bytes(end - start))
 
 
-def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, start and length of the data of a PNG's chunks."""
-    at = 8
-    for _ in range(MAX_CHUNKS):
-        head = bytes(buffer[at : at + 8])
-        if len(head) < 8:
-            return
-        length, name = struct.unpack(">I4s", head)
-        if at + 12 + length > len(buffer):
-            return
-        yield name, at + 8, length
-        at += 12 + length
+def _chunks(buffer: Buffer) -> list[tuple[bytes, int, int]]:
+    """Name, start and length of a PNG's chunks, as far as it is whole."""
+    chunks: list[tuple[bytes, int, int]] = []
+    with contextlib.suppress(TruncatedImageError):
+        chunks.extend(chunks_of(buffer))
+    return chunks
 
 
 def _is_packed(body: bytes, name: bytes) -> bool:

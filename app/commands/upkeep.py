@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 def doctor(
     context: typer.Context,
     data: Data = None,
-    repair: Annotated[bool, typer.Option("--repair", help="Mend what can be mended.")] = False,
     deep: Annotated[
         bool, typer.Option("--deep", help="Also read each photo and kernel, and compare checksums.")
     ] = False,
@@ -38,9 +37,7 @@ def doctor(
 
         lensmodel doctor --deep --json
 
-        lensmodel doctor --repair
-
-    Exit status: 0 all is well or mended, 1 something is not, 2 wrong usage.
+    Exit status: 0 all is well, 1 something is not, 2 wrong usage.
     """
     from dataclasses import asdict  # noqa: PLC0415 - only these commands need the service
 
@@ -51,16 +48,15 @@ def doctor(
     settings = _existing(data)
     with _opened(settings) as (store, storage):
         migrate.check(store.database)
-        report = examination.examine(settings, store, storage, repair=repair, deep=deep)
+        report = examination.examine(settings, store, storage, deep=deep)
     if json_output:
         findings = [asdict(finding) for finding in report.findings]
-        shown.document({"checks": list(report.checks), "findings": findings, "open": len(report.open)})
+        shown.document({"checks": list(report.checks), "findings": findings})
     else:
         for finding in report.findings:
-            end = "mended" if finding.mended else finding.remedy
-            shown.result(f"{finding.check}: {finding.subject}: {finding.says}; {end}")
-        shown.result(f"{len(report.checks)} checks, {len(report.findings)} findings, {len(report.open)} open")
-    if report.open:
+            shown.result(f"{finding.check}: {finding.subject}: {finding.says}; {finding.remedy}")
+        shown.result(f"{len(report.checks)} checks, {len(report.findings)} findings")
+    if report.findings:
         raise typer.Exit(1)
 
 

@@ -312,7 +312,7 @@ class Worker:
         """Delete data that are no longer needed."""
         for owner_key in self._store.accounts.to_erase():
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
-        for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
+        for photo_id in self._store.photos.unneeded() if self._settings.keep_photos == "never" else ():
             self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, SHOWN)))
         for photo_id in self._store.photos.read_profiles():
             self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))

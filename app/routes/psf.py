@@ -13,7 +13,6 @@ from app.http import psf_formats
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import Fitted
 from app.routes.common import NOT_CHANGED, Answers, file_answer, matches_tag, problems
-from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
 from lensmodel.core.errors import OutsideSupportError
@@ -65,8 +64,7 @@ _QUERY: Final = {
 )
 def read_psf(lens_id: str, call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
-    with metrics.QUERY_SECONDS.time():
-        return _answer(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
+    return _answer(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
 
 
 @router.get(
@@ -78,8 +76,7 @@ def read_psf(lens_id: str, call: CallDep) -> Response:
 )
 def read_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
     """Return the PSF in the format of the suffix."""
-    with metrics.QUERY_SECONDS.time():
-        return _answer(lens_id, suffix, call)
+    return _answer(lens_id, suffix, call)
 
 
 def accepted(header: str) -> Format:

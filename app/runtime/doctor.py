@@ -8,24 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import timedelta
 from typing import Final
 
-from sqlalchemy import func, select, text, update
+from sqlalchemy import func, select, text
 
 from app.blobs.storage import Storage
-from app.runtime.outage import CODE as OUTAGE
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.database import insert_new
 from app.store.invariants import INVARIANTS
-from app.store.owners import now
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
 
-# Age of a blob without a row before it is deleted (chosen): its row may still be written
-STILL_COMING: Final = timedelta(minutes=30)
 _WITH_FILE: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
 
 
@@ -37,7 +31,6 @@ class Violation:
     subject: str
     says: str
     remedy: str
-    mended: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,27 +40,14 @@ class DoctorReport:
     checks: tuple[str, ...]
     findings: tuple[Violation, ...]
 
-    @property
-    def open(self) -> tuple[Violation, ...]:
-        """Findings that were not mended."""
-        return tuple(finding for finding in self.findings if not finding.mended)
 
-
-def examine(
-    settings: Settings, store: Store, storage: Storage, *, repair: bool = False, deep: bool = False
-) -> DoctorReport:
+def examine(settings: Settings, store: Store, storage: Storage, *, deep: bool = False) -> DoctorReport:
     """Run all checks."""
-    findings = list(_tables(store))
-    checks = ["database", *(invariant.name for invariant in INVARIANTS)]
-    blobs: dict[str, Callable[[], Iterator[Violation]]] = {
-        "work": lambda: _work(settings, store),
-        "blobs": lambda: _blobs(store, storage, repair=repair),
-    }
+    checks = ["database", *(invariant.name for invariant in INVARIANTS), "work", "blobs"]
+    findings = [*_tables(store), *_work(settings, store), *_blobs(store, storage)]
     if deep:
-        blobs |= {"kernels": lambda: _kernels(store), "photos": lambda: _photos(store, storage)}
-    for name, check in blobs.items():
-        checks.append(name)
-        findings.extend(check())
+        checks += ["kernels", "photos"]
+        findings += [*_kernels(store), *_photos(store, storage)]
     return DoctorReport(tuple(checks), tuple(findings))
 
 
@@ -92,7 +72,7 @@ def _work(settings: Settings, store: Store) -> Iterator[Violation]:
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")
 
 
-def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Violation]:
+def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
     """Compare the stored blobs with the tables, which are read last, since blobs are written first."""
     if not storage.is_there:
         where = str(storage.folder)
@@ -125,37 +105,15 @@ def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Violatio
         if result is None or sizes.get(result) == length:
             continue
         if dict(storage.listed(f"{result.rpartition('/')[0]}/")).get(result) != length:
-            yield _lost_result(store, correction_id, repair=repair)
+            says = "the result of the correction is missing"
+            yield Violation("blobs", correction_id, says, "delete the correction, and ask for it again")
     for prefix in sorted({_group(key) for key in sizes}):
-        if prefix in known or prefix.startswith(("probe/", *garbage)):
-            continue
-        yield _orphan(store, prefix, repair=repair)
+        if prefix not in known and not prefix.startswith(garbage):
+            yield Violation("blobs", prefix, "no row names these blobs", "delete them by hand")
 
 
 def _group(key: str) -> str:
     return "/".join([*key.split("/")[:2], ""])
-
-
-def _lost_result(store: Store, correction_id: str, *, repair: bool) -> Violation:
-    says = "the result of the correction is missing"
-    if not repair:
-        return Violation("blobs", correction_id, says, "lensmodel doctor --repair lets it be made again")
-    with store.database.writing() as session:
-        session.execute(
-            update(CorrectionRow)
-            .where(CorrectionRow.public_id == correction_id, CorrectionRow.state == "succeeded")
-            .values(state="failed", error_code=OUTAGE, error_detail="its result was lost: retry it")
-        )
-    return Violation("blobs", correction_id, f"{says}; it can be retried now", "", mended=True)
-
-
-def _orphan(store: Store, prefix: str, *, repair: bool) -> Violation:
-    says = "no row names these blobs"
-    if not repair:
-        return Violation("blobs", prefix, says, "lensmodel doctor --repair gives them up for deletion")
-    with store.database.writing() as session:
-        insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + STILL_COMING}])
-    return Violation("blobs", prefix, f"{says}; they will be deleted", "", mended=True)
 
 
 def _kernels(store: Store) -> Iterator[Violation]:

@@ -33,9 +33,6 @@ REQUEST_SECONDS: Final = Histogram(
     registry=API,
     buckets=_QUICK,
 )
-QUERY_SECONDS: Final = Histogram(
-    "lensmodel_psf_query_seconds", "Time to answer for one PSF.", registry=API, buckets=_QUICK
-)
 MODELS: Final = Counter(
     "lensmodel_model_cache", "Models asked for, by what became of that.", ("outcome",), registry=API
 )
@@ -82,12 +79,7 @@ class Tables(Collector):
             age.add_metric((kind,), seconds)
         workers = GaugeMetricFamily("lensmodel_workers", "Workers heard of within their lease.")
         workers.add_metric((), len(self._store.jobs.live(self._lease_s)))
-        garbage = GaugeMetricFamily("lensmodel_garbage", "Groups of blobs that wait to be deleted.")
-        garbage.add_metric((), load.garbage)
-        rows = GaugeMetricFamily("lensmodel_rows", "Rows that are not deleted.", labels=("table",))
-        for table, count in load.rows.items():
-            rows.add_metric((table,), count)
-        yield from (depth, age, workers, garbage, rows)
+        yield from (depth, age, workers)
 
 
 def of_service(store: Store, lease_s: float) -> bytes:

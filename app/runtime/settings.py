@@ -62,12 +62,10 @@ class Settings(BaseSettings):
     max_stored_gb: float = Field(
         default=200.0, gt=0, description="Bytes of photos and results of one owner, in GiB."
     )
-    keep_photos: Literal["never", "corrections", "always"] = Field(
+    keep_photos: Literal["never", "always"] = Field(
         default="always",
-        description=(
-            "How long the files of photos stay: never = until their work is done; corrections = only of "
-            "photos that are there to be corrected; always = until they are deleted."
-        ),
+        description="How long the files of photos stay: never = until their work is done; always = until "
+        "they are deleted.",
     )
     keep_results_days: float = Field(
         default=30.0, gt=0, description="How long corrections and their files stay after their end."

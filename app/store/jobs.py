@@ -77,7 +77,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """Waiting jobs and numbers of rows at one moment.
+    """Waiting jobs at one moment.
 
     Parameters
     ----------
@@ -85,16 +85,10 @@ class Load:
         Unfinished jobs.
     oldest_s : mapping of kind to float
         Seconds for which the oldest job has waited; 0 where none waits.
-    garbage : int
-        Prefixes of blobs that wait to be deleted.
-    rows : mapping of table to int
-        Photos, lenses and samples.
     """
 
     jobs: Mapping[tuple[str, str], int]
     oldest_s: Mapping[str, float]
-    garbage: int
-    rows: Mapping[str, int]
 
 
 def params_hash(params: Mapping[str, Any]) -> str:
@@ -283,7 +277,7 @@ class Jobs(Repository):
 
     @reads
     def load(self, session: Session) -> Load:
-        """Return the numbers; reads of indexes, except for the counts of rows."""
+        """Return the numbers, by reads of indexes."""
         jobs = {(kind, state): 0 for kind, states in _STATES.items() for state in states}
         oldest = dict.fromkeys(_STATES, 0.0)
         for kind, table, since in (
@@ -296,14 +290,7 @@ class Jobs(Repository):
                 jobs[kind, state] = count
                 if state == _STATES[kind][0]:
                     oldest[kind] = max((now() - first).total_seconds(), 0.0)
-        numbers = {
-            "photo": select(func.count()).where(PhotoRow.deleted_at.is_(None)),
-            "lens": select(func.count()).where(LensRow.deleted_at.is_(None)),
-            # a count of samples would read all
-            "sample": select(func.coalesce(func.sum(LensRow.sample_count), 0)),
-        }
-        rows = {name: int(session.scalar(query) or 0) for name, query in numbers.items()}
-        return Load(jobs, oldest, session.scalar(select(func.count()).select_from(GarbageRow)) or 0, rows)
+        return Load(jobs, oldest)
 
     # --- workers ----------------------------------------------------------------------------------
 

@@ -58,9 +58,6 @@ SPARE: Final = timedelta(hours=1)
 # How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen): its
 # owner looks again within a day
 FILE_KEPT: Final = timedelta(days=1)
-# With `keep_photos=corrections`: how long a photo that has just calibrated its lens can still be corrected
-# (chosen): who sent photos to correct them asks for it in the same sitting
-GRACE: Final = timedelta(hours=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,21 +111,16 @@ class Photos(Patches):
         return list(session.scalars(query.order_by(PhotoRow.public_id.desc()).limit(limit)))
 
     @reads
-    def unneeded(self, session: Session, policy: str, limit: int = 100) -> list[str]:
-        """Return photos whose file is to be given up, as the setting `keep_photos` says."""
+    def unneeded(self, session: Session, limit: int = 100) -> list[str]:
+        """Return photos whose file is to be given up where files are not kept."""
         # Never one that is being worked on, waits for its lens, or failed in an outage and may be retried
-        if policy == "always":
-            return []
         jobs = select(CorrectionRow.id).where(CorrectionRow.photo_id == PhotoRow.id)
         busy = jobs.where(CorrectionRow.state.in_(CORRECTION_ACTIVE)).exists()
         ended, day = PhotoRow.finished_at, now() - FILE_KEPT
         learned = PhotoRow.state.in_(("counted", "excluded", "cancelled")) | (
             (PhotoRow.state == "failed") & ((PhotoRow.error_code != "outage") | (ended < day))
         )
-        if policy == "never":
-            disposable = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
-        else:
-            disposable = learned & ~jobs.exists() & (ended < now() - GRACE)
+        disposable = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
         query = select(PhotoRow.public_id).where(*_FILED, disposable, ~busy)
         return list(session.scalars(query.limit(limit)))
 

@@ -187,18 +187,10 @@ def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Any) -> Non
     for photo in (counted, corrected, stored):
         ended(store, photo, timedelta(hours=2))
 
-    def unneeded(policy: str) -> set[str]:
-        return set(store.photos.unneeded(policy))
-
-    assert unneeded("always") == set()
-    assert unneeded("corrections") == {counted.public_id}
-    assert unneeded("never") == {counted.public_id}  # the others are to be corrected
+    assert store.photos.unneeded() == [counted.public_id]  # the others are to be corrected
     store.jobs.cancel(row.public_id, "local")
     ended(store, stored, timedelta(hours=25))
-    assert unneeded("corrections") == {counted.public_id}
-    assert unneeded("never") == {counted.public_id, corrected.public_id, stored.public_id}
-    ended(store, counted, timedelta(minutes=1))
-    assert unneeded("corrections") == set()
+    assert set(store.photos.unneeded()) == {counted.public_id, corrected.public_id, stored.public_id}
 
 
 def test_a_file_that_was_given_up_comes_back_with_the_same_bytes(client: TestClient, store: Store) -> None:

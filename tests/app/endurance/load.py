@@ -27,11 +27,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
+from sqlalchemy import func, select
 
 from app.blobs.storage import Storage
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.tables import PhotoRow, SampleRow
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from running import LIGHT, Service, running, write_photo
@@ -136,10 +138,13 @@ def measured(load: Load, store: Store, minute: float) -> dict[str, Any]:
             handles += len(list(Path(f"/proc/{int(pid)}/fd").iterdir()))
     times = sorted(load.psf_ms) or [0.0]
     load.psf_ms.clear()
-    rows = store.jobs.load().rows
+    with store.database.reading() as session:
+        photos, samples = (
+            session.scalar(select(func.count()).select_from(table)) for table in (PhotoRow, SampleRow)
+        )
     numbers = (
         *(round(minute, 1), sum(load.answers.values()), memory // 1024, handles),
-        *(sum(1 for _ in load.service.data.rglob("*")), rows["photo"], rows["sample"]),
+        *(sum(1 for _ in load.service.data.rglob("*")), photos, samples),
         *(round(statistics.median(times), 1), round(times[int(0.99 * (len(times) - 1))], 1)),
     )
     return dict(zip(COLUMNS, numbers, strict=True))

@@ -66,7 +66,7 @@ def test_a_service_goes_on_from_a_backup(
         ]
         photo = Job("photo", (photos[2].public_id, 1), "local")  # work goes on there
         assert new.jobs.to_do() == store.jobs.to_do() == [Job("measure", (lens_id, 2)), photo]
-        assert [f.check for f in examine(settings, new, blobs).open] == ["work"]
+        assert [f.check for f in examine(settings, new, blobs).findings] == ["work"]
 
 
 def test_a_second_backup_brings_the_first_up_to_date(
@@ -117,7 +117,7 @@ def test_a_backup_under_load_has_every_blob_that_its_rows_name(
     for folder in whole:
         with opened(folder) as (settings, new, blobs):
             assert not [
-                f for f in examine(settings, new, blobs).open if f.check == "blobs" and "missing" in f.says
+                f for f in examine(settings, new, blobs).findings if f.check == "blobs" and "missing" in f.says
             ]
 
 

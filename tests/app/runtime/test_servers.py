@@ -50,7 +50,7 @@ def test_an_installation_works_on_servers(steps: Any, far: tuple[Settings, Store
         blobs.put(photo.blob_key, b"m" * photo.byte_size)
 
     assert there.lenses.samples_of(busy.lens_id(busy.counted()))[0].version == 3
-    found = {finding.check for finding in examine(away, there, blobs, deep=True).open}
+    found = {finding.check for finding in examine(away, there, blobs, deep=True).findings}
     assert found == {"blobs", "photos", "work"}  # of one photo there is no file, the others are made up
     assert next(iter(Tables(there, 20.0).collect())).samples
 

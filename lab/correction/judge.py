@@ -151,8 +151,8 @@ class Row:
         self.edges.append(figures.overshoots(old, new, sharp))
         grey = [np.repeat(figures.luma(p)[..., None], 3, axis=-1) for p in (old, new)]
         self.grain.append(figures.grain(*grey))
-        self.faults["dots"] += int(figures.dots(old, new)[inner].sum())
-        self.faults["flips"] += int(figures.hue_flips(old, new)[inner].sum())
+        self.faults["dots"] += int(figures.dots(old, new, sharp)[inner].sum())
+        self.faults["flips"] += int(figures.hue_flips(old, new, sharp)[inner].sum())
 
     def cells(self) -> list[str]:
         """The row of the table."""

@@ -73,19 +73,23 @@ def chromaticity(picture: Shown) -> NDArray[np.float32]:
     return np.stack([(r - g) / np.float32(2**0.5), (r + g - 2 * b) / np.float32(6**0.5)], axis=-1)
 
 
-def dots(before: Shown, after: Shown) -> NDArray[np.bool_]:
+def dots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.bool_]:
     """Pixels that stand alone where the original has no such value and nothing that could become one.
 
     In a channel, a dot exceeds the range of the original's 5 x 5 pixels by twice that range and by
     `STANDS_OUT` at least, and at most one of its own eight neighbours goes with it: what is sharpened
-    along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`.
+    along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`. Where the truth
+    is known, what it has within a pixel, but for `STANDS_OUT`, is no dot: where thin twigs cross, a perfect
+    correction brings back pixels of which the blur left no bump.
     """
     found = np.zeros(before.shape[:2], dtype=bool)
     for k in range(3):
-        old = np.asarray(before[..., k], dtype=np.float32)
-        new = np.asarray(after[..., k], dtype=np.float32)
+        old, new = (np.asarray(picture[..., k], dtype=np.float32) for picture in (before, after))
         for sign in (np.float32(1.0), np.float32(-1.0)):
-            found |= _dots(sign * old, sign * new)
+            dot = _dots(sign * old, sign * new)
+            if truth is not None:
+                dot &= sign * new > ndimage.maximum_filter(sign * truth[..., k], 3) + STANDS_OUT
+            found |= dot
     return found
 
 
@@ -111,14 +115,14 @@ def _dots(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.bool
     return found
 
 
-def hue_flips(before: Shown, after: Shown) -> NDArray[np.bool_]:
+def hue_flips(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.bool_]:
     """Pixels whose hue the original has nowhere within `HUE_REACH` pixels, and no trace of it either.
 
     With c the chromaticity of a pixel and o those around the same place of the original, it is a flip
     where |c| exceeds the largest part of any o along c by `COLOURED` and by half of |c|: a colour may
     get purer, up to twice, but not turn into another one. A small thing whose colour blur has washed out
     left a tenth of it, and a ridge (`TRACE`); only where all around it has the opposite hue did it leave
-    nothing, and counts.
+    nothing, and counts. Where the truth is known, what it has within a pixel, but for `COLOURED`, is no flip.
     """
     old, new = chromaticity(before), chromaticity(after)
     size = np.linalg.norm(new, axis=-1)
@@ -141,6 +145,11 @@ def hue_flips(before: Shown, after: Shown) -> NDArray[np.bool_]:
         down, across, mixed = ((bend[at] * towards).sum(axis=-1) for bend in bends)
         np.maximum(ridge, np.hypot((down - across) / 2.0, mixed) - (down + across) / 2.0, out=ridge)
     traced = (ridge >= TRACE * own) & (_most_along(old, rows, cols, towards, 1) >= _HINT * own)
+    if truth is not None:
+        colours = np.pad(chromaticity(truth), ((1, 1), (1, 1), (0, 0)), mode="reflect")
+        for dr, dc in np.ndindex(3, 3):
+            away = np.linalg.norm(new[rows, cols] - colours[rows + dr, cols + dc], axis=-1)
+            traced |= away <= COLOURED
     found[rows[~traced], cols[~traced]] = True
     return found
 

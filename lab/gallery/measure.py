@@ -34,9 +34,10 @@ def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figur
     edges, places, changed = [], [], 0
     for row, col, window, inner in _tiles(*before.shape[:2]):
         old, new = _unit(before[window]), _unit(after[window])
+        true = None if truth is None else _unit(truth[window])
         for name, find in (("dots", figures.dots), ("hue_flips", figures.hue_flips)):
-            faults[name].append(np.argwhere(find(old, new)[inner]) + np.array([row, col]))
-        edges.append(figures.overshoots(old, new, None if truth is None else _unit(truth[window])))
+            faults[name].append(np.argwhere(find(old, new, true)[inner]) + np.array([row, col]))
+        edges.append(figures.overshoots(old, new, true))
         places.append(figures.grain(old[inner], new[inner]))
         changed += int((np.abs(new[inner] - old[inner]).max(axis=-1) > 1.0 / 255.0).sum())
     counts: Figures = {}

@@ -139,6 +139,14 @@ def test_grain_that_was_doubled_is_no_dot() -> None:
     assert not dots(before, GREY + 2.0 * (before - GREY)).any()
 
 
+def test_a_dark_pixel_that_the_truth_has_is_no_dot_and_one_that_it_lacks_is() -> None:
+    before = even(noise=0.0)
+    after, truth = before.copy(), before.copy()
+    truth[20, 20] = after[20, 21] = after[40, 40] = 0.1
+
+    assert np.argwhere(dots(before, after, truth)).tolist() == [[40, 40]]
+
+
 # --- hue -----------------------------------------------------------------------------------------
 
 
@@ -177,6 +185,7 @@ def test_a_green_dot_in_a_red_place_is_a_flip() -> None:
     after[20, 20] = (0.1, 0.8, 0.1)
 
     assert np.argwhere(hue_flips(before, after)).tolist() == [[20, 20]]
+    assert not hue_flips(before, after, after).any()
 
 
 # --- edges ---------------------------------------------------------------------------------------

@@ -37,18 +37,24 @@ Mask = NDArray[np.bool_]
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
 )
-_NEAREST, _NEXT = 2, 1
-"""Radii beside clipped light for the least and the most (chosen: specks in a dark glow are seen before all
-else, and darker twigs are not)."""
+_NEAR, _NEXT = 2, 1
+"""Radii beside lamps for the least and the most (chosen: specks in a dark glow are seen before all else, and
+darker twigs are not); beside paint of which one colour clips the least is that within one pixel more."""
 _BRIGHTER: Final = 4.0
 """Brightness of broad white areas, in units of saturation: lamps, sunlit paint and white skies (chosen)."""
 _EVEN: Final = 5
 """Side of the window in which glare is compared with light (chosen: pixel by pixel, noise would decide)."""
+_LAMP: Final = 2.0
+"""Solved light, in units of saturation, from which a pixel counts as a lamp although the photo did not clip
+(chosen: edges overshoot by less, lamps that the blur has dimmed are brighter)."""
 _PLATEAU: Final = 3
 """Pixels beyond the blur's reach that hold the level beside an edge (chosen: about as many as its width)."""
 _SURE: Final = 0.24
 """Error of a kernel at which a result may leave the photo's range by the width of that range (chosen: the
 least that costs no gain behind a lens that is known to a quarter)."""
+_MOST_ROOM: Final = 4.0
+"""Ranges by which a line may leave the photo's where the kernel is known well (chosen: the least with which
+dark lines behind exact kernels come back)."""
 _EDGE, _UNSURE = 0.06, 0.1
 """Share of the range by which a result may leave the level beside an edge, and error of the kernel up to
 which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
@@ -112,21 +118,19 @@ def limited(
     r"""Hold a result within what the photo can have hidden.
 
     Light, the mean of the colours as it is seen (its square root), stays within the photo's range [l, h]
-    within 2 pixels, widened by a span. With e the error of the kernel, p the peak of its line integral, that
-    is the contrast that a thin line keeps, and [L, H] the range in the reach of the blur::
+    within 2 pixels, widened by a span, with e the error of the kernel and [L, H] the range in the reach of
+    the blur::
 
-        on a line     from h to h + (1 / p - 1) (h - L), from l to l - (1 / p - 1) (H - l) of linear light, by
-                      no more than (.24 / e)² (h - l)
-        at an edge    .06 max( (.1 / e)², 1 ) (H - L)
+        on a line     min( (.24 / e)², 4 ) (h - l)
+        at an edge    .06 max( (.1 / e)², 1 ) (H - L), and no more than that
 
-    It is an edge where a quarter of the window lies at the level that is exceeded. Around lamps, white areas,
-    and all clipped light where e is .1 or more, in the reach of the blur and some more, each colour stays
-    above the photo's least within 2 pixels and below its most within 1. Beside areas of which one colour
-    clipped, it stays within the photo's range in the blur's reach, widened by .06 or what the blur hides of a
-    line. Broad clipped areas stay as they are, and so does, where e is .1, what may be glare of white ones,
-    four times as bright as saturation. Colour, the shares of red, green and blue in the light, is drawn
-    towards the photo's own at the same place until their differences lie in the photo's range within 3
-    pixels; the light stays.
+    It is an edge where a quarter of the window lies at the level that is exceeded. What clips, and lamps,
+    which were solved to be twice as bright as saturation, have rules of their own: around them, in the reach
+    of the blur and some more, each colour stays below the photo's most within 1 pixel and above its least
+    within 3, of lamps and white areas within 2; near white areas it gets no brighter. Broad clipped areas
+    stay as they are, and so does, where e is .1, what may be glare of white ones, four times as bright as
+    saturation. Colour, the shares of red, green and blue in the light, is drawn towards the photo's own at
+    the same place until their differences lie in the photo's range within 3 pixels; the light stays.
 
     Parameters
     ----------
@@ -144,43 +148,42 @@ def limited(
     Planes, float32
     """
     error = max(*errors, _EXACT)
-    hidden, sure, edge = widening(blurs, error) if halo is None else (min(halo, _FREE),) * 3
+    room, edge = widening(error) if halo is None else (min(halo, _FREE),) * 2
     reach = max(blur.spread for blur in blurs)
     dark = math.hypot(*(sensor.noise.sigma_at(0.0) for sensor in sensors))
     held = np.array(restored, dtype=np.float32, order="C")
     photo = np.ascontiguousarray(photo, dtype=np.float32)
     wide, shape = min(reach, _MOST) + _PLATEAU, photo.shape[1:]
-    free, number = np.zeros(shape, dtype=np.bool_), np.empty((0, 0), dtype=np.float32)
+    near, number = np.zeros(shape, dtype=np.bool_), np.empty((0, 0), dtype=np.float32)
     clip = np.array([min(sensor.clip, _FREE) for sensor in sensors], dtype=np.float32)
     clipped = photo >= clip[:, None, None]
-    if clipped.any():
+    solved = (held > np.float32(_LAMP) * clip[:, None, None]).any(axis=0)
+    if clipped.any() or solved.any():
         broad = np.stack([plane & ~compact(plane, reach) for plane in clipped])
         white = broad.sum(axis=0) > 1
         if white.any():
             doubt = np.float32(_BRIGHTER * min(error / _UNSURE, 1.0))
             held += np.minimum(doubt * glare_share(photo, white, clip, blurs), 1.0) * (photo - held)
-        number, lamp, tinted = np.empty((3, *shape), dtype=np.float32)
-        _marks(photo, clip, broad, error >= _UNSURE, number, lamp, tinted)
+        number = clipped.sum(axis=0, dtype=np.float32)
+        kinds = np.maximum(np.minimum(number, 1.0), np.float32(2.0) * ((number > 1.0) | solved))
         glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
-        _beside_clipped(photo, held, broad, lamp, tinted, glow, wide, np.float32(min(hidden, _EDGE)), free)
+        _beside_lamps(photo, held, broad | white, kinds, white.astype(np.float32), glow, near)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
-    shares = (np.float32(hidden), np.float32(sure), np.float32(edge))
     most = np.empty(shape, dtype=np.float32)
     device = chosen()
     if device is not None and number.size == 0:
         colourless = _SIGMAS * dark + 1e-6
-        held = held_on_device(
-            device, photo, held, free, wide, (hidden, sure, edge), float(darkest), colourless
-        )
+        held = held_on_device(device, photo, held, near, wide, (room, edge), float(darkest), colourless)
     else:
-        _hold_light(photo, held, free, wide, shares, darkest, most)
+        shares = (np.float32(room), np.float32(edge))
+        _hold_light(photo, held, near, wide, shares, darkest, most)
         _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6))
     if halo is not None and halo < _FREE:
         low, high = np.empty_like(photo), np.empty_like(photo)
         for c in range(len(photo)):
             extremes(photo[c], photo[c], REACH, low[c], high[c])
-        room = np.float32(halo) * (high - low)
-        np.clip(held, low - room, high + room, out=held)
+        more = np.float32(halo) * (high - low)
+        np.clip(held, low - more, high + more, out=held)
     return held
 
 
@@ -194,10 +197,9 @@ def glare_share(photo: Planes, white: Mask, clip: Real, blurs: Sequence[UniformB
     return np.minimum(share, np.float32(1.0))
 
 
-def widening(blurs: Sequence[UniformBlur], error: float) -> tuple[float, float, float]:
-    """Shares of the far and the near range by which a line may leave it, and of the far one at an edge."""
-    hidden = max(1.0 / blur.line_peak - 1.0 for blur in blurs)
-    return hidden, (_SURE / error) ** 2, _EDGE * max((_UNSURE / error) ** 2, 1.0)
+def widening(error: float) -> tuple[float, float]:
+    """Shares of the near range by which a line may leave it, and of the far one by which an edge may."""
+    return min((_SURE / error) ** 2, _MOST_ROOM), _EDGE * max((_UNSURE / error) ** 2, 1.0)
 
 
 @jit
@@ -290,7 +292,7 @@ def _hold_light(
     x: Real,
     free: Mask,
     wide: int,
-    shares: tuple[Number, Number, Number],
+    shares: tuple[Number, Number],
     darkest: Number,
     most: Real,
 ) -> None:
@@ -301,7 +303,7 @@ def _hold_light(
     rows, cols = most.shape
     zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
     tiny = np.float32(TINY)
-    hidden, sure, edge = shares
+    room, edge = shares
     floor = np.sqrt(darkest)
     light, seen = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
     for i in range(rows):
@@ -323,13 +325,8 @@ def _hold_light(
         for j in range(cols):
             low, high = least[i, j], most[i, j]
             now = np.sqrt(third * (max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero)))
-            near, at_edge = sure * (high - low), edge * (top[j] - bottom[j])
-            # a line that is brighter than all nearby by what blur hides of it, and one that is darker
-            line = np.sqrt(high * high + hidden * max(high * high - bottom[j] * bottom[j], zero)) - high
-            line = min(line, near)
+            line, at_edge = room * (high - low), edge * (top[j] - bottom[j])
             up = line + above[j] * (min(at_edge, line) - line)
-            line = low - np.sqrt(max(low * low - hidden * max(top[j] * top[j] - low * low, zero), zero))
-            line = min(line, near)
             down = line + below[j] * (min(at_edge, line) - line)
             bound = min(max(now, low - down, floor * low), high + up)
             share = bound / max(now, tiny)
@@ -342,54 +339,29 @@ def _hold_light(
 
 
 @jit
-def _marks(y: Real, clip: Real, broad: Mask, unsure: bool, number: Real, lamp: Real, tinted: Real) -> None:
-    """Count clipped colours, and mark what may be a lamp, and paint of which one colour clips."""
-    one = np.float32(1.0)
-    for i in range(number.shape[0]):
-        for j in range(number.shape[1]):
-            number[i, j] = lamp[i, j] = tinted[i, j] = np.float32(0.0)
-            for c in range(3):
-                if y[c, i, j] >= clip[c]:
-                    number[i, j] += one
-                    if unsure or not broad[c, i, j] or number[i, j] > one:
-                        lamp[i, j] = one
-            if number[i, j] == one and lamp[i, j] == np.float32(0.0):
-                tinted[i, j] = one
+def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow: int, near: Mask) -> None:
+    """Hold each colour around clipped light and lamps within that of the photo, in place; mark where that is.
 
-
-@jit
-def _beside_clipped(
-    y: Real,
-    x: Real,
-    broad: Mask,
-    lamp: Real,
-    tinted: Real,
-    glow: int,
-    wide: int,
-    slack: Number,
-    near: Mask,
-) -> None:
-    """Hold each colour beside clipped light within that of the photo, in place; mark where lamps are near."""
-    rows, cols = lamp.shape
-    unused, beside, around = np.empty_like(lamp), np.empty_like(lamp), np.empty_like(lamp)
-    dimmest, brightest = np.empty_like(lamp), np.empty_like(lamp)
-    bottom, top = np.empty_like(lamp), np.empty_like(lamp)
-    extremes(lamp, lamp, glow, unused, beside)
-    extremes(tinted, tinted, wide, unused, around)
+    `kinds` is 2 for lamps and for what clips in more than one colour, and 1 for other clipped light.
+    """
+    rows, cols = kinds.shape
+    unused, kind, glare = np.empty_like(kinds), np.empty_like(kinds), np.empty_like(kinds)
+    least, dimmest, brightest = np.empty_like(kinds), np.empty_like(kinds), np.empty_like(kinds)
+    extremes(kinds, kinds, glow, unused, kind)
+    extremes(white, white, glow // 2, unused, glare)
     for c in range(3):
-        extremes(y[c], y[c], _NEAREST, dimmest, unused)
         extremes(y[c], y[c], _NEXT, unused, brightest)
-        extremes(y[c], y[c], wide - _PLATEAU - 1, bottom, top)  # in the reach of the blur
+        extremes(y[c], y[c], _NEAR, dimmest, unused)
+        extremes(y[c], y[c], _NEAR + 1, least, unused)
         for i in range(rows):
             for j in range(cols):
-                near[i, j] = beside[i, j] > np.float32(0.0)
-                room = slack * (top[i, j] - bottom[i, j])
-                if broad[c, i, j]:
+                near[i, j] = kind[i, j] > np.float32(0.0)
+                low = dimmest[i, j] if kind[i, j] > np.float32(1.0) else least[i, j]
+                high = y[c, i, j] if glare[i, j] > np.float32(0.0) else brightest[i, j]
+                if fixed[c, i, j]:
                     x[c, i, j] = y[c, i, j]
                 elif near[i, j]:
-                    x[c, i, j] = min(max(x[c, i, j], dimmest[i, j]), brightest[i, j])
-                elif around[i, j] > np.float32(0.0):
-                    x[c, i, j] = min(max(x[c, i, j], bottom[i, j] - room), top[i, j] + room)
+                    x[c, i, j] = min(max(x[c, i, j], low), high)
 
 
 @jit

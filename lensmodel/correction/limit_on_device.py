@@ -37,7 +37,7 @@ def held_on_device(
     made: NDArray[np.float32],
     free: NDArray[np.bool_],
     wide: int,
-    shares: tuple[float, float, float],
+    shares: tuple[float, float],
     darkest: float,
     dark: float,
 ) -> NDArray[np.float32]:
@@ -58,19 +58,15 @@ def _light_held(
     near: tuple[Array, Array],
     free: Array,
     wide: int,
-    shares: tuple[float, float, float],
+    shares: tuple[float, float],
     darkest: float,
 ) -> Array:
-    (least, most), (hidden, sure, edge) = near, shares
+    (least, most), (room, edge) = near, shares
     bottom, top, below, above = _levels(xp, light, wide)
     now = xp.sqrt(xp.sum(xp.clip(x, 0.0, None), axis=0) / 3.0)
-    room, at_edge = sure * (most - least), edge * (top - bottom)
-    line = xp.sqrt(most**2 + hidden * xp.clip(most**2 - bottom**2, 0.0, None)) - most
-    line = xp.minimum(line, room)
-    up = line + above * (xp.minimum(at_edge, line) - line)
-    line = least - xp.sqrt(xp.clip(least**2 - hidden * xp.clip(top**2 - least**2, 0.0, None), 0.0, None))
-    line = xp.minimum(line, room)
-    down = line + below * (xp.minimum(at_edge, line) - line)
+    line = room * (most - least)
+    at_edge = xp.minimum(edge * (top - bottom), line) - line
+    up, down = line + above * at_edge, line + below * at_edge
     low = xp.maximum(least - down, darkest**0.5 * least)
     bound = xp.minimum(xp.maximum(now, low), most + up)
     share = xp.where(free, xp.ones_like(now), (bound / xp.clip(now, TINY, None)) ** 2)

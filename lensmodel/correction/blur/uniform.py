@@ -74,11 +74,6 @@ class UniformBlur:
         """Radius in pixels that holds 98 percent of the kernel's light and its shift, and a pixel more."""
         return max(support_radius(self.kernel, 0.98), 1) + math.ceil(max(map(abs, self.offset))) + 1
 
-    @property
-    def line_peak(self) -> float:
-        """Share of its contrast that a line of one pixel keeps at least, along rows or columns."""
-        return float(min(self.kernel.sum(axis=0).max(), self.kernel.sum(axis=1).max()))
-
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
         """Transfer function on the `rfft2` grid of `shape`, cached.
 

@@ -229,7 +229,7 @@ def export_psfs(
 
         lensmodel export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json
 
-        lensmodel export my-24mm.lensprofile --aperture 2 -o mtf.csv
+        lensmodel export my-24mm.lensprofile --aperture 2 -o wide-open.npz
 
     Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """

@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft, ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
@@ -216,22 +216,20 @@ def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:
         if disc is not None:
             discs.append(disc)
     discs = sorted(discs, key=lambda disc: -disc[3])[:_CANDIDATES]
-    best: tuple[float, list[tuple[float, float, float, float]]] | None = None
+    best: tuple[float, NDArray[np.float64]] | None = None
     for four in combinations(discs, 4):
         areas = [disc[2] for disc in four]
-        quad = _clockwise(np.array([disc[:2] for disc in four]))
-        if max(areas) > _ALIKE * min(areas) or not _convex(quad):
+        hull = spatial.ConvexHull([disc[:2] for disc in four], qhull_options="QJ")
+        if max(areas) > _ALIKE * min(areas) or len(hull.vertices) < 4:
             continue
-        size = _area(quad)
-        if best is None or size > best[0]:
-            best = size, list(four)
+        if best is None or hull.volume > best[0]:
+            best = hull.volume, _clockwise(hull.points)
     if best is None or best[0] < 0.05 * small.size:
         raise NotEnoughEvidenceError(
             f"{len(discs)} corner discs of a target are seen, four are needed; the whole page must be in the "
             "photo, with its white border"
         )
-    quad = _clockwise(np.array([disc[:2] for disc in best[1]]))
-    return np.asarray((quad + 0.5) * factor - 0.5, dtype=np.float64)
+    return np.asarray((best[1] + 0.5) * factor - 0.5, dtype=np.float64)
 
 
 def _disc(
@@ -265,17 +263,3 @@ def _clockwise(points: NDArray[np.float64]) -> NDArray[np.float64]:
     middle = points.mean(axis=0)
     order = np.argsort(np.arctan2(points[:, 0] - middle[0], points[:, 1] - middle[1]))
     return np.asarray(points[order])
-
-
-def _convex(quad: NDArray[np.float64]) -> bool:
-    turns = []
-    for i in range(4):
-        a, b, c = quad[i], quad[(i + 1) % 4], quad[(i + 2) % 4]
-        u, v = b - a, c - b
-        turns.append(u[0] * v[1] - u[1] * v[0])
-    return bool(np.all(np.array(turns) > 0) or np.all(np.array(turns) < 0))
-
-
-def _area(quad: NDArray[np.float64]) -> float:
-    r, c = quad.T
-    return 0.5 * abs(float(np.dot(r, np.roll(c, -1)) - np.dot(c, np.roll(r, -1))))

@@ -29,6 +29,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.types import LensSettings
@@ -155,14 +156,9 @@ def _asymmetry(fit: _Fit, groups: NDArray[np.intp], scale: float) -> Asymmetry:
         error, freedom = max((error, freedom), _jackknife(fit, groups))
     length = float(np.hypot(*vector))
     # |g|^2 / (2 s^2) is distributed as F with 2 and 2 (n - 1) degrees where there is only chance
-    limit = math.sqrt(2.0 * _exceeded_by_chance(max(freedom, 1)))
+    limit = math.sqrt(2.0 * float(special.fdtri(2.0, 2.0 * max(freedom, 1), 1.0 - _CHANCE)))
     direction = math.atan2(float(vector[1]), float(vector[0]))
     return Asymmetry(scale * length, direction, scale * error, significant=length > limit * error)
-
-
-def _exceeded_by_chance(half_freedom: int) -> float:
-    """Value that F with 2 and 2 m degrees exceeds by chance; its survival function is (1 + x / m)^-m."""
-    return half_freedom * (_CHANCE ** (-1.0 / half_freedom) - 1.0)
 
 
 def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:

@@ -25,6 +25,10 @@ except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
 _INKS: Final[dict[Direction, str]] = {"tangential": "#b45309", "sagittal": "#0b6e99", "oblique": "#3f9142"}
+_HEAD: Final = (
+    *("edge", "row", "col", "r", "phi", "place"),
+    *("direction", "normal_deg", "mtf50_c_px", "overshoot_percent"),
+)
 _COLUMNS, _ROWS = 4, 6  # edges on a page (chosen: curves are still read in print)
 _WIDE: Final = 1600  # pixels of the chart on the page (chosen)
 _PROFILE_PX: Final = 8.0  # pixels of a profile on each side: where its curve is (chosen)
@@ -46,20 +50,7 @@ def edges_csv(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> str:
     """Write a row for each edge: where it is, along what it was measured, and its figures."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        [
-            "edge",
-            "row",
-            "col",
-            "r",
-            "phi",
-            "place",
-            "direction",
-            "normal_deg",
-            "mtf50_c_px",
-            "overshoot_percent",
-        ]
-    )
+    writer.writerow(_HEAD)
     for number, edge in enumerate(edges, start=1):
         place = photo.frame.position(*edge.middle)
         figures = (*edge.middle, place.r, place.phi)

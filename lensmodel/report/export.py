@@ -1,4 +1,4 @@
-"""PSFs and MTF in the formats of other programs.
+"""PSFs in the formats of other programs.
 
 All kernels are the image of a point in sensor orientation, row 0 at the top, sum 1, centre of mass on
 the middle pixel: what a program convolves with to blur, and is to be given to undo it.
@@ -6,7 +6,6 @@ the middle pixel: what a program convolves with to blur, and is to be given to u
 
 from __future__ import annotations
 
-import csv
 import importlib
 import io
 import json
@@ -14,7 +13,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +23,8 @@ from lensmodel.core.files import write_atomically
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.places import DEFAULT_ASPECT, grid
 
-# Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)
-FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
 
 
@@ -42,15 +38,6 @@ class PsfGrid:
     cols: int
     settings: LensSettings
     predicted_error: tuple[float, ...]  # expected relative L2 of each kernel
-
-    def __post_init__(self) -> None:
-        n = len(self.positions)
-        if self.kernels.ndim != 3 or not self.kernels.shape[0] == n == self.rows * self.cols:
-            raise InvalidInputError(
-                f"{self.rows} x {self.cols} places need as many kernels, got shape {self.kernels.shape}"
-            )
-        if len(self.predicted_error) != n:
-            raise InvalidInputError(f"{n} kernels need as many errors, got {len(self.predicted_error)}")
 
 
 def psf_grid(
@@ -136,60 +123,33 @@ def to_npz(psfs: PsfGrid) -> bytes:
 
 
 def to_json(psfs: PsfGrid) -> bytes:
-    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object."""
-    if len(psfs.positions) == 1:
-        content: Any = _matrix(psfs.kernels[0])
-    else:
-        content = document(psfs)
+    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object with units."""
+    matrices = [[[float(f"{v:.9g}") for v in row] for row in kernel] for kernel in psfs.kernels]
+    if len(matrices) == 1:
+        return json.dumps(matrices[0], allow_nan=False).encode()
+    places = zip(psfs.positions, psfs.predicted_error, matrices, strict=True)
+    content = {
+        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
+        "aperture": psfs.settings.aperture,
+        "focal_mm": psfs.settings.focal_mm,
+        "channel": psfs.settings.channel,
+        "rows": psfs.rows,
+        "cols": psfs.cols,
+        "psfs": [
+            {"r": place.r, "phi": place.phi, "predicted_error": error, "kernel": matrix}
+            for place, error, matrix in places
+        ],
+    }
     return json.dumps(content, allow_nan=False).encode()
 
 
-def to_mtf_table(psfs: PsfGrid) -> bytes:
-    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
-    known = ["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal"]
-    writer.writerow([*known, *heads])
-    for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
-        exact = kernel.astype(np.float64)
-        fifty = tangential_sagittal_mtf50(exact, place.phi)
-        contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
-        values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
-        writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
-    return out.getvalue().encode()
-
-
 # Formats by name, each of which turns `psfs` into the bytes of a file; names of files end in it
-exporters: Registry[bytes] = Registry(
-    "export format", {"csv": to_mtf_table, "fits": to_fits, "json": to_json, "npz": to_npz}
-)
+exporters: Registry[bytes] = Registry("export format", {"fits": to_fits, "json": to_json, "npz": to_npz})
 
 
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     """Write a grid in a format; the file appears complete or not at all."""
     write_atomically(Path(path), exporters.create(file_format, psfs=psfs))
-
-
-def document(psfs: PsfGrid) -> dict[str, Any]:
-    """A grid as what `json` can write, with its units."""
-    settings = psfs.settings
-    return {
-        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
-        "aperture": settings.aperture,
-        "focal_mm": settings.focal_mm,
-        "channel": settings.channel,
-        "rows": psfs.rows,
-        "cols": psfs.cols,
-        "psfs": [
-            {"r": place.r, "phi": place.phi, "predicted_error": error, "kernel": _matrix(kernel)}
-            for place, error, kernel in zip(psfs.positions, psfs.predicted_error, psfs.kernels, strict=True)
-        ],
-    }
-
-
-def _matrix(kernel: NDArray[np.float32]) -> list[list[float]]:
-    return [[float(f"{value:.9g}") for value in row] for row in kernel]
 
 
 def _astropy_fits() -> ModuleType:

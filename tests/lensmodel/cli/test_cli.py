@@ -427,15 +427,15 @@ REFUSED = {
     "export format": (
         ["export", PROFILE, "-o", "new.bmp", "--format", "bmp"],
         2,
-        "'bmp'; add .* .csv, .fits, .json",
+        "'bmp'; add .* .fits, .json",
     ),
-    "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .csv, .fits, .json"),
+    "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .fits, .json"),
     "export by two formats": (
         ["export", PROFILE, "-o", "new.fits", "--format", "npz"],
         2,
         "fits does, .* npz",
     ),
-    "half a place": (["export", PROFILE, "-o", "new.csv", "--phi", "1"], 2, "--phi needs --r"),
+    "half a place": (["export", PROFILE, "-o", "new.npz", "--phi", "1"], 2, "--phi needs --r"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
     "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
     "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
-import io
 import json
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +15,6 @@ from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.quality import tangential_sagittal_mtf50
 from lensmodel.report import PsfGrid, export, exporters, psf_grid
 from lensmodel.simulate import draw_lens
 
@@ -115,32 +111,14 @@ def test_json_of_a_single_place_is_a_bare_matrix_with_the_top_row_first(tmp_path
     assert stored[2, 4] == 0.25
 
 
-def test_csv_tells_the_contrast_of_each_kernel(psfs: PsfGrid, tmp_path: Path) -> None:
-    export(tmp_path / "mtf.csv", psfs, "csv")
-
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "mtf.csv").read_text(encoding="utf-8"))))
-    assert [(int(row["row"]), int(row["col"])) for row in rows] == [
-        (i, j) for i in range(2) for j in range(3)
-    ]
-    for row, place, kernel in zip(rows, psfs.positions, psfs.kernels, strict=True):
-        tangential, sagittal = tangential_sagittal_mtf50(kernel.astype(np.float64), place.phi)
-        assert float(row["mtf50_tangential"]) == pytest.approx(tangential, abs=1e-5)
-        assert float(row["mtf50_sagittal"]) == pytest.approx(sagittal, abs=1e-5)
-        assert 1.0 > float(row["tangential_0.05"]) > float(row["tangential_0.15"])
-
-
 @pytest.mark.parametrize("name", sorted(exporters))
-class TestEveryFormat:
-    def test_writes_a_file_that_is_complete_or_absent(self, psfs: PsfGrid, tmp_path: Path, name: str) -> None:
-        target = tmp_path / f"psf.{name}"
+def test_every_format_is_one_file_complete_or_absent(psfs: PsfGrid, tmp_path: Path, name: str) -> None:
+    target = tmp_path / f"psf.{name}"
 
-        export(target, psfs, name)
+    export(target, psfs, name)
 
-        assert target.stat().st_size > 100
-        assert [p.name for p in tmp_path.iterdir()] == [target.name]
-
-    def test_writes_a_single_place(self, name: str) -> None:
-        assert len(exporters.create(name, psfs=arrow())) > 50
+    assert target.stat().st_size > 100
+    assert [p.name for p in tmp_path.iterdir()] == [target.name]
 
 
 def test_a_single_place_is_that_kernel(model: LensModel) -> None:
@@ -153,17 +131,10 @@ def test_a_single_place_is_that_kernel(model: LensModel) -> None:
 
 
 def test_unknown_formats_are_refused_by_name(psfs: PsfGrid, tmp_path: Path) -> None:
-    with pytest.raises(UnknownMethodError, match="csv, fits, json, npz"):
+    with pytest.raises(UnknownMethodError, match="fits, json, npz"):
         export(tmp_path / "psf.bmp", psfs, "bmp")
 
 
 def test_grids_too_large_for_memory_are_refused(model: LensModel) -> None:
     with pytest.raises(InvalidInputError, match="512 MiB"):
         psf_grid(model, SETTINGS, rows=100, cols=100, size=255)
-
-
-def test_grids_of_another_number_of_kernels_are_refused(psfs: PsfGrid) -> None:
-    with pytest.raises(InvalidInputError, match="2 x 2 places"):
-        replace(psfs, rows=2, cols=2)
-    with pytest.raises(InvalidInputError, match="6 kernels need as many errors, got 1"):
-        replace(psfs, predicted_error=(0.1,))

@@ -61,7 +61,7 @@ def _files(store: Store, storage: Storage, owner: str) -> Iterator[tuple[zipfile
     ]
     for name, key in kept:
         try:
-            size = storage.info(key).size
+            size = storage.size(key)
         except FileNotFoundError:  # deleted meanwhile
             missing.append(name)
         else:

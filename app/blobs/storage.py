@@ -12,7 +12,6 @@ import os
 import shutil
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
@@ -43,13 +42,6 @@ class AsyncBlobWriter(Protocol):
 
     async def write(self, data: bytes) -> object:
         """Take the next piece."""
-
-
-@dataclass(frozen=True, slots=True)
-class BlobInfo:
-    """Properties of a blob, without its content."""
-
-    size: int
 
 
 def _client_options(patience_s: float) -> ClientConfig:
@@ -151,9 +143,9 @@ class Storage:
         """Return a whole blob; FileNotFoundError where there is none of that key."""
         return bytes(obstore.get(self._store, key).bytes())
 
-    def info(self, key: str) -> BlobInfo:
-        """Return what is known of a blob; raises as `get`."""
-        return BlobInfo(size=int(obstore.head(self._store, key)["size"]))
+    def size(self, key: str) -> int:
+        """Return the bytes of a blob; raises as `get`."""
+        return int(obstore.head(self._store, key)["size"])
 
     def stream(self, key: str, start: int, end: int) -> Iterator[bytes]:
         """Yield the bytes `start` to `end`, the last one excluded, in pieces."""

@@ -122,7 +122,7 @@ def _read(storage: Storage, key: str, number: int) -> bytes:
 def _table(storage: Storage, key: str) -> tuple[int, int, tuple[int, ...]]:
     """Return height, width and offsets."""
     try:
-        return _checked(storage, key, storage.info(key).size)  # made anew it has another size
+        return _checked(storage, key, storage.size(key))  # made anew it has another size
     except FileNotFoundError as error:
         raise NotReadyError("there is no such picture yet: wait for the job that makes it") from error
 

@@ -120,7 +120,7 @@ def create(
         )
     lasts = _span_or_none(expires)
     with _opened(data) as store:
-        new_key = store.create_key(
+        text = store.create_key(
             name,
             [scope],  # type: ignore[list-item]  # the option takes no other
             label=label,
@@ -128,7 +128,7 @@ def create(
             quota_bytes=None if quota_gb is None else int(quota_gb * GIB),
             quota_photos=quota_photos,
         )
-    _show(new_key.text)
+    _show(text)
 
 
 @keys.command(name="list")

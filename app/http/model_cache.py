@@ -15,10 +15,11 @@ from typing import Final, TypeAlias
 
 from app.errors import ConflictError, UnknownError
 from app.runtime import metrics
-from app.store import Store, StoredSample
+from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.psf import PsfSample
 from lensmodel.model import LensModel
 
 log = logging.getLogger(__name__)
@@ -69,7 +70,7 @@ class ModelCache:
         if old is not None:
             state, samples = self._store.lenses.samples_of(lens_id, after_version=old.state.version)
             if state.rebuild_epoch == old.state.rebuild_epoch:
-                return Fitted(lens_id, state, old.model.added([stored.sample for stored in samples]))
+                return Fitted(lens_id, state, old.model.added(samples))
         return _fit(lens_id, *self._store.lenses.samples_of(lens_id))
 
     def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
@@ -106,13 +107,13 @@ class ModelCache:
         return fitted
 
 
-def _fit(lens_id: str, state: LensState, samples: list[StoredSample]) -> Fitted:
+def _fit(lens_id: str, state: LensState, samples: list[PsfSample]) -> Fitted:
     if not samples:
         raise NoSamplesError(
             f"lens {lens_id} has no samples yet (version {state.version}): "
             "upload photos taken with it and wait until they are counted"
         )
-    return Fitted(lens_id, state, LensModel.fit([stored.sample for stored in samples]))
+    return Fitted(lens_id, state, LensModel.fit(samples))
 
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -112,7 +112,7 @@ class JobContext:
                 raise OutageError(f"task {task}: {outcome.detail}")
             doubled_mb = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
             if outcome.ending == "memory_limit" and not enlarged and doubled_mb > limits.memory_mb:
-                enlarged, limits = True, limits.with_memory(doubled_mb)
+                enlarged, limits = True, replace(limits, memory_mb=doubled_mb)
             elif outcome.code == "crashed":
                 crashes += 1
                 self._pause_after(outcome, task, crashes, wanted)
@@ -166,7 +166,7 @@ class JobContext:
     def _is_stored(self, key: str) -> bool:
         """Say whether there is a blob; OSError while its folder is away: nothing is known then."""
         try:
-            self.storage.info(key)
+            self.storage.size(key)
         except FileNotFoundError:
             return False
         return True

@@ -111,13 +111,13 @@ class CorrectionWork:
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
         try:
-            state, stored = self._context.store.lenses.samples_of(lens_id, up_to_version=version)
+            state, samples = self._context.store.lenses.samples_of(lens_id, up_to_version=version)
         except NoSamplesError as error:
             raise JobFailedError(error.code, str(error)) from error
-        if not stored:
+        if not samples:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
-        write_samples(folder, [entry.sample for entry in stored])
+        write_samples(folder, samples)
         return state
 
     def _progress_of(self, run: Run) -> ProgressHook:

@@ -33,7 +33,6 @@ from lensmodel.blind import estimators
 from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
-from lensmodel.correction.engine import first_use
 from lensmodel.model import LensModel
 from lensmodel.model.profile import read_profile
 from lensmodel.neural import FieldNetwork
@@ -170,7 +169,6 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     """Correct the photo in `developed` with the samples in the folder; write the result there."""
     # A compressed photo that would gain nothing to be seen is left as it is, which some of its cells tell
     # soon. The photo's own samples join them, unless they are there already: `photo` is what they are called.
-    _log_compiling()
     developed = sampling.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
@@ -321,15 +319,6 @@ def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
     """Write planes as upright sRGB tiles."""
     upright = photo.upright(photo.shown(planes, developed.encoding), developed.encoding.orientation)
     write_tiles(path, upright)
-
-
-def _log_compiling() -> None:
-    """Log the compilation of loops: a child otherwise logs warnings only."""
-    if not first_use.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s task %(name)s: %(message)s"))
-        first_use.addHandler(handler)
-        first_use.setLevel(logging.INFO)
 
 
 def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:

@@ -155,7 +155,7 @@ def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region
 def exists(storage: Storage, key: str) -> bool:
     """Say whether a picture is stored."""
     try:
-        storage.info(key)
+        storage.size(key)
     except FileNotFoundError:
         return False
     return True

@@ -32,7 +32,7 @@ from app.schemas import (
 from app.store import LensName
 from app.store.accounts import Usage
 from app.store.database import new_id
-from app.store.photos import GIVEN_SETTINGS, NewCopy, Received
+from app.store.photos import GIVEN_SETTINGS, Received
 from app.store.tables import PhotoRow
 from lensmodel.patches import selectors
 
@@ -348,7 +348,7 @@ def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
         find_lens(call, change.lens_id)
     keys = list(dict.fromkeys(change.photo_ids))
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    lens = change.lens_id if change.new_lens is None else NewCopy(change.new_lens.label)
-    call.store.photos.change_several(keys, call.owner, given, lens)
+    label = None if change.new_lens is None else change.new_lens.label
+    call.store.photos.change_several(keys, call.owner, given, lens_id=change.lens_id, label=label)
     items = [views.photo_out(find_photo(call, key)) for key in keys]
     return Page[PhotoOut](items=items, next=None)

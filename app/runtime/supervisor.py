@@ -65,21 +65,17 @@ def run_worker(settings: Settings) -> None:
     # worker is small for this reason
     confine.keep_private()
     require_sandbox(settings)
-    _migrate(settings)
+    _prepare(settings, asks_for_keys=False)
     os.environ.update(ONE_THREAD | environment(settings))
     os.execv(sys.executable, [sys.executable, "-m", "app.runtime.worker_main"])  # noqa: S606 - no shell is wanted
 
 
-def _prepare(settings: Settings) -> None:
+def _prepare(settings: Settings, *, asks_for_keys: bool = True) -> None:
     """Bring the schema up to date, and check that there is a key if one is needed."""
-    _migrate(settings)
-    database = Database(settings.database)
-    try:
-        usable = not settings.needs_keys or Accounts(database).has_valid_key()
-    finally:
-        database.close()
-    if usable:
-        return
+    with contextlib.closing(Database(settings.database)) as database:
+        migrate.upgrade(database)  # one of several simultaneous processes does it
+        if not (asks_for_keys and settings.needs_keys) or Accounts(database).has_valid_key():
+            return
     raise UsageError(
         f"the service asks for keys (LENS_HOST={settings.host}, LENS_ALLOWED_HOSTS={settings.allowed_hosts}, "
         f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
@@ -107,15 +103,6 @@ _REMEDIES: Final = {
     "files": "no Landlock: use Linux 5.13 or newer with it switched on (lsm=landlock,...), and a container "
     "engine that allows its system calls",
 }
-
-
-def _migrate(settings: Settings) -> None:
-    """Bring the schema up to date; one of several simultaneous processes does it."""
-    database = Database(settings.database)
-    try:
-        migrate.upgrade(database)
-    finally:
-        database.close()
 
 
 def environment(settings: Settings) -> dict[str, str]:

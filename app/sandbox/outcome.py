@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import signal
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -29,10 +29,6 @@ class TaskLimits:
     scratch_mb: int = 8192  # all that lies in its folder
     files: int = 10_000
     open_files: int = 256
-
-    def with_memory(self, memory_mb: int) -> TaskLimits:
-        """Return the same limits with another memory."""
-        return replace(self, memory_mb=memory_mb)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from app.store.jobs import Jobs
 from app.store.lenses import Lenses, LensName
 from app.store.patches import NewPatch, NewSample
 from app.store.photos import Photos
-from app.store.samples import StoredSample
 
-__all__ = ["LensName", "NewPatch", "NewSample", "Store", "StoredSample"]
+__all__ = ["LensName", "NewPatch", "NewSample", "Store"]
 
 
 class Store:

@@ -47,15 +47,6 @@ USE_PRECISION: Final = timedelta(minutes=10)  # of `last_used_at` (chosen): each
 
 
 @dataclass(frozen=True, slots=True)
-class NewKey:
-    """A new key: `text` is shown once, the others are stored."""
-
-    text: str
-    prefix: str
-    key_hash: str
-
-
-@dataclass(frozen=True, slots=True)
 class Usage:
     """What an owner stores and has in work, and the limits that differ from the settings."""
 
@@ -86,8 +77,9 @@ class Accounts(Repository):
         lasts: timedelta | None = None,
         quota_bytes: int | None = None,
         quota_photos: int | None = None,
-    ) -> NewKey:
-        """Create a key for an owner, and the owner if new; quotas that are given replace the present ones."""
+    ) -> str:
+        """Return a new key of an owner, who may be new too; quotas that are given replace the present."""
+        # Only its hash is stored
         owner_key = ensure_owner(session, owner)
         quotas = {"quota_bytes": quota_bytes, "quota_photos": quota_photos}
         given = {name: value for name, value in quotas.items() if value is not None}
@@ -95,19 +87,18 @@ class Accounts(Repository):
             session.execute(update(OwnerRow).where(OwnerRow.id == owner_key).values(**given))
         prefix = "".join(secrets.choice(_PREFIX_SIGNS) for _ in range(8))
         text = f"lpk_{prefix}_{secrets.token_urlsafe(32)}"
-        key = NewKey(text, prefix, digest_of(text))
         session.add(
             KeyRow(
                 owner_id=owner_key,
-                prefix=key.prefix,
-                key_hash=key.key_hash,
+                prefix=prefix,
+                key_hash=digest_of(text),
                 label=label,
                 scopes=" ".join(scopes),
                 created_at=now(),
                 expires_at=None if lasts is None else now() + lasts,
             )
         )
-        return key
+        return text
 
     @writes_durably
     def revoke_key(self, session: Session, prefix: str) -> bool:

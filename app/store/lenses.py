@@ -26,7 +26,7 @@ from app.store.owners import (
     now,
     owned,
 )
-from app.store.samples import COLUMNS, LensState, StoredSample, sample_in
+from app.store.samples import COLUMNS, LensState, sample_in
 from app.store.tables import (
     CORRECTION_ACTIVE,
     PHOTO_WORKED_ON,
@@ -39,6 +39,7 @@ from app.store.tables import (
     SampleRow,
 )
 from lensmodel.core.names import name_key, serial_key
+from lensmodel.core.psf import PsfSample
 
 TEACHES: Final = and_(PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
 NO_RESULT: Final = ("failed", "cancelled")
@@ -184,12 +185,12 @@ class Lenses(Repository):
 
     def samples_of(
         self, lens_id: str, *, after_version: int = 0, up_to_version: int | None = None
-    ) -> tuple[LensState, list[StoredSample]]:
+    ) -> tuple[LensState, list[PsfSample]]:
         """Return the state of a lens and its samples that joined after a version."""
         # Both are of one moment. Versions grow under the lens's row lock, so no sample of a version that was
         # seen can turn up later.
         query = (
-            select(SampleRow.id, SampleRow.version_added, *COLUMNS)
+            select(SampleRow.id, *COLUMNS)
             .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
             .join(PatchRow, PatchRow.id == SampleRow.patch_id)
             .join(LensRow, LensRow.id == SampleRow.lens_id)
@@ -203,7 +204,7 @@ class Lenses(Repository):
             if state is None:
                 return LensState(0, 0), []
             rows = session.execute(query)
-            return LensState(*state), [StoredSample(r.id, r.version_added, sample_in(r)) for r in rows]
+            return LensState(*state), [sample_in(row) for row in rows]
 
     # --- measuring --------------------------------------------------------------------------------
 

@@ -61,13 +61,6 @@ FILE_KEPT: Final = timedelta(days=1)
 
 
 @dataclass(frozen=True, slots=True)
-class NewCopy:
-    """A new copy of the lens that photos say they were taken with, by the name that its owner gives it."""
-
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
 class Received:
     """Result of an upload: the photo, and whether there is work to do for it."""
 
@@ -392,10 +385,12 @@ class Photos(Patches):
         photo_ids: Sequence[str],
         owner: str,
         given: Mapping[str, Any],
-        lens: str | NewCopy | None,
+        *,
+        lens_id: str | None = None,
+        label: str | None = None,
     ) -> None:
         """Apply the same settings and lens to several photos: to all or, where one is gone, to none."""
-        # A new copy becomes the lens of them all
+        # With `label` a new copy, called so, of the lens that the first one names becomes that of them all;
         # always locked in the same order: two such changes must not wait for each other
         rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
         chosen: LensRow | None = None
@@ -403,11 +398,9 @@ class Photos(Patches):
             photo = rows[key]
             if photo is None:
                 raise UnknownError("photo", key)
-            if chosen is None and isinstance(lens, NewCopy):
-                name = LensName(photo.lens_maker, photo.lens_model, None, label=lens.label)
-                chosen = _chosen(session, photo, name, owner)
-            elif chosen is None and isinstance(lens, str):
-                chosen = _chosen(session, photo, lens, owner)
+            if chosen is None:
+                named = label and LensName(photo.lens_maker, photo.lens_model, None, label=label)
+                chosen = _chosen(session, photo, named or lens_id, owner)
             _change(session, photo, given, chosen)
 
     @writes

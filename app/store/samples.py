@@ -75,15 +75,6 @@ class LensState:
     rebuild_epoch: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredSample:
-    """A sample with its key and the version at which it joined."""
-
-    id: int
-    version_added: int
-    sample: PsfSample
-
-
 def columns_of(
     sample: PsfSample, photo: PhotoRow, patch: PatchRow, diagnostics: Mapping[str, Any]
 ) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
     with pytest.raises(ServiceProblemError, match="not_ready"):
         api.save_report(lens_id, tmp_path / "report.pdf")
     _, stored = store.lenses.samples_of(lens_id)
-    model = LensModel.fit([one.sample for one in stored])
+    model = LensModel.fit(stored)
     test = lens_report(model, "A lens", rows=5, size=15, channels=("g",))
     lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None

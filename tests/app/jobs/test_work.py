@@ -260,7 +260,7 @@ def test_samples_lie_where_their_patches_do(
     work.photo(photo.public_id, 1)
 
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
-    assert {(round(entry.sample.position.r, 9), entry.sample.position.phi) for entry in samples} == {
+    assert {(round(entry.position.r, 9), entry.position.phi) for entry in samples} == {
         (0.1, 0.5),
         (0.3, 0.5),
     }
@@ -296,7 +296,7 @@ def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estima
 
     assert (steps.fresh(photo).state, "estimate" in sandbox.ran) == ("counted", False)
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
-    assert [(s.sample.estimator, s.sample.error) for s in samples] == [("measured-target/1", 0.04)] * 2
+    assert [(s.estimator, s.error) for s in samples] == [("measured-target/1", 0.04)] * 2
 
 
 def test_a_file_is_not_lost_whose_disk_went_away_for_a_moment(
@@ -345,7 +345,7 @@ def test_a_photo_focused_at_infinity_says_so_to_the_model(
     work.photo(photo.public_id, 1)
 
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
-    assert {stored.sample.settings.focus_m for stored in samples} == {math.inf}
+    assert {stored.settings.focus_m for stored in samples} == {math.inf}
     assert views.photo_out(steps.fresh(photo)).focus_distance_m is None
 
 
@@ -719,7 +719,7 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
     CorrectionWork(context).correction(key)
 
     with pytest.raises(FileNotFoundError):
-        context.storage.info(f"corrections/{key}/result.tif")
+        context.storage.size(f"corrections/{key}/result.tif")
 
 
 def test_a_child_cannot_hand_in_a_file_from_elsewhere(

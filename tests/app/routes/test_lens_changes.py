@@ -165,9 +165,7 @@ def reported(client: TestClient, steps: Steps, store: Store, settings: Settings)
     """A lens whose newest version has its report."""
     lens_id: str = steps.lens_id(steps.counted(patches=6))
     _, stored = store.lenses.samples_of(lens_id)
-    test = lens_report(
-        LensModel.fit([one.sample for one in stored]), "A lens", rows=5, size=15, channels=("g",)
-    )
+    test = lens_report(LensModel.fit(stored), "A lens", rows=5, size=15, channels=("g",))
     lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)

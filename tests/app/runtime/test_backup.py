@@ -48,7 +48,7 @@ def opened(folder: Path) -> Iterator[tuple[Settings, Store, Storage]]:
 
 def kernels(store: Store, lens_id: str) -> np.ndarray:
     _, samples = store.lenses.samples_of(lens_id)
-    return np.stack([stored.sample.kernel for stored in samples])
+    return np.stack([stored.kernel for stored in samples])
 
 
 def test_a_service_goes_on_from_a_backup(
@@ -117,7 +117,9 @@ def test_a_backup_under_load_has_every_blob_that_its_rows_name(
     for folder in whole:
         with opened(folder) as (settings, new, blobs):
             assert not [
-                f for f in examine(settings, new, blobs).findings if f.check == "blobs" and "missing" in f.says
+                f
+                for f in examine(settings, new, blobs).findings
+                if f.check == "blobs" and "missing" in f.says
             ]
 
 

@@ -127,7 +127,7 @@ class Installation:
         self.workers: list[subprocess.Popen[bytes]] = []
         key = store.accounts.create_key(
             "local", ["write"]
-        ).text  # others can reach these: they do not start without
+        )  # others can reach these: they do not start without
         self.clients = [
             httpx2.Client(
                 base_url=f"http://{h.address}:{API_PORT}",

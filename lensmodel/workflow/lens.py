@@ -105,8 +105,8 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        places = zip(_one_each(r, n, "r"), _one_each(phi, n, "phi"), strict=True)
-        apertures = [None] * n if aperture is None else _one_each(aperture, n, "aperture")
+        places = zip(_each(r, n, "r"), _each(phi, n, "phi"), strict=True)
+        apertures = [None] * n if aperture is None else _each(aperture, n, "aperture")
         samples = [
             PsfSample(
                 centred(kernel),
@@ -121,9 +121,9 @@ class Lens:
                 stack,
                 places,
                 apertures,
-                _named_each(channel, n, "channel"),
-                _one_each(weight, n, "weight"),
-                _named_each(photo, n, "photo"),
+                _each(channel, n, "channel"),
+                _each(weight, n, "weight"),
+                _each(photo, n, "photo"),
                 strict=True,
             )
         ]
@@ -495,17 +495,10 @@ def _frequencies_of(values: ArrayLike) -> NDArray[np.float64]:
     return wanted
 
 
-def _one_each(values: ArrayLike, n: int, name: str) -> list[float]:
-    """Return n numbers that were given one by one, or once for all."""
-    array = np.asarray(values, dtype=np.float64)
+def _each(values: ArrayLike | Sequence[str], n: int, name: str) -> list[Any]:
+    """Return n numbers or names that were given one by one, or once for all."""
+    array = np.asarray(values)
     if array.shape not in {(), (n,)}:
-        raise InvalidInputError(f"{name} must be one number or {n}, one for each kernel, got {array.shape}")
-    return [float(value) for value in np.broadcast_to(array, (n,))]
-
-
-def _named_each(values: str | Sequence[str], n: int, name: str) -> list[Any]:
-    """Return n names that were given one by one, or once for all."""
-    names = [values] * n if isinstance(values, str) else list(values)
-    if len(names) != n:
-        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(names)}")
-    return names
+        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {array.shape}")
+    plain = array if array.dtype.kind == "U" else np.asarray(values, dtype=np.float64)
+    return np.broadcast_to(plain, (n,)).tolist()

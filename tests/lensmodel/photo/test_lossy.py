@@ -56,38 +56,19 @@ def write_lossy_dng(
     )
 
 
-@pytest.mark.parametrize(("fine", "coarse"), [(97, 85), (85, 60)])
-def test_the_tables_of_a_lossy_dng_say_its_noise(tmp_path: Path, fine: int, coarse: int) -> None:
-    variances = []
-    for quality in (fine, coarse):
-        write_lossy_dng(tmp_path / "x.dng", scene(), quality)
-        developed = photo.develop(tmp_path / "x.dng")
-        assert developed.info.kind == "dng"
-        assert developed.lossy
-        coded = developed.coding_noise
-        assert coded is not None
-        variances.append(float(coded.variance(np.array(0.2))))
-        for noise in (*developed.correction_noise, *developed.coarse_noise):
-            assert noise.variance(np.array(0.2)) >= 0.999 * variances[-1]
-
-    def median_step(quality: int) -> float:
-        table = Image.open(io.BytesIO(jpeg_tile(scene(), quality))).quantization[0]  # type: ignore[attr-defined]
-        return float(np.median(table))
-
-    assert variances[1] / variances[0] == pytest.approx(
-        (median_step(coarse) / median_step(fine)) ** 2, rel=0.2
-    )
-
-
-def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize("quality", [85, 70])
+def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(quality: int, tmp_path: Path) -> None:
     before = scene()
     planes = []
-    for quality in (100, 70):
-        write_lossy_dng(tmp_path / "x.dng", before, quality)
+    for each in (100, quality):
+        write_lossy_dng(tmp_path / "x.dng", before, each)
         developed = photo.develop(tmp_path / "x.dng")
         planes.append(developed.planes[1])
     coded = developed.coding_noise
     assert coded is not None
+    assert (developed.info.kind, developed.lossy) == ("dng", True)
+    for noise in (*developed.correction_noise, *developed.coarse_noise):
+        assert noise.variance(np.array(0.2)) >= 0.999 * coded.variance(np.array(0.2))
     error = planes[1] - planes[0]
     expected = float(coded.variance(planes[0]).mean())
     assert 0.3 < float(np.square(error).mean()) / expected < 3.0

@@ -186,7 +186,7 @@ def _add(
     if target.exists():  # another run may have added to it meanwhile
         known = Lens.load(target)
     model = joined(None if known is None else known.model, samples, replace=replace_blind)
-    profile = grown(known, model, {key: path.name}, [identity], any_lens=any_lens).profile
+    profile = grown(known, model, key, path, identity, any_lens=any_lens).profile
     left = {sample.photo for sample in model.samples}  # `--replace` may have taken all of a photo
     profile = replace(profile, photos={name: label for name, label in profile.photos.items() if name in left})
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -88,8 +88,8 @@ def difference(known: Mapping[str, str], cameras: Iterable[Camera], identity: Id
     alike = [body for body in bodies if _same_model(body, identity.camera)]
     if not identity.names_lens and not alike:
         return (
-            f"it names no lens and was taken with another camera, {_camera_words(identity.camera)}, "
-            f"and the profile's photos with {', '.join(map(_camera_words, bodies))}"
+            f"it names no lens and was taken with another camera, {identity.camera.model}, "
+            f"and the profile's photos with {', '.join(body.model or 'an unknown camera' for body in bodies)}"
         )
     built_in = not _names_lens(known) if not identity.names_lens else _is_built_in(identity)
     serials = {serial_key(body.serial) for body in alike if body.serial}
@@ -115,10 +115,6 @@ def _same_model(one: Camera, other: Camera) -> bool:
     # makers write their name into the model or not, and in more than one way; models are not shared
     a, b = name_key(one.model), name_key(other.model)
     return bool(a) and bool(b) and (a.endswith(b) or b.endswith(a))
-
-
-def _camera_words(camera: Camera) -> str:
-    return camera.model or "an unknown camera"
 
 
 def _lens_words(lens: Mapping[str, str]) -> str:
@@ -264,7 +260,7 @@ class Calibration:
         if lens is not None and not self._any_lens:
             require_same_lens(lens, identity)
         model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
-        self._store.keep(grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens))
+        self._store.keep(grown(lens, model, key, path, identity, any_lens=self._any_lens))
         return len(samples)
 
     def _knows(self, key: str) -> bool:
@@ -298,25 +294,18 @@ def require_original(path: Path) -> None:
 
 
 def grown(
-    lens: Lens | None,
-    model: LensModel,
-    photos: Mapping[str, str],
-    identities: Iterable[Identity],
-    *,
-    any_lens: bool = False,
+    lens: Lens | None, model: LensModel, key: str, path: Path, identity: Identity, *, any_lens: bool = False
 ) -> Lens:
-    """Return a lens whose model has learned from more photos (names by id), with names and cameras of both.
+    """Return a lens whose model has learned from one photo more, with names and cameras of both.
 
-    Photos that may be of other lenses (`any_lens`) do not name this one.
+    A photo that may be of another lens (`any_lens`) does not name this one.
     """
     known = LensProfile(model) if lens is None else lens.profile
-    names, cameras = dict(known.lens), list(known.cameras)
-    for identity in identities:
-        if lens is None or not any_lens:
-            names = {**identity.lens, **names}
-        if identity.camera is not None and identity.camera not in cameras:
-            cameras.append(identity.camera)
-    return Lens(LensProfile(model, names, {**known.photos, **photos}, tuple(cameras)))
+    names, camera = known.lens, identity.camera
+    if lens is None or not any_lens:
+        names = {**identity.lens, **names}
+    new = () if camera is None or camera in known.cameras else (camera,)
+    return Lens(LensProfile(model, names, {**known.photos, key: path.name}, (*known.cameras, *new)))
 
 
 def joined(

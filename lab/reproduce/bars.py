@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from lab.reproduce.cases import SOFT_SEED
-from lab.reproduce.tables import MORE, groups, more_photos, paths, summary
-from lensmodel.core.types import ZONES
+from lab.reproduce.cases import SOFT_SEED, learned
+from lab.reproduce.tables import FEWER, MORE, get, groups, more_photos, paths, summary
+from lensmodel.core.types import CHANNELS, ZONES
 
 COUNTS: Final = ("1", "2", "5")
 """Numbers of photos that bars are of."""
@@ -51,21 +51,21 @@ class Bar:
 
 def bars(result: Mapping[str, Any]) -> list[Bar]:
     """Evaluate every bar on the lenses of each family, the soft fast one apart."""
-    method = result["plan"]["methods"][0]
     soft = [case for case in result["cases"] if case["settings"]["seed"] == SOFT_SEED]
     usual = [case for case in result["cases"] if case["settings"]["seed"] != SOFT_SEED]
     found: list[Bar] = []
     for family, group in groups({**result, "cases": usual}).items():
-        parts = (_psf(group), _photos(group, method), _more(group, method), _paths(group))
+        made = summary(group)
+        parts = (_psf(made), _photos(made), _more(group, made), _paths(group))
         found += [replace(bar, family=family) for part in parts for bar in part]
     if soft:
         made = summary({**result, "cases": soft})
         for zone, limit in zip(ZONES, _SOFT, strict=True):
-            value = made["psf"].get("1", {}).get(zone)
+            value = get(made, "psf", learned(1), "g", zone)
             found.append(
                 Bar("relative L2 of the PSF, green", zone, value, high=limit, family="soft fast lens")
             )
-        worse = made["worse"][method].get("1", {})
+        worse = made["worse"].get("1", {})
         found.append(Bar(_FALLS, _zones(worse), worse.get("clearly_worse"), high=0, family="soft fast lens"))
     return found
 
@@ -77,46 +77,41 @@ def _zones(counts: Mapping[str, int]) -> str:
     return f"of {counts['zones']} zones" if counts else "zones"
 
 
-def _psf(group: Mapping[str, Any]) -> Iterator[Bar]:
-    made = summary(group)
+def _psf(made: Mapping[str, Any]) -> Iterator[Bar]:
     for i, n in enumerate(COUNTS):
-        green = made["psf_by_channel"]["g"].get(n, {})
-        for zone, limit in zip(ZONES, _PSF[i], strict=True):
-            yield Bar("relative L2 of the PSF, green", zone, green.get(zone), high=limit, n=n)
-        for channel, word in (("r", "red"), ("b", "blue")):
-            other = made["psf_by_channel"][channel].get(n, {})
-            for zone in ZONES:
-                pair = other.get(zone), green.get(zone)
-                ratio = None if None in pair else pair[0] / pair[1]
+        errors = {c: [get(made, "psf", learned(n), c, zone) for zone in ZONES] for c in CHANNELS}
+        for zone, green, limit in zip(ZONES, errors["g"], _PSF[i], strict=True):
+            yield Bar("relative L2 of the PSF, green", zone, green, high=limit, n=n)
+        for word, others in (("red", errors["r"]), ("blue", errors["b"])):
+            for zone, other, green in zip(ZONES, others, errors["g"], strict=True):
+                ratio = None if None in (other, green) else other / green
                 yield Bar(f"relative L2 of the PSF, {word} over green", zone, ratio, high=_COLOURS[i], n=n)
         told = made["predicted_right"].get(n)
         yield Bar("share of PSF errors told right within a factor of 1.5", "field", told, low=_TOLD[i], n=n)
 
 
-def _photos(group: Mapping[str, Any], method: str) -> Iterator[Bar]:
-    made = summary(group)
+def _photos(made: Mapping[str, Any]) -> Iterator[Bar]:
     for i, n in enumerate(COUNTS):
         for zone, limit in zip(ZONES, _KEPT[i], strict=True):
-            value = made["psnr_kept"][method].get(n, {}).get(zone)
+            value = get(made, "psnr_kept", n, zone)
             yield Bar("share of the true-PSF gain in PSNR", zone, value, low=limit, n=n)
         for zone in ZONES:
-            value = made["highest_mtf"][method].get(n, {}).get(zone)
+            value = get(made, "highest_mtf", n, zone)
             yield Bar("highest corrected MTF of any lens", zone, value, high=_HIGHEST_MTF[i], n=n)
-        worse = made["worse"][method].get(n, {})
+        worse = made["worse"].get(n, {})
         yield Bar(_FALLS, _zones(worse), worse.get("clearly_worse"), high=0, n=n)
-        off = made["forecast_off"][method].get(n)
+        off = made["forecast_off"].get(n)
         words = "what the forecast of the gain by zone is off by, dB"
         yield Bar(words, "all zones", off, high=_FORECAST_DB[i], n=n)
 
 
-def _more(group: Mapping[str, Any], method: str) -> Iterator[Bar]:
-    psf = summary(group)["psf"]
+def _more(group: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[Bar]:
     for zone in ZONES:
-        pair = [psf.get(n, {}).get(zone) for n in ("2", "5")]
+        pair = [get(made, "psf", learned(n), "g", zone) for n in (FEWER, MORE)]
         more = None if None in pair else pair[1] - pair[0]
         yield Bar("relative L2 of green above that of two photos", zone, more, high=_MORE_HARMS, n=MORE)
-    compared = more_photos(group["cases"], method)
-    value = compared["psnr_worse"] if compared["zones"] else None
+    compared = more_photos(group["cases"])
+    value = compared["clearly_worse"] if compared["zones"] else None
     words = "zones where five photos give a PSNR below that of two by more than 0.05 dB"
     yield Bar(words, _zones(compared) if compared["zones"] else "zones", value, high=0, n=MORE)
 

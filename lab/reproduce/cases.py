@@ -24,11 +24,19 @@ Family: TypeAlias = Literal["third order", "ray-traced"]
 
 FAMILIES: Final[tuple[Family, ...]] = ("third order", "ray-traced")
 
-PROTOCOL: Final = 7
+PROTOCOL: Final = 8
 """Part of every key of a stored result; raised when what is measured changes."""
 
-METHODS: Final = ("standard", "paper")
-"""Non-blind methods; here `paper` is the deconvolution alone, Richardson-Lucy, with our own PSFs."""
+METHOD: Final = "standard"
+"""Non-blind method of all corrections but the paper's own way."""
+
+# Names of what becomes of the photos of a lens, beside what was learned by default, see `learned`.
+BEFORE: Final = "without correction"
+RIVAL: Final = "Schuler et al. 2012, n = 1"
+GENERAL: Final = "general profile of the lens model"
+PAPER_WAY: Final = "the paper's own way"
+MEASURED: Final = "measured with a target"
+TRUE: Final = "true PSF"
 
 FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""
@@ -50,6 +58,11 @@ _TRACED: Final = 100_000
 
 _QUICK_FRAME: Final = (640, 960)  # rows and columns (chosen): 0.6 megapixels
 _PHOTOS: Final = {"quick": (1, 2), "default": (1, 2, 5, 10)}
+
+
+def learned(number: int | str) -> str:
+    """Name of what was learned by default from so many photos."""
+    return f"n = {number}"
 
 
 def repository_grids() -> tuple[Path, ...]:
@@ -151,14 +164,9 @@ class Reproduction:
     # folder of sharp photographs, of which the test half is used; None means the library's five
     scenes: Path | None = None
     size: Size = "default"  # how it was planned, for the page
-    # whether all that a lens is compared with is run too: Richardson-Lucy with our PSFs, the paper's own way
-    # from end to end, a general profile, a printed target, a blind rival, Figs. 2 and 4
+    # whether all that a lens is compared with is run too: the paper's own way from end to end, a general
+    # profile, a printed target, a blind rival, Figs. 2 and 4
     compare: bool = False
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Non-blind methods of the correction."""
-        return METHODS if self.compare else METHODS[:1]
 
     def files(self) -> tuple[Path, ...]:
         """Return the photographs."""
@@ -184,7 +192,7 @@ def key_of(case: Case, plan: Reproduction, code: str) -> str:
 
     The numbers of photos are no part of it, so that a later run with more of them finds what is there.
     """
-    parts = (PROTOCOL, code, _lens_of(case), case.layout, plan.methods, content_of(plan.files()))
+    parts = (PROTOCOL, code, _lens_of(case), case.layout, content_of(plan.files()))
     return f"{case.name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"
 
 

@@ -1,4 +1,4 @@
-"""PSF fields to compare with: a general profile, a measured lens, no blur, and the ways of Fig. 2."""
+"""PSF fields to compare with: a general profile, a measured lens, and the ways of Fig. 2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lab.model.model_benchmark import PATCHES, asked_places, patch_places, predi
 from lab.reproduce.cases import Case
 from lensmodel import measured as measure
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfField, PsfSample, as_kernel, delta, distance
+from lensmodel.core.psf import PsfField, PsfSample, as_kernel, distance
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.measured.target import Target
 from lensmodel.model import LensModel
@@ -56,16 +56,6 @@ class Remembered:
         if key not in self._known:
             self._known[key] = self.field.kernel_at(position, channel, size)
         return self._known[key]
-
-
-@dataclass(frozen=True, slots=True)
-class PointField:
-    """A lens without any blur: what is left of a correction with it is denoising and demosaicing."""
-
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return a point."""
-        del position, channel
-        return delta(size)
 
 
 # --- a general profile of the lens model: what a maker of software has who measured other copies ---

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from dataclasses import field as dataclass_field
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from lab.reproduce.cases import Case
+from lab.reproduce.cases import METHOD, Case
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.correction import correct_planes
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.photo.lateral import LateralColour, resample
 from lensmodel.workflow import correcting, sampling
 from lensmodel.workflow.sampling import PRESETS, Preset
 
@@ -29,41 +28,6 @@ _SMALL_FRAME: Final = 2e6
 """Pixels below which the paper's way takes kernels of the default's size (chosen): 55 are of 21 MP."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """A PSF as the lens model gives it."""
-
-    kernel: Kernel
-    predicted_error: float  # relative L2 that the model expects of it; NaN where it says nothing
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CorrectedPhoto:
-    """A photo as the lens model corrects it: its parts, in what it was."""
-
-    planes: Planes  # in the camera's colours, linear, not white-balanced
-    # gain in PSNR of linear light that the correction expects of itself, by zone, mean over the parts; None
-    # where it is not sure enough to tell
-    expected_db: Mapping[str, float | None] = dataclass_field(default_factory=dict)
-    nothing_to_correct: bool = False  # whether the correction said so, and left every pixel as it was
-
-
-class Learner(Protocol):
-    """One lens that learns from photos, answers for its PSF, and corrects photos."""
-
-    def learn(self, photo: Path) -> str:
-        """Learn from one more photo; return why it did not count, or nothing.
-
-        A photo that has been learned from before changes nothing; the answer is the same.
-        """
-
-    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
-        """Return the PSFs at some places."""
-
-    def corrected(self, photo: Path, method: str, parts: Sequence[Roi]) -> CorrectedPhoto:
-        """Correct parts of a photo that takes no part in learning, with what is known now."""
-
-
 def paper_way(case: Case) -> Preset:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
@@ -71,20 +35,26 @@ def paper_way(case: Case) -> Preset:
     return replace(PRESETS["paper"], kernel_size=sampling.DEFAULT_KERNEL_SIZE)
 
 
-class LibraryLearner:
-    """The library in this process, by a way of learning, on so many processes."""
+class Learner:
+    """One lens that learns from photos by a preset, answers for its PSF, and corrects photos."""
 
     def __init__(self, way: Preset, workers: int) -> None:
+        self.seconds = 0.0  # that learning took
         self._way, self._workers = way, workers
-        self._seen: dict[str, str] = {}
+        self._seen: dict[str, str] = {}  # why photos did not count, by their identity
         self._model: LensModel | None = None
 
-    def learn(self, photo: Path) -> str:
-        """Learn from one more photo; see `Learner`."""
-        name = sampling.photo_id(photo)
-        if name not in self._seen:
-            self._seen[name] = self._learned(photo)
-        return self._seen[name]
+    def learn(self, photos: Sequence[Path]) -> list[str]:
+        """Learn from photos that are new; say which of all did not count, and why."""
+        began, refused = time.monotonic(), []
+        for photo in photos:
+            name = sampling.photo_id(photo)
+            if name not in self._seen:
+                self._seen[name] = self._learned(photo)
+            if self._seen[name]:
+                refused.append(f"{photo.stem}: {self._seen[name]}")
+        self.seconds += time.monotonic() - began
+        return refused
 
     def _learned(self, photo: Path) -> str:
         config = sampling.Config(estimator=self._way.estimator, kernel_size=self._way.kernel_size)
@@ -96,33 +66,38 @@ class LibraryLearner:
         self._model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
         return ""
 
-    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
-        """Return the PSFs at some places; see `Learner`."""
+    def answers(
+        self, places: Sequence[Place], settings: LensSettings, size: int
+    ) -> list[tuple[Kernel, float]]:
+        """Return the PSFs at some places, and the relative L2 error that the model expects of each."""
         model = self._known()
         found = [model.query(place, settings.with_channel(channel), size) for place, channel in places]
-        return [Answer(answer.kernel, answer.predicted_error) for answer in found]
+        return [(answer.kernel, answer.predicted_error) for answer in found]
 
-    def corrected(self, photo: Path, method: str, parts: Sequence[Roi]) -> CorrectedPhoto:
-        """Correct parts of a photo; see `Learner`."""
+    def corrected(self, photo: Path, parts: Sequence[Roi]) -> tuple[Planes, Mapping[str, float | None]]:
+        """Correct parts of a photo that takes no part in learning, with what is known now.
+
+        Also the gain in PSNR of linear light that the correction expects of itself, by zone, mean over the
+        parts; None where it is not sure enough to tell.
+        """
         developed = develop(photo)
         model, settings = self._known(), sampling.settings_of(developed)
-        field = correcting.psfs_for(developed, model, settings, method=method)
+        field = correcting.psfs_for(developed, model, settings, method=self._way.method)
         lateral = correcting.lateral_of(developed)
-        planes, said, nothing = developed.planes.copy(), dict[str, list[float | None]](), True
+        planes, said = developed.planes.copy(), dict[str, list[float | None]]()
         for roi in parts:
             done = correcting.correct_photo(
-                developed, model, settings, method=method, lateral=lateral, known=field, roi=roi,
+                developed, model, settings, method=self._way.method, lateral=lateral, known=field, roi=roi,
                 workers=self._workers,
             )  # fmt: skip
             planes[_inside(roi)] = done.planes
-            nothing &= done.nothing_to_correct
             for zone, report in done.zones.items():
                 said.setdefault(zone, []).append(report.expected_gain_db)
         expected = {
             zone: None if None in told else float(np.mean([v for v in told if v is not None]))
             for zone, told in said.items()
         }
-        return CorrectedPhoto(planes, expected, nothing)
+        return planes, expected
 
     def _known(self) -> LensModel:
         if self._model is None:
@@ -131,19 +106,14 @@ class LibraryLearner:
 
 
 def corrected_with(
-    developed: LinearPhoto, field: PsfField, method: str, parts: Sequence[Roi], *, workers: int = 1
+    developed: LinearPhoto, field: PsfField, parts: Sequence[Roi], *, workers: int = 1
 ) -> Planes:
-    """Correct parts of a photo with a PSF field taken as right, as learners do with theirs."""
-    planes, cfa = developed.planes, developed.cfa
-    lateral: LateralColour | None = correcting.lateral_of(developed)
-    if method == "paper" and lateral is not None:
-        # the same way as `correcting.correct_photo` goes, so that only the PSFs differ
-        planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
-    made = planes.copy()
+    """Correct parts of a photo with a PSF field taken as right, as a learner does with its own."""
+    lateral, made = correcting.lateral_of(developed), developed.planes.copy()
     for roi in parts:
         made[_inside(roi)] = correct_planes(
-            planes, field, developed.frame, method=method, noise=developed.correction_noise,
-            clip=developed.clip, lateral=lateral, cfa=cfa, roi=roi, workers=workers,
+            developed.planes, field, developed.frame, method=METHOD, noise=developed.correction_noise,
+            clip=developed.clip, lateral=lateral, cfa=developed.cfa, roi=roi, workers=workers,
         ).planes  # fmt: skip
     return made
 

@@ -13,11 +13,11 @@ from lab.charts import by_zone, measure_edges
 from lab.images import BLOCK, BORDER, fidelity
 from lab.model.model_benchmark import asked_places
 from lab.reproduce.cases import Case
-from lab.reproduce.learners import Answer, Place, Roi
+from lab.reproduce.learners import Place, Roi
 from lab.reproduce.shots import Shots, guard_of
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, distance
-from lensmodel.core.types import CHANNELS, ZONES, Planes, Zone
+from lensmodel.core.types import CHANNELS, ZONES, Kernel, Planes, Zone
 from lensmodel.simulate import edge_chart
 
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
@@ -35,16 +35,16 @@ def places() -> list[Place]:
     return [(place, channel) for channel in CHANNELS for place in asked_places()]
 
 
-def psf_errors(answers: Sequence[Answer], truth: PsfField) -> dict[str, Any]:
-    """Compare the answers at `places()` with the truth, after sub-pixel alignment."""
+def psf_errors(answers: Sequence[tuple[Kernel, float]], truth: PsfField) -> dict[str, Any]:
+    """Compare kernels at `places()`, and the errors expected of them, with the truth after alignment."""
     rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     right = []
-    for (place, channel), answer in zip(places(), answers, strict=True):
-        found = distance(answer.kernel, truth.kernel_at(place, channel, PSF_SIZE))
+    for (place, channel), (kernel, expected) in zip(places(), answers, strict=True):
+        found = distance(kernel, truth.kernel_at(place, channel, PSF_SIZE))
         rel_l2[channel][zone_of(place.r)].append(found.rel_l2)
         mtf[channel][zone_of(place.r)].append(found.mtf_rmse)
-        ratio = answer.predicted_error / max(found.rel_l2, 1e-9)
+        ratio = expected / max(found.rel_l2, 1e-9)
         right.append(1.0 / NEAR <= ratio <= NEAR)
     return {
         "rel_l2": _medians(rel_l2),

@@ -10,17 +10,8 @@ from typing import Any
 
 from lab.page import Page
 from lab.reproduce.bars import Bar, bars, held
-from lab.reproduce.tables import (
-    DENOISED,
-    GENERAL,
-    PAPER_WAY,
-    deconvolution,
-    groups,
-    number,
-    paths,
-    shown,
-    summary,
-)
+from lab.reproduce.cases import GENERAL, PAPER_WAY
+from lab.reproduce.tables import counts, groups, number, summary
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import ZONES
@@ -62,7 +53,6 @@ def write_json(result: Mapping[str, Any], path: Path) -> Path:
     whole = {
         **result,
         "summary": found,
-        "paths_summary": {label: paths(group) for label, group in groups(result).items()},
         "bars": [bar.plain() for bar in every],
         "bars_held": held(every),
     }
@@ -112,16 +102,10 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
         f"Mean over {found['lenses']} lenses; in each zone the median over its edges, and the largest "
         "MTF and overshoot (percent of the step), without which MTF50 proves nothing."
     )
-    for method, rows in found["mtf"].items():
-        page.title(f"Deconvolution: {deconvolution(method)}", 3)
-        head = [
-            "",
-            *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over")),
-        ]
-        page.table(head, [[shown(row["state"]), *_edge_cells(row)] for row in rows])
-        page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
-        kept = found["share"][method].items()
-        page.table(["", *ZONES], [[f"n = {n}", *(number(v[z], 2) for z in ZONES)] for n, v in kept])
+    head = ["", *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over"))]
+    page.table(head, [[_shown(state), *_edge_cells(row)] for state, row in found["mtf"].items()])
+    page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
+    page.table(["", *ZONES], _rows({f"n = {n}": row for n, row in found["share"].items()}, 2))
     page.text("The paper, Canon EF 24mm f/1.4 (center, corner), for comparison of shares, not of values:")
     page.table(["", "center", "corner"], _PAPER)
 
@@ -146,8 +130,7 @@ def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
         "Relative L2 against the truth after sub-pixel alignment, green; median of the zone, mean over "
         "lenses."
     )
-    beside = [[name, *(number(row[z], 3) for z in ZONES)] for name, row in found["psf_others"].items()]
-    page.table(["", *ZONES], [*beside, *_count_rows(found["psf"], 3)])
+    page.table(["", *ZONES], _rows({_shown(state): row["g"] for state, row in found["psf"].items()}, 3))
 
 
 def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
@@ -155,14 +138,11 @@ def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
     page.title(f"A photo never used for calibration, {label}")
     page.text(
         "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 pixels at its "
-        f"best shift. {DENOISED.capitalize()} is the control: the correction with a PSF that is a point."
+        "best shift."
     )
-    for method, psnr in found["psnr"].items():
-        page.title(f"Deconvolution: {deconvolution(method)}", 3)
-        page.table(["", *ZONES], [[shown(row["state"]), *(number(row[z], 2) for z in ZONES)] for row in psnr])
-        page.text("Share of the gain of the true PSF in PSNR, where that is measurable:")
-        kept = found["psnr_kept"][method]
-        page.table(["", *ZONES], [[f"n = {n}", *(number(kept[n][z], 2) for z in ZONES)] for n in kept])
+    page.table(["", *ZONES], _rows({_shown(state): row for state, row in found["psnr"].items()}, 2))
+    page.text("Share of the gain of the true PSF in PSNR, where that is measurable:")
+    page.table(["", *ZONES], _rows({f"n = {n}": row for n, row in found["psnr_kept"].items()}, 2))
 
 
 def _bars_table(page: Page, every: Sequence[Bar]) -> None:
@@ -191,17 +171,9 @@ def _cell(bar: Bar | None) -> str:
     if bar is None:
         return ""
     value = number(bar.value, 0 if isinstance(bar.value, int) else 2)
-    return f"{value} ({_band(bar.low, bar.high)}) {_verdict(bar)}"
-
-
-def _band(low: float | None, high: float | None) -> str:
-    return f"at most {high:g}" if low is None else f"at least {low:.2g}"
-
-
-def _verdict(bar: Bar) -> str:
-    if bar.met is None:
-        return "not told"
-    return "held" if bar.met else "MISSED"
+    band = f"at most {bar.high:g}" if bar.low is None else f"at least {bar.low:.2g}"
+    verdict = {None: "not told", True: "held", False: "MISSED"}[bar.met]
+    return f"{value} ({band}) {verdict}"
 
 
 def _which_lenses(page: Page, result: Mapping[str, Any]) -> None:
@@ -230,18 +202,23 @@ def _refused(page: Page, result: Mapping[str, Any]) -> None:
         f"{case['title']}: {reason}"
         for case in result["cases"]
         for reason in dict.fromkeys(
-            r
-            for part in ("learned", "paper")
-            for unit in case.get(part, {}).values()
-            for r in unit["refused"]
+            reason
+            for state, reasons in case["refused"].items()
+            if state.startswith(("n = ", PAPER_WAY))
+            for reason in reasons
         )
     ]
     if refused:
         page.text("Photos that gave no usable patch and did not count: " + "; ".join(refused) + ".")
 
 
-def _count_rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
-    return [[f"default, n = {n}", *(number(row[zone], digits) for zone in ZONES)] for n, row in rows.items()]
+def _rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
+    return [[name, *(number(row[zone], digits) for zone in ZONES)] for name, row in rows.items()]
+
+
+def _shown(state: str) -> str:
+    """Name of a state on pages: what was learned by default says so."""
+    return f"default, {state}" if state.startswith("n = ") else state
 
 
 # --- figures ---
@@ -331,32 +308,24 @@ def _before_after(page: Page, result: Mapping[str, Any]) -> None:
         "lower right."
     )
     for case in result["cases"]:
-        names = _pictures(case)
-        if names:
-            page.title(case["title"], 3)
-        for label, words in _labels(case, result["plan"]).items():
-            if label in names:
-                page.picture(PICTURES + names[label], words)
+        page.title(case["title"], 3)
+        for label, words in _labels(case).items():
+            if label in case["pictures"]:
+                page.picture(PICTURES + case["pictures"][label], words)
 
 
-def _pictures(case: Mapping[str, Any]) -> dict[str, str]:
-    """Files of all pictures of a lens by label."""
-    units = [case["truth"], *(case[part] for part in ("general", "measured", "rival") if case.get(part))]
-    units += [unit for part in ("learned", "paths", "paper") for unit in case.get(part, {}).values()]
-    return {label: name for unit in units for label, name in unit["pictures"].items()}
-
-
-def _labels(case: Mapping[str, Any], plan: Mapping[str, Any]) -> dict[str, str]:
+def _labels(case: Mapping[str, Any]) -> dict[str, str]:
     """Pictures of a lens in their order, with what they show."""
-
-    def each(label: str, words: str) -> dict[str, str]:
-        return {f"{label}-{m}": f"{words}, deconvolution {deconvolution(m)}" for m in plan["methods"]}
-
-    n = max(int(n) for n in case["learned"])
-    found = {"before": "as photographed", **each(f"n{n}", f"corrected blindly by default, n = {n}")}
-    found |= {"tiff": "a 16-bit TIFF corrected, n = 1", "jpeg": "a JPEG corrected, n = 1"}
-    found[f"way-paper-n{n}-paper"] = f"corrected blindly, {PAPER_WAY}, n = {n}"
-    found |= each("schuler", "corrected with the PSFs of Schuler et al. 2012 (a basis of lenses)")
-    found |= each("general", f"corrected with a {GENERAL} (in place of a commercial one)")
-    found |= each("measured", "corrected with PSFs measured with a target (non-blind)")
-    return {**found, **each("true", "corrected with the true PSF"), "scene": "the scene itself"}
+    n = counts([case])[-1]
+    return {
+        "before": "as photographed",
+        f"n{n}": f"corrected blindly by default, n = {n}",
+        "tiff": "a 16-bit TIFF corrected, n = 1",
+        "jpeg": "a JPEG corrected, n = 1",
+        f"way-paper-n{n}": f"corrected blindly, {PAPER_WAY}, n = {n}",
+        "schuler": "corrected with the PSFs of Schuler et al. 2012 (a basis of lenses)",
+        "general": f"corrected with a {GENERAL} (in place of a commercial one)",
+        "measured": "corrected with PSFs measured with a target (non-blind)",
+        "true": "corrected with the true PSF",
+        "scene": "the scene itself",
+    }

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -19,8 +19,14 @@ from lab.images import EVERY, as_shown, blocks, fidelity, to_srgb
 from lab.reproduce import job, measure
 from lab.reproduce.bars import bars, held
 from lab.reproduce.cases import (
+    BEFORE,
     FIRST_SEED,
+    GENERAL,
+    MEASURED,
+    PAPER_WAY,
+    RIVAL,
     SOFT_SEED,
+    TRUE,
     Case,
     Reproduction,
     key_of,
@@ -32,20 +38,20 @@ from lab.reproduce.fields import Flow, MeanField, SymmetricField, general_field
 from lab.reproduce.figures import strip
 from lab.reproduce.frames import centred_cut, frame_scene, layout_for, scene_files
 from lab.reproduce.job import run_reproduction
-from lab.reproduce.learners import Answer, Place, Roi, paper_way
+from lab.reproduce.learners import paper_way
 from lab.reproduce.page import collected, write_json, write_page
 from lab.reproduce.shots import Shots, in_container
-from lab.reproduce.tables import RIVAL, groups, kept, paths, shares, summary
+from lab.reproduce.tables import groups, kept, paths, share, summary
 from lab.scenes import HARD_SCENES
 from lab.stored import ROOT, code_of, version_of
 from lab.traced import read_grid
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import as_kernel, distance
-from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
-from lensmodel.workflow.sampling import Preset
+from lensmodel.workflow.sampling import PRESETS, Preset
 
 
 def case(**changes: Any) -> Case:
@@ -91,13 +97,6 @@ HELIAR, TELEPHOTO = repository_grids()
 def traced(path: Path = HELIAR, **changes: Any) -> Case:
     (one,) = planned("quick", lenses=[str(path)]).cases
     return replace(one, height=480, width=640, **changes)
-
-
-def test_only_what_bars_ask_for_is_run_where_nothing_is_compared() -> None:
-    least, whole = planned("default"), planned("default", compare=True)
-    assert least.methods == ("standard",)
-    assert whole.methods == ("standard", "paper")
-    assert [one.name for one in least.cases] == [one.name for one in whole.cases]
 
 
 def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
@@ -244,9 +243,8 @@ def test_key_changes_with_settings_and_code() -> None:
         key_of(one, plan(), "1"),
         key_of(one, plan(), "2"),
         key_of(replace(one, aperture=2.8), plan(), "1"),
-        key_of(one, plan(compare=True), "1"),
     }
-    assert len(keys) == 4
+    assert len(keys) == 3
     assert photos_of(one, plan()) == photos_of(one, plan(compare=True))
     assert photos_of(one, plan()) != photos_of(replace(one, width=320), plan())
     assert key_of(case(), plan(), "1") in keys
@@ -301,6 +299,10 @@ def state(mtf50: float, psnr: float) -> dict[str, Any]:
     }
 
 
+def psf(error: float, right: float = 0.75) -> dict[str, Any]:
+    return {"rel_l2": {c: dict.fromkeys(ZONES, error) for c in "rgb"}, "predicted_right": right}
+
+
 def result(*lenses: tuple[float, float]) -> dict[str, Any]:
     """Lenses given by MTF50 and PSNR after n = 1; 100 and 30 before, 200 and 34 with the true PSF."""
     cases = [
@@ -311,41 +313,22 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             "unseen": True,
             "source": f"drawn, seed {1000 + i}",
             "settings": {"seed": 1000 + i, "height": 480, "width": 640},
-            "truth": {
-                "before": state(100, 30.0),
-                "true": {"paper": state(200, 34.0)},
-                "control": state(101, 30.5),
-                "pictures": {"before": "before.png", "scene": "scene.png", "true-paper": "true.png"},
+            "states": {
+                BEFORE: state(100, 30.0),
+                TRUE: state(200, 34.0),
+                "n = 1": state(mtf50, psnr),
+                RIVAL: state(130, 31.0),
             },
-            "learned": {
-                "1": {
-                    "photos": 1,
-                    "counted": 1,
-                    "refused": [],
-                    "pictures": {"n1-paper": "after.png"},
-                    "psf": {
-                        "rel_l2": {c: dict.fromkeys(ZONES, 0.2) for c in "rgb"},
-                        "predicted_right": 0.75,
-                    },
-                    "methods": {"paper": state(mtf50, psnr)},
-                }
-            },
+            "psf": {"n = 1": psf(0.2), RIVAL: psf(0.5)},
+            "refused": {"n = 1": []},
             "paths": {},
-            "rival": {
-                "pictures": {"schuler-paper": "schuler.png"},
-                "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
-                "methods": {"paper": state(130, 31.0)},
-            },
+            "pictures": {"before": "before.png", "scene": "scene.png", "true": "true.png", "n1": "after.png"},
         }
         for i, (mtf50, psnr) in enumerate(lenses)
     ]
     return {
         "code": "abc",
-        "plan": {
-            "size": "quick",
-            "methods": ["paper"],
-            "own_scenes": True,
-        },
+        "plan": {"size": "quick", "own_scenes": True},
         "scenes": ["city", "lake"],
         "developed_on": ["lake"],
         "cases": cases,
@@ -354,31 +337,30 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
 
 
 def test_share_is_of_the_gain_of_the_true_psf() -> None:
-    assert shares(result((160, 32.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.6))
-    assert kept(result((160, 33.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.75))
+    one = result((160, 33.0))["cases"][0]
+    assert share(one, "n = 1", "mid") == pytest.approx(0.6)
+    assert kept(one, "n = 1", "mid") == pytest.approx(0.75)
 
 
 def test_share_of_a_small_gain_is_left_out() -> None:
-    made = result((160, 32.0))
-    made["cases"][0]["truth"]["true"]["paper"] = state(104, 30.1)
-    assert shares(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
-    assert kept(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
+    one = result((160, 32.0))["cases"][0]
+    one["states"][TRUE] = state(104, 30.1)
+    assert share(one, "n = 1", "mid") is kept(one, "n = 1", "mid") is None
 
 
 def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
     found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
-    rows = {row["state"]: row for row in found["mtf"]["paper"]}
-    assert list(rows) == ["without correction", "denoised only", RIVAL, "n = 1", "true PSF"]
-    assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
-    assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
-    assert found["worse"]["paper"]["1"] == {"zones": 9, "worse": 6, "clearly_worse": 3}
-    assert found["psf_others"][RIVAL]["corner"] == pytest.approx(0.5)
-    assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
+    assert list(found["mtf"]) == [BEFORE, RIVAL, "n = 1", TRUE]
+    assert found["mtf"]["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
+    assert found["mtf"]["n = 1"]["corner"]["sagittal_mtf50"] is None
+    assert found["worse"]["1"] == {"zones": 9, "clearly_worse": 3}
+    assert found["psf"][RIVAL]["g"]["corner"] == pytest.approx(0.5)
+    assert found["share"]["1"]["mid"] == pytest.approx(1 / 3)
 
 
 def test_bar_of_the_highest_mtf_sees_the_one_lens_that_rings() -> None:
     made = result((190, 33.0), (190, 33.0), (190, 33.0))
-    made["cases"][1]["learned"]["1"]["methods"]["paper"]["edges"]["mid"]["mtf_max"] = 1.3
+    made["cases"][1]["states"]["n = 1"]["edges"]["mid"]["mtf_max"] = 1.3
     found = {(bar.place, bar.n): bar for bar in bars(made) if bar.name == "highest corrected MTF of any lens"}
     assert (found["mid", "1"].value, found["mid", "1"].met) == (1.3, False)
     assert (found["center", "1"].value, found["center", "1"].met) == (1.02, True)
@@ -386,8 +368,7 @@ def test_bar_of_the_highest_mtf_sees_the_one_lens_that_rings() -> None:
 
 def test_forecast_is_judged_by_the_mean_of_what_its_zones_are_off_by() -> None:
     made = result((190, 33.0))
-    methods = made["cases"][0]["learned"]["1"]["methods"]
-    methods["paper"]["forecast"] = {
+    made["cases"][0]["states"]["n = 1"]["forecast"] = {
         "center": {"expected": 2.0, "true": 1.0},
         "mid": {"expected": None, "true": 1.0},
         "corner": {"expected": 1.0, "true": 1.5},
@@ -400,12 +381,11 @@ def after(two: tuple[float, float], five: tuple[float, float]) -> dict[str, Any]
     """A lens after two and five photos: the error of its blue PSF, and PSNR, both in the corner."""
     made = result((190, 33.0))
     one = made["cases"][0]
-    for n, (error, psnr) in (("2", two), ("5", five)):
-        unit = json.loads(json.dumps(one["learned"]["1"]))
-        unit["psf"]["rel_l2"]["b"]["corner"] = error
-        unit["psf"]["rel_l2"]["g"]["corner"] = unit["psf"]["rel_l2"]["r"]["corner"] = 0.3 if n == "2" else 0.1
-        unit["methods"]["paper"]["psnr"]["corner"] = psnr
-        one["learned"][n] = unit
+    for n, green, (error, psnr) in (("2", 0.3, two), ("5", 0.1, five)):
+        one["states"][f"n = {n}"], one["psf"][f"n = {n}"] = state(190, 33.0), psf(0.2)
+        one["states"][f"n = {n}"]["psnr"]["corner"] = psnr
+        for channel, value in (("r", green), ("g", green), ("b", error)):
+            one["psf"][f"n = {n}"]["rel_l2"][channel]["corner"] = value
     return made
 
 
@@ -434,7 +414,7 @@ def test_colours_are_judged_by_their_ratio_to_green() -> None:
 def test_the_soft_fast_lens_is_judged_by_itself() -> None:
     made = result((190, 33.0), (190, 33.0))
     made["cases"][1]["settings"]["seed"] = SOFT_SEED
-    made["cases"][1]["learned"]["1"]["psf"]["rel_l2"]["g"]["center"] = 0.29
+    made["cases"][1]["psf"]["n = 1"]["rel_l2"]["g"]["center"] = 0.29
     found = [bar for bar in bars(made) if bar.family == "soft fast lens"]
     assert [(bar.place, bar.met) for bar in found][:2] == [("center", True), ("mid", True)]
     green = [b for b in bars(made) if b.name == "relative L2 of the PSF, green" and b.family == "third order"]
@@ -443,21 +423,16 @@ def test_the_soft_fast_lens_is_judged_by_itself() -> None:
 
 def test_files_of_other_kinds_are_judged_by_what_raw_ones_gain() -> None:
     made = result((190, 33.0))  # raw gains 3 dB
-    states = {"before": state(0, 30.0), "true": state(0, 33.0), "after": state(0, 31.2)}
-    made["cases"][0]["paths"] = {name: {**states, "refused": [], "pictures": {}} for name in ("tiff", "jpeg")}
+    states = {BEFORE: state(0, 30.0), TRUE: state(0, 33.0), "after": state(0, 31.2)}
+    made["cases"][0]["paths"] = dict.fromkeys(("tiff", "jpeg"), states)
     assert paths(made)["jpeg"]["share"]["mid"] == pytest.approx(0.4)
     met = {b.name: b.met for b in bars(made) if b.place == "mid" and "that of raw" in b.name}
     assert met == {"TIFF: gain in PSNR over that of raw": False, "JPEG: gain in PSNR over that of raw": True}
 
 
-def traced_too(made: dict[str, Any]) -> dict[str, Any]:
-    """Make the last lens a ray-traced one."""
-    made["cases"][-1] |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
-    return made
-
-
 def test_families_are_judged_and_shown_apart(tmp_path: Path) -> None:
-    made = traced_too(result((190, 33.0), (120, 29.0)))
+    made = result((190, 33.0), (120, 29.0))
+    made["cases"][-1] |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
     falls = [b for b in bars(made) if b.name.startswith("zones where PSNR falls") and b.n == "1"]
     assert {bar.family: bar.value for bar in falls} == {"third order": 0, "ray-traced": 3}
     assert list(groups(made)) == ["third order", "ray-traced"]
@@ -466,33 +441,12 @@ def test_families_are_judged_and_shown_apart(tmp_path: Path) -> None:
     assert "| third order | Lens &lt;0&gt; | drawn, seed 1000 | unseen |" in text
 
 
-def with_paper(made: dict[str, Any]) -> dict[str, Any]:
-    """Add the paper's own way, a general profile and a measured lens to every lens."""
-    for number, one in enumerate(made["cases"]):
-        unit = one["learned"]["1"]
-        worse = {"rel_l2": {c: dict.fromkeys(ZONES, 0.6 + number) for c in "rgb"}, "predicted_right": 0.0}
-        pictures = {"way-paper-n1-paper": "way.png"}
-        one["paper"] = {
-            "1": {**unit, "psf": worse, "methods": {"paper": state(140, 31.5)}, "pictures": pictures}
-        }
-        one["general"] = {"psf": worse, "methods": {"paper": state(145, 31.6)}, "pictures": {}}
-        one["measured"] = {"psf": worse, "methods": {"paper": state(195, 33.9)}, "pictures": {}}
-    return made
-
-
 def test_the_papers_own_way_is_a_row_of_each_table(tmp_path: Path) -> None:
-    made = with_paper(result((160, 32.0)))
-    found = summary(made)
-    assert [row["state"] for row in found["mtf"]["paper"]][-5:] == [
-        "general profile of the lens model",
-        "the paper's own way, n = 1",
-        "n = 1",
-        "measured with a target",
-        "true PSF",
-    ]
-    rows = {row["state"]: row for row in found["psnr"]["paper"]}
-    assert rows["the paper's own way, n = 1"]["corner"] == 31.5
-    assert found["psf_others"]["the paper's own way, n = 1"]["center"] == pytest.approx(0.6)
+    made, way = result((160, 32.0)), f"{PAPER_WAY}, n = 1"
+    one = made["cases"][0]
+    one["states"] |= {way: state(140, 31.5), GENERAL: state(145, 31.6), MEASURED: state(195, 33.9)}
+    one["psf"] |= {way: psf(0.6), GENERAL: psf(0.6), MEASURED: psf(0.6)}
+    assert list(summary(made)["psnr"]) == [BEFORE, RIVAL, GENERAL, way, "n = 1", MEASURED, TRUE]
     text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
     assert "| the paper's own way, n = 1 | 140 |" in text
     assert "| the paper's own way, n = 1 | 0.600 |" in text
@@ -513,20 +467,18 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert "MISSED" in text
 
 
-def test_json_holds_results_and_summary(tmp_path: Path) -> None:
+def test_json_holds_results_summary_and_bars(tmp_path: Path) -> None:
     path = write_json(result((160, 32.0)), tmp_path / "all.json")
     stored = json.loads(path.read_text(encoding="utf-8"))
-    assert stored["summary"]["third order"]["share"]["paper"]["1"]["corner"] == pytest.approx(0.6)
-    assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
+    assert stored["summary"]["third order"]["share"]["1"]["corner"] == pytest.approx(0.6)
+    assert stored["cases"][0]["states"]["n = 1"]["psnr"]["mid"] == 32.0
     assert stored["bars_held"] == held(bars(result((160, 32.0))))
     assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
-    assert stored["paths_summary"] == {"third order": {}}
 
 
 def test_page_says_when_photos_did_not_count(tmp_path: Path) -> None:
     made = result((100, 30.0))
-    unit = made["cases"][0]["learned"]["1"]
-    unit["refused"], unit["counted"], unit["psf"] = ["photo-00: flat"], 0, None
+    made["cases"][0]["refused"]["n = 1"] = ["photo-00: flat"]
     markdown, _ = write_page(made, tmp_path)
     assert "photo-00: flat" in markdown.read_text(encoding="utf-8")
 
@@ -556,7 +508,7 @@ def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
     few = [(FieldPosition(r, 0.5), c) for r in (0.1, 0.5, 0.9) for c in CHANNELS]
     monkeypatch.setattr(measure, "places", lambda: few)
     field = case().truth()
-    exact = [Answer(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in measure.places()]
+    exact = [(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in measure.places()]
     found = measure.psf_errors(exact, field)
     assert max(v for zones in found["rel_l2"].values() for v in zones.values()) < 1e-3
     assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
@@ -637,21 +589,19 @@ def test_strip_shows_the_corners_of_a_picture() -> None:
 
 
 class Nothing:
-    """A learner that never learns anything; counts what it is asked."""
+    """A learner that never learns anything; keeps the presets and photos that it was given."""
 
-    def __init__(self) -> None:
-        self.learned: list[str] = []
+    opened: ClassVar[list[tuple[str, int]]]
+    learned: ClassVar[list[str]]
+    seconds = 0.0
 
-    def learn(self, photo: Path) -> str:
-        if photo.stem not in self.learned:
-            self.learned.append(photo.stem)
-        return "too dark"
+    def __init__(self, way: Preset, workers: int) -> None:
+        del workers
+        self.opened.append((way.estimator, way.kernel_size))
 
-    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
-        raise AssertionError((places, settings, size))
-
-    def corrected(self, photo: Path, method: str, parts: Sequence[Roi]) -> Planes:
-        raise AssertionError((photo, method, parts))
+    def learn(self, photos: Sequence[Path]) -> list[str]:
+        self.learned.extend(photo.stem for photo in photos)
+        return [f"{photo.stem}: too dark" for photo in photos]
 
 
 @pytest.fixture
@@ -664,138 +614,93 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         folder.mkdir(parents=True, exist_ok=True)
         return Shots.of(one, folder)
 
-    def truth(self: Any, shots: Shots) -> dict[str, Any]:
-        made: dict[str, Any] = result((160, 32.0))["cases"][0]["truth"]
-        return made
-
-    def path(self: Any, container: str, way: Preset, shots: Shots) -> dict[str, Any]:
-        del self, container, way, shots
-        states = {name: state(100, 30.0) for name in ("before", "true", "after")}
-        return {**states, "refused": [], "pictures": {}}
-
-    def by_target(self: Any, shots: Shots) -> dict[str, Any]:
-        del self, shots
-        return {"refused": "no page was photographed", "psf": None, "methods": {}, "pictures": {}}
-
+    truth = {"states": {BEFORE: state(100, 30.0), TRUE: state(200, 34.0)}}
     monkeypatch.setattr(job, "take", made_up)
-    monkeypatch.setattr(job.CaseJob, "_truth", truth)
-    monkeypatch.setattr(job.CaseJob, "_path", path)
-    monkeypatch.setattr(job.CaseJob, "_by_field", lambda *_: by_target(None, None))
+    monkeypatch.setattr(job, "Learner", Nothing)
+    monkeypatch.setattr(Nothing, "opened", [], raising=False)
+    monkeypatch.setattr(Nothing, "learned", [], raising=False)
+    monkeypatch.setattr(job.CaseJob, "_truth", lambda _: truth)
+    monkeypatch.setattr(job.CaseJob, "_path", lambda _, name: {"paths": {name: {}}})
+    for part in ("_by_field", "_measured", "_rival"):
+        monkeypatch.setattr(job.CaseJob, part, lambda *_: {})
     monkeypatch.setattr(job.figures, "draw", lambda *_, **__: {})
-    monkeypatch.setattr(job.CaseJob, "_measured", by_target)
-    monkeypatch.setattr(job.CaseJob, "_rival", by_target)
     return taken
 
 
-def reproduced(folder: Path, learner: Nothing, chosen: Reproduction) -> dict[str, Any]:
-    announced: list[tuple[int, int]] = []
-
-    def on_work(words: str, done: int, total: int) -> None:
-        del words
-        announced.append((done, total))
-
-    def opened(way: Preset, workers: int) -> Nothing:
-        del way, workers
-        return learner
-
-    made = run_reproduction(chosen, folder, on_work=on_work, learner=opened)
-    assert announced[-1][0] == announced[-1][1]  # all the work that was announced is over
+def reproduced(folder: Path, chosen: Reproduction) -> dict[str, Any]:
+    announced: list[tuple[str, int, int]] = []
+    made = run_reproduction(chosen, folder, on_work=lambda *told: announced.append(told))
+    assert announced[-1][1] == announced[-1][2]  # all the work that was announced is over
     return made
 
 
 def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) -> None:
     chosen = plan(case(photos=(1, 2)))
-    first = reproduced(tmp_path, Nothing(), chosen)
-    again = Nothing()
-    assert reproduced(tmp_path, again, chosen) == first
-    assert again.learned == []
+    first = reproduced(tmp_path, chosen)
+    Nothing.learned.clear()
+    assert reproduced(tmp_path, chosen) == first
+    assert Nothing.learned == []
     assert len(quick_photos) == 1
 
 
 def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path, quick_photos: list[str]) -> None:
     del quick_photos
-    opened: list[tuple[str, int]] = []
-
-    def open_one(way: Preset, workers: int) -> Nothing:
-        del workers
-        opened.append((way.estimator, way.kernel_size))
-        return Nothing()
-
     chosen = plan(case(photos=(1, 2)), compare=True)
-    made = run_reproduction(chosen, tmp_path, on_work=unheard, learner=open_one)
-    assert set(made["cases"][0]["paper"]) == {"1", "2"}
-    assert list(made["cases"][0]["paper"]["1"]["methods"]) == ["paper"]
-    assert [estimator for estimator, _ in opened] == ["default", "michaeli-irani"]
-    assert opened[1][1] == 31
+    made = reproduced(tmp_path, chosen)
+    assert {f"{PAPER_WAY}, n = {n}" for n in (1, 2)} < set(made["cases"][0]["states"])
+    assert Nothing.opened[:2] == [("default", PRESETS["default"].kernel_size), ("michaeli-irani", 31)]
     assert paper_way(replace(chosen.cases[0], height=2000, width=3000)).kernel_size == 55
-    assert made["plan"]["paper_kernel"] == 31
-
-
-class Killed(Nothing):
-    """A route that is killed while it learns from the second photo."""
-
-    def learn(self, photo: Path) -> str:
-        if photo.stem == "photo-01":
-            raise KeyboardInterrupt
-        return super().learn(photo)
 
 
 def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
-    tmp_path: Path, quick_photos: list[str]
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def killed(self: Nothing, photos: Sequence[Path]) -> list[str]:
+        if len(photos) > 1:
+            raise KeyboardInterrupt
+        return [f"{photos[0].stem}: too dark"]
+
     second = replace(planned("quick").cases[1], height=480, width=640, photos=(1, 2))
     chosen = plan(case(photos=(1, 2)), second)
-    with pytest.raises(KeyboardInterrupt):
-        reproduced(tmp_path / "killed", Killed(), chosen)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Nothing, "learn", killed)
+        with pytest.raises(KeyboardInterrupt):
+            reproduced(tmp_path / "killed", chosen)
     (kept_result,) = (tmp_path / "killed").rglob("learned-1.json")
     written = kept_result.stat().st_mtime_ns
     assert len(quick_photos) == 1
-    again = Nothing()
-    made = reproduced(tmp_path / "killed", again, chosen)
+    made = reproduced(tmp_path / "killed", chosen)
     assert kept_result.stat().st_mtime_ns == written
-
-    def timeless(found: dict[str, Any]) -> list[Any]:
-        units = [unit for one in found["cases"] for unit in one["learned"].values()]
-        return [{**unit, "learning_seconds": 0} for unit in units]
-
-    assert timeless(made) == timeless(reproduced(tmp_path / "whole", Nothing(), chosen))
+    assert made == reproduced(tmp_path / "whole", chosen)
 
 
 def test_lens_that_learned_nothing_leaves_photos_as_they_are(tmp_path: Path, quick_photos: list[str]) -> None:
     del quick_photos
-    made = reproduced(tmp_path, Nothing(), plan(case(photos=(1,))))
-    unit = made["cases"][0]["learned"]["1"]
-    assert unit["counted"] == 0
-    assert unit["methods"]["standard"] == made["cases"][0]["truth"]["before"]
-    assert unit["refused"] == ["photo-00: too dark"]
+    (one,) = reproduced(tmp_path, plan(case(photos=(1,))))["cases"]
+    assert one["states"]["n = 1"] == one["states"][BEFORE]
+    assert one["refused"] == {"n = 1": ["photo-00: too dark"]}
 
 
 def test_damaged_result_is_reported(tmp_path: Path, quick_photos: list[str]) -> None:
     del quick_photos
     chosen = plan(case(photos=(1,)))
-    reproduced(tmp_path, Nothing(), chosen)
+    reproduced(tmp_path, chosen)
     next(tmp_path.rglob("learned-1.json")).write_text("{")
     with pytest.raises(InvalidInputError, match="delete it"):
-        reproduced(tmp_path, Nothing(), chosen)
-
-
-def unheard(words: str, done: int, total: int) -> None:
-    del words, done, total
+        reproduced(tmp_path, chosen)
 
 
 @pytest.mark.slow
 def test_lens_is_learned_and_corrected_from_end_to_end(tmp_path: Path) -> None:
-    made = run_reproduction(plan(case(photos=(1,))), tmp_path, on_work=unheard)
+    made = reproduced(tmp_path, plan(case(photos=(1,))))
     (one,) = made["cases"]
-    before, true = one["truth"]["before"], one["truth"]["true"]["standard"]
-    learned = one["learned"]["1"]["methods"]["standard"]
+    before, true, learned = (one["states"][name] for name in (BEFORE, TRUE, "n = 1"))
     for zone in ("center", "corner"):
         assert true["psnr"][zone] > learned["psnr"][zone] > before["psnr"][zone]
         assert true["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
         assert learned["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
-        assert one["paths"]["tiff"]["after"]["psnr"][zone] > one["paths"]["tiff"]["before"]["psnr"][zone]
-    assert learned["nothing_to_correct"] is False
-    assert one["learned"]["1"]["psf"]["rel_l2"]["g"]["center"] < 0.6
+        assert one["paths"]["tiff"]["after"]["psnr"][zone] > one["paths"]["tiff"][BEFORE]["psnr"][zone]
+    assert one["psf"]["n = 1"]["rel_l2"]["g"]["center"] < 0.6
     _, html = write_page(made, tmp_path)
     for source in re.findall(r'src="([^"]+)"', html.read_text(encoding="utf-8")):
         assert (tmp_path / source).stat().st_size > 0

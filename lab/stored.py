@@ -19,13 +19,7 @@ _DATA: Final = (".npz", ".json")
 
 
 def version_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> str:
-    """Hash of the code and data behind some modules.
-
-    Returns
-    -------
-    str
-        Sixteen hexadecimal digits; the same wherever the tree lies.
-    """
+    """Hash of the code and data behind some modules: 16 hexadecimal digits, wherever the tree lies."""
     total = hashlib.sha256()
     for path in code_of(*modules, without=without, root=root):
         total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())

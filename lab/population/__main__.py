@@ -18,7 +18,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.traced import draw
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork
-from lensmodel.neural.network import WEIGHTS, with_errors_raised, with_logits_scaled, with_provenance
+from lensmodel.neural.network import WEIGHTS, adjusted
 
 
 def _arguments() -> argparse.Namespace:
@@ -114,11 +114,11 @@ def _publish(asked: argparse.Namespace) -> None:
     apart = sets.load_library(asked.folder / "held-out", set())
     drawn = [sets.draw_set(lens, 64, 8, rng, varied=False) for lens in apart]
     powers = sets.best_powers(FieldNetwork.from_bytes(data), drawn)
-    data = with_logits_scaled(data, powers)
+    data = adjusted(data, powers=powers)
     shift = sets.understated(FieldNetwork.from_bytes(data), drawn)
-    data = with_errors_raised(data, shift)
+    data = adjusted(data, raised=shift)
     figures = sets.judge(FieldNetwork.from_bytes(data), sets.load_sets(asked.fixed))
-    published = with_provenance(
+    published = adjusted(
         data,
         fixed_set={name: round(value, 4) for name, value in figures.items()},
         errors_raised=round(shift, 4),
@@ -131,41 +131,20 @@ def _publish(asked: argparse.Namespace) -> None:
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
 
 
-_OTHERS: Final = {"judge": _judge, "describe": _describe, "grid": _grid, "publish": _publish}
+def _scenes(asked: argparse.Namespace) -> None:
+    from lab.cases import photo_half  # noqa: PLC0415 - brings all of the library
+
+    trained = (source for source in scenes.files_of(asked.photos) if photo_half(source.name) == "dev")
+    others = chain.from_iterable(scenes.objects_of(repository, ".") for repository in asked.git)
+    print(len(scenes.build(asked.folder / "scenes", chain(trained, others))), "scenes")
 
 
-def main() -> None:
-    """Run the command that was asked for."""
-    asked = _arguments()
-    if asked.command == "scenes":
-        from lab.cases import photo_half  # noqa: PLC0415 - brings all of the library
-
-        trained = (source for source in scenes.files_of(asked.photos) if photo_half(source.name) == "dev")
-        others = chain.from_iterable(scenes.objects_of(repository, ".") for repository in asked.git)
-        print(len(scenes.build(asked.folder / "scenes", chain(trained, others))), "scenes")
-        return
-    if asked.command == "train":
-        from lab.population.training import train  # noqa: PLC0415 - needs PyTorch
-
-        train(
-            asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
-            threads=asked.threads, seed=asked.seed, code=asked.code,
-        )  # fmt: skip
-        return
-    if asked.command == "train-errors":
-        from lab.population.training import train_errors  # noqa: PLC0415 - needs PyTorch
-
-        train_errors(asked.folder, asked.minutes, threads=asked.threads, seed=asked.seed)
-        return
-    if asked.command in _OTHERS:
-        _OTHERS[asked.command](asked)
-        return
+def _lenses(asked: argparse.Namespace) -> None:
     began, count = time.monotonic(), 0
     name = "plain" if asked.plain else "held-out" if asked.held_out else "lenses"
-    name = "lenses-of-errors" if asked.of_errors else name
     order = library.Order(
-        asked.folder / name, asked.folder / "scenes", asked.family,
-        held_out=asked.held_out or asked.plain, plain=asked.plain, through=asked.through,
+        asked.folder / ("lenses-of-errors" if asked.of_errors else name), asked.folder / "scenes",
+        asked.family, held_out=asked.held_out or asked.plain, plain=asked.plain, through=asked.through,
         rescaled=asked.rescaled,
     )  # fmt: skip
     shards = range(asked.first, asked.first + asked.shards)
@@ -175,5 +154,27 @@ def main() -> None:
             print(f"{asked.family}: {count} lenses in {time.monotonic() - began:.0f} s", flush=True)
 
 
+def _train(asked: argparse.Namespace) -> None:
+    from lab.population.training import train  # noqa: PLC0415 - needs PyTorch
+
+    train(
+        asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
+        threads=asked.threads, seed=asked.seed, code=asked.code,
+    )  # fmt: skip
+
+
+def _train_errors(asked: argparse.Namespace) -> None:
+    from lab.population.training import train_errors  # noqa: PLC0415 - needs PyTorch
+
+    train_errors(asked.folder, asked.minutes, threads=asked.threads, seed=asked.seed)
+
+
+_COMMANDS: Final = {
+    "scenes": _scenes, "lenses": _lenses, "train": _train, "train-errors": _train_errors, "judge": _judge,
+    "describe": _describe, "grid": _grid, "publish": _publish,
+}  # fmt: skip
+
+
 if __name__ == "__main__":
-    main()
+    asked_for = _arguments()
+    _COMMANDS[asked_for.command](asked_for)

@@ -28,11 +28,8 @@ def widths(lens: Lens) -> NDArray[np.float64]:
 def describe(lenses: Sequence[Lens]) -> dict[str, tuple[float, ...]]:
     """Percentiles (10, 50, 90) over lenses of what is known of real ones.
 
-    Returns
-    -------
-    dict of str to tuple of float
-        "center", "mid" and "corner": width of green in pixels; "red" and "blue": median width over that of
-        green; "sides": widest over narrowest place at half to most of the way to the corner; "f-number".
+    "center", "mid" and "corner": width of green in pixels; "red" and "blue": median width over that of green;
+    "sides": widest over narrowest place at half to most of the way to the corner; "f-number".
     """
     rows: dict[str, list[float]] = {}
     for lens in lenses:

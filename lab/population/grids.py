@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from lab.population.kernels import SIDE, WAVELENGTHS_UM, kernels_of
+from lab.population.kernels import WAVELENGTHS_UM, kernels_of
 from lab.population.prescriptions import PRESCRIPTIONS
 from lab.population.traced import TracedLens
 from lab.traced import GridField
+from lensmodel.neural.network import SIDE
 
 _AT_ONCE: Final = 64  # places whose rays are traced together
 _INSIDE: Final = 1.001  # half diagonals: designs are traced no farther out than the corner
@@ -18,22 +19,9 @@ _INSIDE: Final = 1.001  # half diagonals: designs are traced no farther out than
 def grid_of(
     lens: TracedLens, f_number: float | None = None, *, step: float = 0.1, size: int = 55
 ) -> GridField:
-    """Kernels of a traced lens at nodes of the field.
+    """Kernels of odd side `size` of a traced lens at nodes of the field, wide open by default.
 
-    Parameters
-    ----------
-    lens : TracedLens
-    f_number : float, optional
-        Wide open by default.
-    step : float
-        Distance of the nodes in half diagonals; it divides 1.
-    size : int
-        Odd side of the kernels in pixels, at most `SIDE`.
-
-    Returns
-    -------
-    GridField
-        Nodes beyond the corner repeat the nearest inside.
+    Nodes lie `step` half diagonals apart, which divides 1; those beyond the corner repeat the nearest inside.
     """
     reach = round(1.0 / step) + 1
     axis = np.arange(-reach, reach + 1, dtype=np.float64) * step

@@ -20,14 +20,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from lensmodel.core.types import Channel
-
-FINE: Final = 33
-"""Pixels: side of the part of a kernel that is given pixel by pixel."""
-COARSE: Final = 25
-"""Cells of `BLOCK` x `BLOCK` pixels on a side of the whole kernel."""
-BLOCK: Final = 3
-SIDE: Final = COARSE * BLOCK
-"""Pixels: side of the whole kernel."""
+from lensmodel.neural.network import BLOCK, COARSE, FINE, SIDE
 
 WAVELENGTHS_UM: Final[dict[Channel, tuple[float, float]]] = {
     "r": (0.59, 0.63),
@@ -271,22 +264,12 @@ def kernels_of(
 
 
 def behind_sensor(kernels: NDArray[np.float32], separation: float, diffusion: float) -> NDArray[np.float32]:
-    """Kernels (..., SIDE, SIDE) with what lies before the pixels; the same where there is nothing.
+    """Kernels (..., SIDE, SIDE) with what lies before the pixels, centred as before, sum 1.
 
-    Parameters
-    ----------
-    kernels : ndarray of float32, shape (..., SIDE, SIDE)
-    separation : float
-        Pixels between the four spots of a birefringent low-pass filter: transfer cos(pi d fx) cos(pi d fy)
-        (J. E. Greivenkamp, "Color dependent optical prefilter for the suppression of aliasing artifacts",
-        Applied Optics 29, 1990).
-    diffusion : float
-        Standard deviation, in pixels, of the Gaussian by which charge spreads.
-
-    Returns
-    -------
-    ndarray of float32, shape (..., SIDE, SIDE)
-        Not negative, sum 1, centred as before.
+    `separation`, in pixels, is that of the four spots of a birefringent low-pass filter: transfer
+    cos(pi d fx) cos(pi d fy) (J. E. Greivenkamp, "Color dependent optical prefilter for the suppression of
+    aliasing artifacts", Applied Optics 29, 1990). `diffusion` is the standard deviation, in pixels, of the
+    Gaussian by which charge spreads.
     """
     if not separation and not diffusion:
         return kernels

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from lab.population import traced
 from lab.population.kernels import PopulationLens, behind_sensor, coarse_of, fine_of, kernels_of, scaled
-from lab.population.photos import KINDS, Camera, Kind, Scenes
+from lab.population.photos import Camera, Scenes
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
-from lensmodel.neural.features import FAR_M
+from lensmodel.neural.features import FAR_M, KINDS, Kind
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import to_octant
 
@@ -157,11 +157,9 @@ def retake(
     if rescaled:
         scale = float(np.exp(rng.uniform(*np.log(_RESCALED))))
         kernels, pitch = scaled(kernels, scale), pitch / scale
-    states = stored["states"].astype(np.float32)
-    if states.shape[1] < 3:  # shards of lenses that were focused far away, all of them
-        states = np.column_stack([states, np.full(len(states), FAR_M, np.float32)])
     other: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     xy = stored["xy"].astype(np.float64)
+    states = stored["states"].astype(np.float32)
     return _photographed(
         rng, scenes, other, xy, kernels.astype(np.float32), states, float(pitch), plain=plain
     )
@@ -203,28 +201,16 @@ def _photographed(
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What lenses to make, and where they go.
+    """What lenses to make, and where they go."""
 
-    Parameters
-    ----------
-    folder, scenes : Path
-        Of shards, and of `scenes.build`.
-    family : {"wavefront", "third-order", "traced"}
-    held_out, plain : bool
-        See `make_lens`.
-    through : Path, optional
-        A folder of shards: other photos are taken through its lenses, and no lens is drawn.
-    rescaled : bool
-        Whether they stand before other pixels then, see `retake`.
-    """
-
-    folder: Path
+    folder: Path  # of shards, and of `scenes.build`
     scenes: Path
     family: Family
-    held_out: bool = False
+    held_out: bool = False  # see `make_lens`
     plain: bool = False
+    # A folder of shards: other photos are taken through its lenses, and no lens is drawn
     through: Path | None = None
-    rescaled: bool = False
+    rescaled: bool = False  # whether they stand before other pixels then, see `retake`
 
     def lenses(self, shard: int) -> Iterator[dict[str, Any] | None]:
         """Make the lenses of a shard."""

@@ -15,7 +15,7 @@ import json
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import scipy.fft
@@ -23,12 +23,10 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image
 
-from lab.population.kernels import FINE, SIDE
 from lab.population.scenes import busiest
+from lensmodel.neural.features import Kind
+from lensmodel.neural.network import FINE, SIDE
 from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
-
-Kind = Literal["raw", "tiff", "jpeg"]
-KINDS: Final[tuple[Kind, ...]] = ("raw", "tiff", "jpeg")
 
 _MARGIN: Final = 8  # pixels around a window that demosaicking and sharpening look at
 _CLIPPED: Final = 0.02  # largest share of clipped samples of a patch that is used
@@ -42,11 +40,7 @@ _DEVELOPED_READ: Final = 1e-3  # noise that the statistics expect of developed f
 class Scenes:
     """Crops of the scenes in a folder that `scenes.build` wrote; read from disk by need.
 
-    Parameters
-    ----------
-    folder : Path
-    held_out : bool
-        A tenth of the photographs, by name, is never trained on; True gives those, False the others.
+    A tenth of the photographs, by name, is never trained on: these alone if `held_out`, else the others.
     """
 
     def __init__(self, folder: Path, *, held_out: bool) -> None:
@@ -77,30 +71,15 @@ class Scenes:
 
 @dataclass(frozen=True, slots=True)
 class Processing:
-    """What a converter or camera does to a developed picture.
+    """What a converter or camera does to a developed picture."""
 
-    Parameters
-    ----------
-    smoothing : float
-        Standard deviation of luma noise reduction, pixels.
-    chroma_smoothing : float
-        The same of chroma.
-    amount, radius : float
-        Unsharp mask.
-    contrast : float
-        Strength of an S curve on top of the gamma of sRGB.
-    quality : int
-        Of JPEG; 0 is 16-bit TIFF.
-    mosaicked : bool
-        False for pictures that the camera has scaled down: all colours are known at every pixel.
-    """
-
-    smoothing: float
-    chroma_smoothing: float
-    amount: float
+    smoothing: float  # standard deviation of luma noise reduction, pixels
+    chroma_smoothing: float  # the same of chroma
+    amount: float  # unsharp mask
     radius: float
-    contrast: float
-    quality: int
+    contrast: float  # strength of an S curve on top of the gamma of sRGB
+    quality: int  # of JPEG; 0 is 16-bit TIFF
+    # false for pictures that the camera has scaled down: all colours are known at every pixel
     mosaicked: bool
 
     @classmethod
@@ -164,7 +143,7 @@ def _encoded(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.power(np.maximum(v, 1e-8), 1 / 2.4) - 0.055)
 
 
-def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
+def _linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(
         np.float32
     )
@@ -221,44 +200,24 @@ class _Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Patches of some photos of one lens.
+    """Patches of some photos of one lens."""
 
-    Parameters
-    ----------
-    statistics : ndarray of float32, shape (n, LENGTH)
-        In the frame of the image.
-    place, photo, state : ndarray of int, shape (n,)
-        Of which place, photo, and state of the lens.
-    """
-
-    statistics: NDArray[np.float32]
-    place: NDArray[np.int64]
+    statistics: NDArray[np.float32]  # (n, LENGTH), in the frame of the image
+    place: NDArray[np.int64]  # (n,), of which place, photo, and state of the lens
     photo: NDArray[np.int64]
     state: NDArray[np.int64]
 
 
 @dataclass
 class Camera:
-    """One body with one lens: its colours, lateral colour and processing; takes patches of photos.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    scenes : Scenes
-    kind : {"raw", "tiff", "jpeg"}
-    xy : ndarray, shape (places, 2)
-    kernels : ndarray of float32, shape (states, places, 3, SIDE, SIDE)
-        Of the lens alone.
-    plain : bool
-        Base sensitivity, all in focus and still: what the best photos are like.
-    """
+    """One body with one lens: its colours, lateral colour and processing; takes patches of photos."""
 
     rng: np.random.Generator
     scenes: Scenes
     kind: Kind
-    xy: NDArray[np.float64]
-    kernels: NDArray[np.float32]
-    plain: bool = False
+    xy: NDArray[np.float64]  # (places, 2)
+    kernels: NDArray[np.float32]  # (states, places, 3, SIDE, SIDE), of the lens alone
+    plain: bool = False  # base sensitivity, all in focus and still: what the best photos are like
     processing: Processing | None = field(init=False)
 
     def __post_init__(self) -> None:

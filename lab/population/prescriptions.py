@@ -36,40 +36,19 @@ _UNSEEN: Final = frozenset({"telephoto", "field-corrector", "aspheric", "noct"})
 
 @dataclass(frozen=True, eq=False)
 class Prescription:
-    """A design in millimetres or in a unit of its own.
-
-    Parameters
-    ----------
-    name : str
-    source : str
-        Patent or book, and which of its examples.
-    focal : float
-        Published focal length.
-    f_number : float
-        Published.
-    half_field_deg : float
-        Published half angle of view.
-    curvature, thickness, conic : ndarray, shape (s,)
-        Of the surfaces from the first glass on; `thickness` lies behind the surface.
-    asphere : ndarray, shape (s, k)
-        Coefficients of h^4, h^6, ... that are added to the sag.
-    glass : ndarray, shape (s, 3)
-        n_d, V_d and P_gF of the medium behind; air has n_d = 1.
-    stop : int
-        Surface that is the aperture stop.
-    """
+    """A design in millimetres or in a unit of its own."""
 
     name: str
-    source: str
-    focal: float
-    f_number: float
-    half_field_deg: float
-    curvature: Array
+    source: str  # patent or book, and which of its examples
+    focal: float  # published focal length
+    f_number: float  # published
+    half_field_deg: float  # published half angle of view
+    curvature: Array  # (s,), of the surfaces from the first glass on; `thickness` lies behind the surface
     thickness: Array
     conic: Array
-    asphere: Array
-    glass: Array
-    stop: int
+    asphere: Array  # (s, k), coefficients of h^4, h^6, ... that are added to the sag.
+    glass: Array  # (s, 3), n_d, V_d and P_gF of the medium behind; air has n_d = 1
+    stop: int  # surface that is the aperture stop
 
     @property
     def family(self) -> str:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lensmodel.core.files import write_atomically
+from lensmodel.simulate import srgb_to_linear
 
 Scene = NDArray[np.float16]  # (height, width, 3), linear light, white 1
 
@@ -88,8 +89,7 @@ def objects_of(repository: Path, under: str) -> Iterator[Source]:
 def linear(data: bytes) -> NDArray[np.float32]:
     """Decode a picture to linear light (sRGB), float32 of shape (height, width, 3)."""
     with Image.open(io.BytesIO(data)) as picture:
-        v = np.asarray(picture.convert("RGB"), np.float32) / 255.0
-    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / 255.0)
 
 
 def scaled_down(scene: NDArray[np.float32], factor: float) -> NDArray[np.float32]:

@@ -41,11 +41,9 @@ class Lens:
         xy = stored["xy"].astype(np.float64)
         pitch, kind = stored["facts"]
         states = stored["states"].astype(np.float64)
-        settings = np.full((len(states), 5), np.nan)
-        settings[:, 0] = np.log(states[:, 0])
-        settings[:, 1] = np.log(0.54 * states[:, 0] / pitch)
-        settings[:, 2 : 1 + states.shape[1]] = np.log(states[:, 1:])  # focus is not in shards of before
-        settings[:, 4] = kind
+        f_number, focal, focus = states.T
+        logs = [np.log(values) for values in (f_number, 0.54 * f_number / pitch, focal, focus)]
+        settings = np.column_stack([*logs, np.full(len(states), kind)])
         octants = octant_of(xy)
         turned = []
         for name in ("fine", "coarse"):
@@ -204,20 +202,11 @@ def understated(network: FieldNetwork, sets: Iterable[Set]) -> float:
 
 
 def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
-    """Errors of kernels, of each colour, of green by zone, and how true the told errors are.
+    """Errors of kernels on lenses that were not trained on, and how true the told errors are.
 
-    Parameters
-    ----------
-    network : FieldNetwork
-    sets : iterable of Set
-        Of lenses that were not trained on.
-
-    Returns
-    -------
-    dict of str to float
-        Relative L2 distance: mean of "r", "g", "b", and of green in "center" (r < 0.3), "mid" and "corner"
-        (r > 0.75); of the means that each lens has there, the medians; and "told_right", the share of places
-        whose told error is within a factor of 1.5.
+    Relative L2 distance: mean of "r", "g", "b", and of green in "center" (r < 0.3), "mid" and "corner"
+    (r > 0.75); of the means that each lens has there, the medians; and "told_right", the share of places
+    whose told error is within a factor of 1.5.
     """
     made, told = [], []
     of_lens: dict[str, list[float]] = {"center": [], "mid": [], "corner": []}

@@ -47,28 +47,17 @@ _TRIES: Final = 60
 
 @dataclass(frozen=True, eq=False)
 class Faults:
-    """How one copy differs from its design; all zero by default.
+    """How one copy differs from its design; all zero by default."""
 
-    Parameters
-    ----------
-    shift_um, tilt_arcmin : ndarray, shape (e, 2)
-        Of each single or cemented element: to the right and up; about the right and the up axis through its
-        front vertex.
-    space : ndarray, shape (s,)
-        Relative errors of the air spaces behind the surfaces.
-    index : ndarray, shape (s,)
-        Errors of the refractive index behind the surfaces.
-    sensor_tilt_um : tuple of float
-        How far the sensor lies behind its place at r = 1 to the right, and upwards.
-    focus_px : float
-        Error of the autofocus: r.m.s. radius along one axis of the disc that it alone would make.
-    """
-
+    # (e, 2), of each single or cemented element: to the right and up; about the right and the up axis through
+    # its front vertex
     shift_um: Array
     tilt_arcmin: Array
-    space: Array
-    index: Array
+    space: Array  # (s,), relative errors of the air spaces behind the surfaces
+    index: Array  # (s,), errors of the refractive index behind the surfaces
+    # how far the sensor lies behind its place at r = 1 to the right, and upwards
     sensor_tilt_um: tuple[float, float] = (0.0, 0.0)
+    # error of the autofocus: r.m.s. radius along one axis of the disc that it alone would make.
     focus_px: float = 0.0
 
     @classmethod
@@ -96,36 +85,18 @@ class _Light(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TracedLens:
-    """One copy of a design in front of a sensor.
+    """One copy of a design in front of a sensor."""
 
-    Parameters
-    ----------
-    design : str
-        Name of the prescription.
-    half_diagonal_mm : float
-        Of the sensor.
-    cover : float
-        Share of the published field that the corner of the sensor sees.
-    f_number : float
-        Widest aperture.
-    pitch_um : float
-        Pixel pitch.
-    faults : Faults
-    corner_light : float
-        Open share of the pupil at r = 1 over that in the centre, wide open: the clear apertures of the first
-        and the last surface are chosen for it. 1 means as open as the stop lets it be.
-    focus_m : float
-        From the sensor to what is in focus.
-    """
-
-    design: str
-    half_diagonal_mm: float
-    cover: float
-    f_number: float
-    pitch_um: float
+    design: str  # name of the prescription
+    half_diagonal_mm: float  # of the sensor
+    cover: float  # share of the published field that the corner of the sensor sees
+    f_number: float  # widest aperture
+    pitch_um: float  # pixel pitch
     faults: Faults
+    # open share of the pupil at r = 1 over that in the centre, wide open: the clear apertures of the first
+    # and the last surface are chosen for it; 1 means as open as the stop lets it be
     corner_light: float = 1.0
-    focus_m: float = math.inf
+    focus_m: float = math.inf  # from the sensor to what is in focus
 
     @property
     def nominal(self) -> Nominal:
@@ -228,26 +199,10 @@ class TracedLens:
     def wavefronts(
         self, xy: Array, wavelengths_um: Array, f_number: float | None = None
     ) -> NDArray[np.float32]:
-        """Wavefronts at places of the image.
+        """Wavefronts at places (p, 2) of the image, right and up, in half diagonals; wide open by default.
 
-        Parameters
-        ----------
-        xy : ndarray, shape (p, 2)
-            Right and up, in half diagonals.
-        wavelengths_um : ndarray, shape (w,)
-        f_number : float or None
-            None means widest.
-
-        Returns
-        -------
-        ndarray, shape (p, w, COLUMNS), float32
-            Micrometres per Zernike term of unit r.m.s. over the disc, see `kernels.TERMS`; piston
-            and tilt are removed. A ray of p arrives at +2 N dW/dp.
-
-        Raises
-        ------
-        InvalidInputError
-            If the lens does not open so far, or hardly any light arrives.
+        Micrometres (p, w, COLUMNS) per Zernike term of unit r.m.s. over the disc, see `kernels.TERMS`; piston
+        and tilt are removed. A ray of p arrives at +2 N dW/dp.
         """
         return self._fitted(xy, wavelengths_um, f_number)[0]
 
@@ -353,26 +308,10 @@ class TracedLens:
 
 
 def draw(rng: np.random.Generator, designs: Sequence[str], *, opened: bool = False) -> TracedLens:
-    """Draw a copy of one of the designs.
+    """Draw a copy of one of the designs that `forms_image`.
 
-    Parameters
-    ----------
-    rng : Generator
-    designs : sequence of str
-        Names to choose from.
-    opened : bool
-        One that opens one to two stops beyond its design, and is soft in the center: such lenses are rare
-        among the others, and hardest to tell.
-
-    Returns
-    -------
-    TracedLens
-        One that `forms_image`.
-
-    Raises
-    ------
-    InvalidInputError
-        If none is found.
+    With `opened` it opens one to two stops beyond its design, and is soft in the center: such lenses are rare
+    among the others, and hardest to tell.
     """
     for _ in range(_TRIES * (1 + opened)):
         lens = _candidate(rng, str(rng.choice(list(designs))), opened=opened)

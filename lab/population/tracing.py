@@ -47,46 +47,22 @@ class Crossing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Surfaces with a place and a direction each.
+    """Surfaces with a place and a direction each."""
 
-    Parameters
-    ----------
-    curvature, conic : ndarray, shape (s,)
-    asphere : ndarray, shape (s, k)
-        Coefficients of h^4, h^6, ...
-    glass : ndarray, shape (s, 3)
-        See `Prescription`.
-    index_error : ndarray, shape (s,)
-        Added to the index behind each surface.
-    origin : ndarray, shape (s + 1, 3)
-        Vertices, the last one of the image plane.
-    turn : ndarray, shape (s + 1, 3, 3)
-        From the frame of the surface to that of the system.
-    stop : int
-    rims : tuple of int
-        Surfaces whose crossing is recorded.
-    """
-
-    curvature: Array
+    curvature: Array  # (s,)
     conic: Array
-    asphere: Array
-    glass: Array
-    index_error: Array
-    origin: Array
-    turn: Array
+    asphere: Array  # (s, k), coefficients of h^4, h^6, ..
+    glass: Array  # (s, 3), see `Prescription`
+    index_error: Array  # (s,), added to the index behind each surface
+    origin: Array  # (s + 1, 3), vertices, the last one of the image plane
+    turn: Array  # (s + 1, 3, 3), from the frame of the surface to that of the system
     stop: int
-    rims: tuple[int, ...]
+    rims: tuple[int, ...]  # surfaces whose crossing is recorded
 
     def trace(self, start: Array, direction: Array, index: Array) -> Crossing:
-        """Trace rays.
+        """Trace rays from places (3, p, 1, r) in directions (3, p, 1, 1 or r).
 
-        Parameters
-        ----------
-        start : ndarray, shape (3, p, 1, r)
-            Where rays start.
-        direction : ndarray, shape (3, p, 1, 1) or (3, p, 1, r)
-        index : ndarray, shape (s, w)
-            Behind each surface.
+        `index` (s, w) is that behind each surface.
         """
         p, w, r = start.shape[1], index.shape[1], start.shape[3]
         X = np.broadcast_to(start, (3, p, w, r)).copy()
@@ -118,18 +94,11 @@ class System:
     def launch(
         self, directions: Array, entrance: Array, wavelengths_um: Array, distance: float = math.inf
     ) -> Crossing:
-        """Trace from the plane across each direction through the first vertex.
+        """Trace from the plane across each direction (p, 2), the cosines L and M, through the first vertex.
 
-        Parameters
-        ----------
-        directions : ndarray, shape (p, 2)
-            Cosines L and M of the incident light.
-        entrance : ndarray, shape (p, 2, r)
-            Where rays cross that plane.
-        wavelengths_um : ndarray, shape (w,)
-        distance : float
-            From the plane of the objects to the first vertex. Objects at a finite one lie where a ray of
-            each direction through the first vertex comes from; paths are counted from there, less that ray's.
+        Rays cross that plane at `entrance` (p, 2, r). `distance` is that from the plane of the objects to the
+        first vertex. Objects at a finite one lie where a ray of each direction through the first vertex comes
+        from; paths are counted from there, less that ray's.
         """
         d, across = frames(directions)
         start = np.einsum("pak,par->kpr", across, entrance)[:, :, None, :]
@@ -263,13 +232,7 @@ class Nominal:
         return float(-1.0 / self.paraxial(wavelength_um)[-1, 1, 0])
 
     def extension(self, distance: float) -> float:
-        """How far behind the design's image plane objects at a distance are imaged, paraxial.
-
-        Raises
-        ------
-        InvalidInputError
-            If they lie within the focal length.
-        """
+        """How far behind the design's image plane objects at a distance are imaged, paraxial."""
         if not math.isfinite(distance):
             return 0.0
         (y, u), (per_y, per_u) = self.paraxial(AIM_UM)[-1].T
@@ -279,13 +242,7 @@ class Nominal:
         return float(y / u - (y + per_y / distance) / slope)
 
     def marginal(self, f_number: float) -> tuple[float, Array]:
-        """Radius of the stop at an aperture, and heights `(k,)` of the axial rim ray at the rims.
-
-        Raises
-        ------
-        InvalidInputError
-            If the design does not open so far.
-        """
+        """Radius of the stop at an aperture, and heights `(k,)` of the axial rim ray at the rims."""
         sine, stop, rims = _axial(self, math.inf)
         wanted = 0.5 / f_number
         if wanted > sine[-1]:
@@ -301,11 +258,6 @@ class Nominal:
         """F-number of the light at the sensor with the stop of `f_number`, focused at a distance.
 
         Half the reciprocal sine of the axial rim ray: larger than at infinity, as the image is farther.
-
-        Raises
-        ------
-        InvalidInputError
-            If the stop is not filled.
         """
         if not math.isfinite(distance):
             return f_number
@@ -344,13 +296,7 @@ def _axial(nominal: Nominal, distance: float) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=512)
 def principal(nominal: Nominal, distance: float = math.inf) -> Principal:
-    """Follow principal rays of objects at a distance, as far as light comes through.
-
-    Raises
-    ------
-    InvalidInputError
-        If none comes through well inside the published field.
-    """
+    """Follow principal rays of objects at a distance, as far as light comes through."""
     one = nominal.prescription
     radius, _ = nominal.marginal(max(one.f_number, 4.0))
     before = nominal.paraxial(AIM_UM)[one.stop]
@@ -409,13 +355,7 @@ def aimed(
     radius: float,
     distance: float,
 ) -> Array:
-    """Maps `(p, 2, 3)` from the stop to the entrance of a copy, `scale` times as large as its design.
-
-    Raises
-    ------
-    InvalidInputError
-        If hardly any light comes through.
-    """
+    """Maps `(p, 2, 3)` from the stop to the entrance of a copy, `scale` times as large as its design."""
     known, _, _, maps = principal(nominal, distance / scale)
     flat = maps.reshape(len(maps), 6)
     start = np.stack([np.interp(angles, known, column) for column in flat.T], axis=1).reshape(-1, 2, 3)

@@ -387,20 +387,9 @@ def train(
 ) -> None:
     """Train from where the last sitting ended; saves every few minutes.
 
-    Parameters
-    ----------
-    folder : Path
-        With `lenses` and `held-out`; lenses that are added meanwhile are trained on, too.
-    minutes : float
-        Length of this sitting.
-    total_minutes : float
-        Length of all sittings together: the rate falls to its end over them, as half a cosine.
-    rate : float
-        Highest rate of learning.
-    threads : int
-    seed : int
-    code : str
-        What made the library, for the provenance.
+    `folder` holds `lenses` and `held-out`; lenses that are added meanwhile are trained on, too. `rate` is the
+    highest of learning, and falls as half a cosine over `total_minutes` of all sittings together; `code` goes
+    into the provenance.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -431,19 +420,10 @@ def train(
 
 
 def train_errors(folder: Path, minutes: float, *, threads: int, seed: int) -> None:
-    """Train what tells the errors anew, on lenses that the kernels were not trained on.
+    """Train what tells the errors anew, on `lenses-of-errors`, which no sitting has learned kernels from.
 
-    On lenses of training the kernels are nearer to the truth than on others, and what learns its own
-    errors there understates them.
-
-    Parameters
-    ----------
-    folder : Path
-        With `lenses-of-errors`, none of them in any sitting, `held-out`, and what the sittings left:
-        `state.pt`, which stays as it is, and `weights.npz`, which is written anew.
-    minutes : float
-    threads : int
-    seed : int
+    On lenses of training the kernels are nearer to the truth than on others, and what learns its own errors
+    there understates them. `state.pt` stays as it is, and `weights.npz` is written anew.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)

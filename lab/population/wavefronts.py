@@ -129,15 +129,9 @@ _FOCUS_WEIGHTS: Final = np.array([2.0] * 3 + [1.0] * 4 + [0.4] * 3)
 
 
 class RandomLens:
-    """A lens of the families "wavefront" or "third-order"; see `PopulationLens`.
+    """A lens of the families "wavefront" or "third-order", everything drawn; see `PopulationLens`.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Everything is drawn from it.
-    family : {"wavefront", "third-order"}
-    zoom : bool
-        Whether the lens has a second state (focal length, focus), reached by `at_state`.
+    With `zoom` it has a second state (focal length, focus), reached by `at_state`.
     """
 
     def __init__(self, rng: np.random.Generator, family: Family = "wavefront", *, zoom: bool = False) -> None:

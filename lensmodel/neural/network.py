@@ -19,7 +19,7 @@ References
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -338,42 +338,24 @@ def _packaged() -> FieldNetwork:
     return FieldNetwork.from_bytes(WEIGHTS.read_bytes())
 
 
-def _changed(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
-    """Weights of which `change` has changed some."""
+def adjusted(
+    data: bytes, *, powers: Sequence[float] = (1.0, 1.0, 1.0), raised: float = 0.0, **facts: object
+) -> bytes:
+    """Weights that differ a little in what they answer, with more facts in their provenance.
+
+    Kernels of red, green and blue are raised to powers, as all their logits are scaled; told errors are
+    exp(`raised`) times as large.
+    """
     with np.load(BytesIO(data)) as stored:
         arrays: dict[str, Any] = dict(stored)
-    change(arrays)
+    for name in ("kernel.2.weight", "kernel.2.bias"):
+        colours = np.split(arrays[name].astype(np.float32), 3)
+        arrays[name] = np.concatenate([p * part for p, part in zip(powers, colours, strict=True)]).astype(
+            np.float16
+        )
+    arrays["error.1.bias"] = (arrays["error.1.bias"].astype(np.float32) + raised).astype(np.float16)
+    told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
+    arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
     out = BytesIO()
     np.savez_compressed(out, **arrays)
     return out.getvalue()
-
-
-def with_logits_scaled(data: bytes, powers: Sequence[float]) -> bytes:
-    """Weights whose kernels of red, green and blue are raised to powers, as all their logits are scaled."""
-
-    def change(arrays: dict[str, Any]) -> None:
-        for name in ("kernel.2.weight", "kernel.2.bias"):
-            scaled = np.stack(np.split(arrays[name].astype(np.float32), 3))
-            scaled *= np.reshape(powers, (3, *[1] * (scaled.ndim - 1)))
-            arrays[name] = np.concatenate(scaled).astype(np.float16)
-
-    return _changed(data, change)
-
-
-def with_errors_raised(data: bytes, shift: float) -> bytes:
-    """Weights whose told errors are exp(shift) times as large."""
-
-    def change(arrays: dict[str, Any]) -> None:
-        arrays["error.1.bias"] = (arrays["error.1.bias"].astype(np.float32) + shift).astype(np.float16)
-
-    return _changed(data, change)
-
-
-def with_provenance(data: bytes, **facts: object) -> bytes:
-    """Weights with more facts in their provenance."""
-
-    def change(arrays: dict[str, Any]) -> None:
-        told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
-        arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
-
-    return _changed(data, change)

@@ -6,7 +6,6 @@ from scipy.special import j1
 
 from lab.population.kernels import (
     COLUMNS,
-    SIDE,
     TERMS,
     Renderer,
     basis,
@@ -17,6 +16,7 @@ from lab.population.kernels import (
     stopped_down,
 )
 from lab.population.wavefronts import RandomLens
+from lensmodel.neural.network import SIDE
 
 OPEN = np.zeros((0, 3))
 AT = np.arange(SIDE) - SIDE // 2

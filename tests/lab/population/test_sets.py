@@ -8,10 +8,10 @@ import pytest
 from lab.population import library, scenes
 from lab.population.describe import describe
 from lab.population.grids import grid_of
-from lab.population.photos import KINDS, Processing, Scenes, bayer, demosaic
+from lab.population.photos import Processing, Scenes, bayer, demosaic
 from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
 from lab.population.traced import draw
-from lensmodel.neural.features import FAR_M, relation_features
+from lensmodel.neural.features import FAR_M, KINDS, relation_features
 from lensmodel.neural.network import SIDE
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab.population import traced
-from lab.population.kernels import SIDE, TERMS, Renderer, spots
+from lab.population.kernels import TERMS, Renderer, spots
 from lab.population.prescriptions import (
     HELD_OUT,
     LOOKED_AT,
@@ -25,6 +25,7 @@ from lab.population.tracing import AIM_UM, Nominal
 from lab.traced import _centred, _moved, read_grid
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel, distance
+from lensmodel.neural.network import SIDE
 
 DATA = Path(__file__).parents[2] / "lensmodel" / "data"
 GLASS = (1.5168, 64.17, 0.5349)

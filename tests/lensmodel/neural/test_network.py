@@ -13,7 +13,7 @@ from scipy import ndimage
 from lab.population.sets import judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
-from lensmodel.neural.network import WEIGHTS, with_logits_scaled
+from lensmodel.neural.network import WEIGHTS, adjusted
 from lensmodel.neural.statistics import LENGTH, WINDOW
 from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place
 
@@ -165,7 +165,7 @@ def test_weights_say_where_they_come_from() -> None:
 def test_scaled_logits_raise_kernels_to_powers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lensmodel.neural.network.centred_kernels", lambda kernels: kernels)
     plain = FieldNetwork.load()
-    scaled = FieldNetwork.from_bytes(with_logits_scaled(WEIGHTS.read_bytes(), (1.0, 0.5, 1.0)))
+    scaled = FieldNetwork.from_bytes(adjusted(WEIGHTS.read_bytes(), powers=(1.0, 0.5, 1.0)))
     sharp = photo(1.0)
     before, after = (
         network.query(network.memory(network.encode(sharp, PLACES, WIDE_OPEN), PLACES, [WIDE_OPEN] * 12),

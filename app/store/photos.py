@@ -466,8 +466,12 @@ class Photos(Patches):
         ):
             return None
         discard(session, file.blob_key)
+        here = (PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+        own = set(session.scalars(select(PhotoRow.public_id).where(*here)))
         imported = 0
         for (photo, settings), of_photo in groups.items():
+            if photo in own:
+                continue
             name = names.get(photo, photo or PROFILE)
             row = _imported(session, lens, photo, settings, of_photo[0], name)
             if row is not None:

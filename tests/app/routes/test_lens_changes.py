@@ -76,6 +76,19 @@ def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -
 
 
 @pytest.mark.usefixtures("reading")
+def test_its_own_profile_tells_a_lens_nothing(client: TestClient, steps: Steps) -> None:
+    lens = steps.lens_id(steps.counted())
+    file = client.get(f"/v1/lenses/{lens}/profile").content
+    known = client.get(f"/v1/lenses/{lens}").json()
+
+    again = client.put(f"/v1/lenses/{lens}/profile", content=file).json()
+
+    assert [again[name] for name in ("photos", "samples", "version")] == [
+        known[name] for name in ("photos", "samples", "version")
+    ]
+
+
+@pytest.mark.usefixtures("reading")
 def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, store: Store) -> None:
     lens = steps.lens_id(steps.counted(patches=4))
     other = steps.named(LensName(None, None, None, label="Another"))

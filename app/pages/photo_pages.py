@@ -111,7 +111,7 @@ def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
             "output": {"format": "png8", "color_space": "srgb"},
         }
     )
-    correction = correction_routes.create(request, call)
+    correction = correction_routes.create_correction(request, call)
     return {"id": correction.id}
 
 

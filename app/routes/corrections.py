@@ -48,12 +48,7 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
     responses={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
 )
 def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
-    """Correct a photo with the model of its lens, or of another."""
-    return create(options, call)
-
-
-def create(options: CorrectionIn, call: Call) -> CorrectionOut:
-    """Create a correction, or return the one of the same request."""
+    """Correct a photo with the model of its lens, or of another; the same request is the same correction."""
     photo = find_photo(call, options.photo_id)
     if options.method not in deconvolvers:
         raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")

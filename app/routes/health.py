@@ -62,7 +62,7 @@ def _readiness(call: Call) -> Readiness:
     confined: dict[str, bool] = {}
     tried: dict[str, Callable[[], None]] = {
         "schema": lambda: _schema(call),
-        "storage": lambda: _storage(call),
+        "storage": call.storage.check_usable,
         "worker": lambda: confined.update(_worker(call)),
     }
     running = {name: _start(probe) for name, probe in tried.items()}
@@ -104,10 +104,6 @@ def _schema(call: Call) -> None:
         raise RuntimeError(
             f"the database is at {database}, this program needs {program}: run `lensmodel serve`"
         )
-
-
-def _storage(call: Call) -> None:
-    call.storage.check_usable()
 
 
 def _worker(call: Call) -> dict[str, bool]:

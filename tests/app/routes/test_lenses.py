@@ -230,6 +230,8 @@ BAD_QUESTIONS = [
     ("size", "5.5"),
     ("focal_length_mm", "0"),
     ("focus_distance_m", "-2"),
+    ("focus_distance_m", "5e-324"),
+    ("pixel_pitch_um", "5e-324"),
     ("version", "0"),
     ("strict", "maybe"),
     ("wavelength", "540"),

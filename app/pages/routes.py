@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote
@@ -89,57 +87,16 @@ def home(call: CallDep) -> HTMLResponse:
 @router.get("/docs")
 def interface(request: Request) -> HTMLResponse:
     """Show what programs can ask, from the same description that programs read; nothing is loaded for it."""
-    description = request.app.openapi()
-    return page("docs.html", title=description["info"]["title"], groups=_operations(description))
+    paths = request.app.openapi()["paths"]
+    operations = [
+        {"path": path, "method": method, **entry}
+        for path, methods in paths.items()
+        for method, entry in methods.items()
+    ]
+    return page("docs.html", operations=operations)
 
 
 @strangers.get("/sign-in")
 async def sign_in() -> HTMLResponse:
     """Ask for a key."""
     return page("sign_in.html")
-
-
-@dataclass(frozen=True, slots=True)
-class Operation:
-    """One operation of the interface."""
-
-    method: str
-    path: str
-    summary: str
-    description: str
-    parameters: list[tuple[str, str, str]]
-    """Name, location and meaning of each."""
-
-    body: list[str]
-    answers: list[str]
-
-
-def _operations(described: Mapping[str, Any]) -> list[tuple[str, list[Operation]]]:
-    """Return the operations of an OpenAPI document by their first tag, in its order."""
-    groups: defaultdict[str, list[Operation]] = defaultdict(list)
-    for path, methods in described["paths"].items():
-        for method, entry in methods.items():
-            groups[(entry.get("tags") or ["other"])[0]].append(_operation(method, path, entry))
-    return list(groups.items())
-
-
-def _operation(method: str, path: str, entry: Mapping[str, Any]) -> Operation:
-    listed = entry.get("parameters", [])
-    first, _, rest = entry.get("description", "").partition("\n\n")
-    return Operation(
-        method=method.upper(),
-        path=path,
-        summary=first or entry["summary"],
-        description=rest,
-        parameters=[(p["name"], p["in"], _meaning(p)) for p in listed],
-        body=list(entry.get("requestBody", {}).get("content", {})),
-        answers=[f"{status} {answer['description']}" for status, answer in entry["responses"].items()],
-    )
-
-
-def _meaning(parameter: Mapping[str, Any]) -> str:
-    schema = parameter.get("schema", {})
-    description = parameter.get("description") or schema.get("description", "")
-    choice = f"one of {', '.join(map(str, schema['enum']))}" if "enum" in schema else ""
-    default = f"default {schema['default']}" if schema.get("default") is not None else ""
-    return "; ".join(part for part in (description, choice, default) if part)

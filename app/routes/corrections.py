@@ -60,13 +60,9 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     version = _version_for(call, lens, options.lens_version)
     usage = call.store.accounts.usage(call.owner)
     check_usage(call.settings, usage, usage.working_corrections, "corrections")
-    params = options.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    asked = options.model_dump(mode="json", exclude={"photo_id", "lens_id", "lens_version", "any_lens"})
     # with other settings of the photo the same request is a new correction
-    params["settings"] = stored_settings(photo)
-    # only values other than the defaults: requests stored before there were bounds stay the same
-    params |= options.model_dump(
-        mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
-    )
+    params = asked | {"settings": stored_settings(photo)}
     row, created = call.store.jobs.correct(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED

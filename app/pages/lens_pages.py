@@ -9,19 +9,19 @@ from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BeforeValidator, TypeAdapter
 
-from app.errors import InvalidParameterError, NotReadyError
+from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
 from app.pages import shown, words
 from app.pages.rendering import page
 from app.routes import lenses as lens_routes
 from app.routes.common import find_lens
 from app.routes.lens_reports import stored_report
-from app.schemas import Aperture, CalibrationOut, PhotoOut
+from app.schemas import Aperture, CalibrationOut, blank_is_none
 from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.types import ZONES, FieldPosition
+from lensmodel.core.types import ZONES
 from lensmodel.report import LensReport, Side, Unit, compare
 from lensmodel.report.tables import place_table
 
@@ -32,19 +32,18 @@ SHOWN_VERSIONS: Final = 200  # Versions of the history on the page (chosen): the
 # Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm
 DEFAULT_ASPECT: Final = 1.5
 _APERTURE: Final = TypeAdapter[float](Aperture)
+ChosenAperture = Annotated[Aperture | None, BeforeValidator(blank_is_none), Query()]  # of a form
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
 @router.get("/lenses/{lens_id}")
-def lens_page(
-    lens_id: str, call: CallDep, aperture: Annotated[str, Query(max_length=20)] = ""
-) -> HTMLResponse:
+def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> HTMLResponse:
     """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
     lens, row = lens_routes.read_lens(lens_id, call), find_lens(call, lens_id)
     photos, more = shown.photos(call, lens_id)
     aspect, test = _aspect(call, row), _test(call, row)
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
-    chosen = _aperture(aperture) or (apertures[0] if apertures else None)
+    chosen = aperture or (apertures[0] if apertures else None)
     question = {"size": 25, "aspect": aspect} | ({} if chosen is None else {"aperture": chosen})
 
     def map_of(cells: int) -> str:
@@ -86,7 +85,6 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         aspect=aspect,
-        spots=_spots(_positions(call, photos), aspect),
         comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
         test=test,
         **({} if test is None else _charts(test, None, "c/px")),
@@ -97,7 +95,7 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
 def lens_charts(
     lens_id: str,
     call: CallDep,
-    aperture: Annotated[str, Query(max_length=20)] = "",
+    aperture: ChosenAperture = None,
     unit: Unit = "c/px",
     against: Annotated[str, Query(max_length=60)] = "",
 ) -> HTMLResponse:
@@ -105,42 +103,23 @@ def lens_charts(
     from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
 
     test = stored_report(call, find_lens(call, lens_id))
-    chosen = _aperture(aperture)
-    with_itself = against.startswith("at ") and _aperture(against.removeprefix("at ")) == chosen
-    if not against or with_itself:
-        return page("_charts.html", **_charts(test, chosen, unit))
-    if against.startswith("at "):
-        second_test = test
-        second_aperture = _aperture(against.removeprefix("at "))
+    at = _APERTURE.validate_python(against.removeprefix("at ")) if against.startswith("at ") else None
+    if not against or (at is not None and at == aperture):
+        return page("_charts.html", **_charts(test, aperture, unit))
+    if at is not None:  # two apertures of one lens
+        sides = [Side(words.f_stop(number or 0.0), test.at(number)) for number in (aperture, at)]
     else:
-        second_test = stored_report(call, find_lens(call, against))
-        second_aperture = chosen if chosen in second_test.apertures else None
-    first_tested, second_tested = test.at(chosen), second_test.at(second_aperture)
-    sides = [
-        Side(name if second_test is not test else words.f_stop(tested.settings.aperture or 0.0), tested)
-        for name, tested in ((test.name, first_tested), (second_test.name, second_tested))
-    ]
+        other = stored_report(call, find_lens(call, against))
+        same = aperture if aperture in other.apertures else None
+        sides = [Side(test.name, test.at(aperture)), Side(other.name, other.at(same))]
     comparison = compare(*sides)
     return page("_charts.html", comparison=comparison, charts=comparison_charts(comparison))
-
-
-def _aperture(text: str) -> float | None:
-    """Return the f-number that a form sends; None where it sends nothing."""
-    try:
-        return _APERTURE.validate_python(text) if text else None
-    except ValidationError as error:
-        raise InvalidParameterError(
-            f"aperture must be an f-number between 0.5 and 128, got {text!r}"
-        ) from error
 
 
 def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, Any]:
     from lensmodel.report.plots import charts  # noqa: PLC0415 - as above
 
-    return {
-        "charts": charts(test, aperture, unit),
-        "table": place_table(test),
-    }
+    return {"charts": charts(test, aperture, unit), "table": place_table(test)}
 
 
 def _error_history(history: Sequence[CalibrationOut]) -> Chart | None:
@@ -165,20 +144,3 @@ def _aspect(call: Call, lens: LensRow) -> float:
     """Return the commonest width over height of the photos of a lens, in sensor orientation."""
     shape = call.store.lenses.shape_of(lens)
     return DEFAULT_ASPECT if shape is None else round(shape[1] / shape[0], 4)
-
-
-def _spots(positions: list[FieldPosition], aspect: float) -> list[tuple[float, float]]:
-    """Return field positions as fractions of the width and height of a picture, from the top left."""
-    corner = math.hypot(aspect, 1.0)
-    return [
-        (
-            0.5 + corner * p.r * math.cos(p.phi) / (2.0 * aspect),
-            0.5 - corner * p.r * math.sin(p.phi) / 2.0,
-        )
-        for p in positions
-    ]
-
-
-def _positions(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
-    """Return where patches of counted photos gave a PSF."""
-    return call.store.photos.places_of([photo.id for photo in photos if photo.state == "counted"])

@@ -17,7 +17,6 @@ from app.store.owners import now
 from app.store.samples import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition
 
 OPEN: Final = ("pending", "running")
 
@@ -77,17 +76,6 @@ class Patches(Repository):
     def patches(self, session: Session, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
         """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
         return list(session.scalars(_patches_of(photo_id, epoch).order_by(PatchRow.idx)))
-
-    @reads
-    def places_of(self, session: Session, photo_ids: Sequence[str]) -> list[FieldPosition]:
-        """Return where patches of photos gave a PSF."""
-        query = (
-            select(PatchRow.r, PatchRow.phi)
-            .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
-            .where(PhotoRow.public_id.in_(photo_ids), PatchRow.epoch == PhotoRow.epoch)
-            .where(PatchRow.state == "done")
-        )
-        return [FieldPosition(r, phi) for r, phi in session.execute(query.order_by(PatchRow.id))]
 
     @reads
     def windows(self, session: Session, photo_id: str) -> list[PatchRow]:

@@ -50,7 +50,6 @@ export function setUpField() {
   const lens = `/v1/lenses/${field.dataset.lens}`;
   const aspect = Number(field.dataset.aspect);
   const [columns, rows] = gridFor(aspect, field.clientWidth);
-  const dots = byId("coverage");
   let [x, y] = [1 - 0.5 / columns, 0.5 / rows]; // the point, in shares of the picture
   let asked = 0;
   const settings = () => {
@@ -120,10 +119,6 @@ export function setUpField() {
   });
   controls.addEventListener("change", showField);
   controls.addEventListener("submit", (event) => event.preventDefault());
-  const seen = byId("show-coverage");
-  const showDots = () => dots.toggleAttribute("hidden", !seen.checked);
-  seen.addEventListener("change", showDots);
-  showDots(); // ticked before this script was there
   showField();
 }
 

@@ -387,13 +387,10 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
 
 
-def test_a_lens_shows_where_photos_had_detail_and_its_versions(page: Page, learned: dict[str, Any]) -> None:
+def test_a_lens_shows_its_versions(page: Page, learned: dict[str, Any]) -> None:
     page.goto(f"/lenses/{learned['lens_id']}/tests")
 
     expect(page.locator("#live:not([hx-get])")).to_be_attached()
-    page.get_by_label("Show where photos had detail").check()
-    expect(page.locator("#coverage")).to_be_visible()
-    assert page.locator("#coverage ellipse").count() >= learned["patches"]["done"]
     page.get_by_text("All versions").click()
     versions = page.get_by_role("region", name="Calibration history")
     expect(versions.locator("tbody tr").first).to_be_visible()

@@ -50,13 +50,13 @@ def photo_out(row: PhotoRow) -> s.PhotoOut:
         kind=row.given.get("kind"),
         reference_id=row.given.get("reference_id"),
         patches={"total": row.patches_total, "done": row.patches_done, "rejected": row.patches_rejected},
-        error=_photo_problem(row),
+        error=_problem(row),
         created_at=row.received_at,
     )
 
 
-def _photo_problem(row: PhotoRow) -> s.Problem | None:
-    if row.state == "needs_lens":
+def _problem(row: PhotoRow | CorrectionRow) -> s.Problem | None:
+    if isinstance(row, PhotoRow) and row.state == "needs_lens":
         return problem_of(
             "metadata_missing",
             row.error_detail
@@ -64,7 +64,8 @@ def _photo_problem(row: PhotoRow) -> s.Problem | None:
             "choose a lens, give its serial with the model, or name a new one",
         )
     if row.state == "cancelled":
-        return problem_of("cancelled", "cancelled by its owner; send the photo again to start anew")
+        what = "send the photo again" if isinstance(row, PhotoRow) else "ask for the correction again"
+        return problem_of("cancelled", f"cancelled by its owner; {what} to start anew")
     return None if row.error_code is None else problem_of(row.error_code, row.error_detail)
 
 
@@ -87,7 +88,7 @@ def photo_job(row: PhotoRow) -> s.JobOut:
         progress={"done": row.patches_done, "total": row.patches_total, "unit": "patches"},
         eta_seconds=_eta(row.stage_at, row.patches_done, row.patches_total) if estimating else None,
         attempt=max(row.attempt, 1),
-        error=_photo_problem(row),
+        error=_problem(row),
         created_at=row.received_at,
         links={
             "self": f"{V1}/jobs/{row.public_id}",
@@ -113,7 +114,7 @@ def correction_job(row: CorrectionRow) -> s.JobOut:
         progress={"done": row.progress_done, "total": row.progress_total, "unit": "tiles"},
         eta_seconds=None if since is None else _eta(since, row.progress_done, row.progress_total),
         attempt=max(row.attempt, 1),
-        error=_correction_problem(row),
+        error=_problem(row),
         links={
             "self": f"{V1}/jobs/{row.public_id}",
             "photo": f"{V1}/photos/{row.photo.public_id}",
@@ -133,15 +134,9 @@ def correction_out(row: CorrectionRow) -> s.CorrectionOut:
         id=row.public_id,
         photo_id=row.photo.public_id,
         lens_id=row.lens.public_id,
-        error=_correction_problem(row),
+        error=_problem(row),
         **asked,
     )
-
-
-def _correction_problem(row: CorrectionRow) -> s.Problem | None:
-    if row.state == "cancelled":
-        return problem_of("cancelled", "cancelled by its owner; ask for the correction again to start anew")
-    return None if row.error_code is None else problem_of(row.error_code, row.error_detail)
 
 
 def lens_out(row: LensRow, apertures: list[float], focals: list[float]) -> s.LensOut:

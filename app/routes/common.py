@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Final, Protocol, TypeAlias, TypeVar
 from urllib.parse import quote, urlencode
 
@@ -13,7 +13,7 @@ from app.errors import UnknownError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
 from app.other_lens import Described
-from app.schemas import OptionalName, Problem
+from app.schemas import Model, OptionalName, Page, Problem
 from app.store.tables import LensRow
 from lensmodel.core.names import camera_name
 
@@ -32,6 +32,8 @@ class HasPublicId(Protocol):
 
 
 Row = TypeVar("Row", bound=HasPublicId)
+M = TypeVar("M", bound=Model)
+T = TypeVar("T")
 
 
 Answers: TypeAlias = dict[int | str, dict[str, Any]]
@@ -73,12 +75,16 @@ def matches_tag(call: Call, tag: str) -> bool:
     return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
 
 
+def found(what: str, key: str, row: T | None) -> T:
+    """Return what was looked up of the owner; refuse what is not there, or somebody else's."""
+    if row is None:
+        raise UnknownError(what, key)
+    return row
+
+
 def find_lens(call: Call, lens_id: str) -> LensRow:
     """Return a lens of the owner."""
-    lens = call.store.lenses.get(lens_id, call.owner)
-    if lens is None:
-        raise UnknownError("lens", lens_id)
-    return lens
+    return found("lens", lens_id, call.store.lenses.get(lens_id, call.owner))
 
 
 def described_lens(call: Call, lens: LensRow) -> Described:
@@ -93,10 +99,10 @@ def described_lens(call: Call, lens: LensRow) -> Described:
     )
 
 
-def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:
-    """Split one row more than a page into the page and the cursor of the next one."""
-    page = list(rows[:limit])
-    return page, page[-1].public_id if len(rows) > limit else None
+def paged(call: Call, rows: Sequence[Row], limit: int, make: Callable[[Row], M]) -> Page[M]:
+    """Return a page of what one row more was read of, with the address of the next one."""
+    following = rows[limit - 1].public_id if len(rows) > limit else None
+    return Page(items=[make(row) for row in rows[:limit]], next=next_link(call, following))
 
 
 def next_link(call: Call, cursor: str | None) -> str | None:

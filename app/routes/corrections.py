@@ -8,7 +8,7 @@ from typing import Final
 from fastapi import APIRouter, Response, status
 from starlette.responses import StreamingResponse
 
-from app.errors import ConflictError, InvalidParameterError, NotReadyError, UnknownError
+from app.errors import ConflictError, InvalidParameterError, NotReadyError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
@@ -18,13 +18,13 @@ from app.routes.common import (
     Cursor,
     Limit,
     OnlyId,
-    cut,
     described_lens,
     file_answer,
     file_headers,
     find_lens,
+    found,
     matches_tag,
-    next_link,
+    paged,
     problems,
 )
 from app.routes.photos import SEND_AGAIN, check_usage, find_photo
@@ -140,10 +140,7 @@ def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
 
 def find_correction(call: Call, correction_id: str) -> CorrectionRow:
     """Return a correction of the owner with its photo and lens."""
-    row = call.store.jobs.correction(correction_id, call.owner)
-    if row is None:
-        raise UnknownError("correction", correction_id)
-    return row
+    return found("correction", correction_id, call.store.jobs.correction(correction_id, call.owner))
 
 
 @router.get("/corrections", operation_id="listCorrections")
@@ -153,8 +150,7 @@ def list_corrections(
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)
     rows = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1, photo=photo)
-    page, following = cut(rows, limit)
-    return Page[CorrectionOut](items=[*map(views.correction_out, page)], next=next_link(call, following))
+    return paged(call, rows, limit, views.correction_out)
 
 
 @router.get("/corrections/{correction_id}", operation_id="getCorrection")
@@ -169,9 +165,7 @@ def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
     prefix = call.store.jobs.delete(correction_id, call.owner)
-    if prefix is None:
-        raise UnknownError("correction", correction_id)
-    call.storage.delete(prefix)
+    call.storage.delete(found("correction", correction_id, prefix))
 
 
 @router.get(

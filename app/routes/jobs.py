@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 from app.errors import ConflictError, UnknownError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
-from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, next_link
+from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, found, next_link
 from app.routes.photos import SEND_AGAIN
 from app.schemas import JobOut, Page
 
@@ -33,10 +33,7 @@ def find_job(call: Call, job_id: str) -> JobOut:
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None:
         return views.photo_job(photo)
-    correction = call.store.jobs.correction(job_id, call.owner)
-    if correction is None:
-        raise UnknownError("job", job_id)
-    return views.correction_job(correction)
+    return views.correction_job(found("job", job_id, call.store.jobs.correction(job_id, call.owner)))
 
 
 def fingerprint(job: JobOut) -> str:

@@ -12,7 +12,7 @@ from app.errors import ConflictError, InvalidParameterError, UnknownError
 from app.http import views
 from app.http.dependencies import CallDep, OneSession
 from app.other_lens import REMEDY, difference
-from app.routes.common import Cursor, Limit, OnlyName, cut, described_lens, find_lens, next_link
+from app.routes.common import Cursor, Limit, OnlyName, described_lens, find_lens, next_link, paged
 from app.schemas import MAX_VERSION, CalibrationOut, Id, LateralOut, LensOut, Name, Page, Question
 from lensmodel.core.errors import NoSamplesError
 
@@ -25,10 +25,8 @@ def list_lenses(
 ) -> Page[LensOut]:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
-    page, following = cut(rows, limit)
-    coverage = call.store.lenses.coverage_of(page)
-    items = [views.lens_out(row, *coverage[row.id]) for row in page]
-    return Page[LensOut](items=items, next=next_link(call, following))
+    coverage = call.store.lenses.coverage_of(rows)
+    return paged(call, rows, limit, lambda row: views.lens_out(row, *coverage[row.id]))
 
 
 @router.get("/lenses/{lens_id}", operation_id="getLens")

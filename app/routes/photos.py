@@ -13,11 +13,11 @@ from fastapi import APIRouter, status
 from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
-from app.errors import BusyError, ConflictError, InvalidParameterError, QuotaError, ServiceError, UnknownError
+from app.errors import BusyError, ConflictError, InvalidParameterError, QuotaError, ServiceError
 from app.http import middleware, upload, views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.middleware import CLOSE
-from app.routes.common import Cursor, Limit, OnlyId, cut, find_lens, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, find_lens, found, paged, problems
 from app.runtime.settings import MIB, Settings
 from app.schemas import (
     V1,
@@ -244,10 +244,7 @@ def _folder(key: str) -> str:
 
 def find_photo(call: Call, photo_id: str) -> PhotoRow:
     """Return a photo of the owner."""
-    photo = call.store.photos.get(photo_id, call.owner)
-    if photo is None:
-        raise UnknownError("photo", photo_id)
-    return photo
+    return found("photo", photo_id, call.store.photos.get(photo_id, call.owner))
 
 
 @router.get("/photos", operation_id="listPhotos")
@@ -260,8 +257,7 @@ def list_photos(
 ) -> Page[PhotoOut]:
     """List photos, newest first."""
     rows = call.store.photos.page(call.owner, before=cursor, limit=limit + 1, lens_id=lens_id, state=state)
-    page, following = cut(rows, limit)
-    return Page[PhotoOut](items=[views.photo_out(row) for row in page], next=next_link(call, following))
+    return paged(call, rows, limit, views.photo_out)
 
 
 @router.get("/photos/{photo_id}", operation_id="getPhoto")
@@ -280,10 +276,7 @@ def list_patches(photo_id: str, call: CallDep) -> Page[PatchOut]:
 @router.delete("/photos/{photo_id}", operation_id="deletePhoto", status_code=status.HTTP_204_NO_CONTENT)
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
-    prefix = call.store.photos.delete(photo_id, call.owner)
-    if prefix is None:
-        raise UnknownError("photo", photo_id)
-    call.storage.delete(prefix)
+    call.storage.delete(found("photo", photo_id, call.store.photos.delete(photo_id, call.owner)))
 
 
 @router.patch("/photos/{photo_id}", operation_id="changePhoto")

@@ -8,11 +8,11 @@ from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Response, status
 
-from app.errors import InvalidParameterError, ServiceError, UnknownError
+from app.errors import InvalidParameterError, ServiceError
 from app.http import psf_formats
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import Fitted
-from app.routes.common import NOT_CHANGED, Answers, file_answer, matches_tag, problems
+from app.routes.common import NOT_CHANGED, Answers, file_answer, found, matches_tag, problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
 from lensmodel.core.errors import OutsideSupportError
@@ -124,10 +124,7 @@ def _answer(lens_id: str, form: Format, call: Call) -> Response:
 
 
 def _known(call: Call, lens_id: str) -> LensState:
-    known = call.store.lenses.known_of(lens_id, call.owner)
-    if known is None:
-        raise UnknownError("lens", lens_id)
-    return known
+    return found("lens", lens_id, call.store.lenses.known_of(lens_id, call.owner))
 
 
 def etag(fitted: Fitted, question: str) -> str:

@@ -206,12 +206,9 @@ class Client:
                     job, tag = _read(s.JobOut, answer), answer.headers.get("ETag", "")
                     if _ended(job, on_change):
                         return job
-            except httpx2.TransportError:
-                if not tag:
-                    raise
-                pause = AWAY_SECONDS
-            except ServiceProblemError as error:
-                if not tag or error.problem.status not in _AWAY:
+            except (httpx2.TransportError, ServiceProblemError) as error:
+                away = not isinstance(error, ServiceProblemError) or error.problem.status in _AWAY
+                if not (tag and away):
                     raise
                 pause = AWAY_SECONDS
             if time.monotonic() >= until:

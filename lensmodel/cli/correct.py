@@ -9,7 +9,6 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from lensmodel.blind import estimators
 from lensmodel.cli import files, folder, outputs
 from lensmodel.cli.console import Display, show_share
 from lensmodel.cli.ending import UsageError
@@ -27,7 +26,6 @@ from lensmodel.cli.options import (
     rare,
 )
 from lensmodel.correction import Bounds, deconvolvers
-from lensmodel.patches import selectors
 from lensmodel.photo import OutputFormat
 from lensmodel.workflow.lens import Lens
 
@@ -90,13 +88,6 @@ def correct(
         int,
         rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group."),
     ] = folder.LEARN_FROM,
-    estimator: Annotated[
-        str, rare(LEARNING, metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}.")
-    ] = "default",
-    selector: Annotated[
-        str,
-        rare(LEARNING, metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}."),
-    ] = "r-map",
     any_lens: Annotated[bool, rare(LEARNING, ANY_LENS)] = False,
     method: Annotated[
         str | None,
@@ -187,9 +178,9 @@ def correct(
     if profile is not None:
         document = _correct_by(profile, targets, options, shown, as_json=json_output)
     else:
-        learning = folder.Learning(profiles, learn_from, estimator, selector)
         base = next(iter({**targets, **twice})).parent
-        document = folder.correct(targets, base, options, learning, shown, as_json=json_output)
+        work = folder.Folder(base, profiles or base / folder.PROFILES, learn_from, options, shown)
+        document = work.correct(targets, as_json=json_output)
     document["results"][:0] = clashed
     if json_output:
         shown.document(document)

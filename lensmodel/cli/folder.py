@@ -19,7 +19,6 @@ from typing import Any, Final
 
 from rich.progress import Progress, TaskID
 
-from lensmodel import blind, patches
 from lensmodel.cli import calibrate, files, outputs
 from lensmodel.cli.console import Display, aligned, gain_words, show_share
 from lensmodel.core import processes
@@ -44,95 +43,83 @@ PROFILES: Final = "lenses"
 ENDING: Final = ".lensprofile"
 
 
-@dataclass(frozen=True, slots=True)
-class Learning:
-    """What the options said of learning."""
+class Folder:
+    """The work on one folder, and its journal.
 
-    # folder of the lens profiles; None is `lenses` in the folder of the corrected photos
-    profiles: Path | None
-    most: int  # photos that each group is learned from
-    estimator: str
-    selector: str
-
-
-def correct(
-    targets: Mapping[Path, Path],
-    base: Path,
-    options: outputs.CorrectionOptions,
-    learning: Learning,
-    display: Display,
-    *,
-    as_json: bool,
-) -> dict[str, Any]:
-    """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
-
-    Photos are given by the file that each becomes, `base` is the folder of these files.
+    Corrected photos go to `output`, lens profiles to `profiles`; each group is learned from `most` photos.
     """
-    with files.as_usage():
-        blind.estimators.create(learning.estimator)
-        patches.selectors.create(learning.selector)
-    shots: list[Shot] = []
-    results: list[dict[str, Any]] = []
-    for path in targets.values():
-        try:
-            shots.append(Shot.of(path))
-        except (LensModelError, OSError) as error:
-            results.append({"photo": str(path), "output": None, **files.failed(error)})
-            display.error(f"{path}: {files.reason(error)}")
-    lens_groups = groups(shots)
-    with processes.pool(None, options.workers) as pool, display.progress() as bars:
-        options = replace(options, least_gain_db=SEEN_DB)
-        work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display, pool)
-        work.learn(lens_groups, bars)
-        by_path = {path: target for target, path in targets.items()}
-        rows = work.correct(lens_groups, by_path, bars, results, as_json=as_json)
-    if not as_json:
-        display.result(_table(rows))
-    return {"groups": rows, "results": results}
-
-
-class _Folder:
-    """The work on one folder, and its journal."""
 
     def __init__(
         self,
         output: Path,
         profiles: Path,
+        most: int,
         options: outputs.CorrectionOptions,
-        learning: Learning,
         display: Display,
-        pool: Executor,
     ) -> None:
-        self._profiles, self._options, self._learning = profiles, options, learning
-        self._display, self._pool = display, pool
+        self._profiles, self._most, self._display = profiles, most, display
+        self._options = replace(options, least_gain_db=SEEN_DB)
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
         self._calibrations: dict[Path, calibrating.Calibration] = {}
         self._refused: dict[Path, LensModelError | OSError] = {}  # photos that taught nothing, and why
 
-    def profile_of(self, group: PhotoGroup) -> Path:
-        """Name the file of a group's lens profile."""
+    def correct(self, targets: Mapping[Path, Path], *, as_json: bool) -> dict[str, Any]:
+        """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
+
+        Photos are given by the file that each becomes.
+        """
+        shots: list[Shot] = []
+        results: list[dict[str, Any]] = []
+        for path in targets.values():
+            try:
+                shots.append(Shot.of(path))
+            except (LensModelError, OSError) as error:
+                results.append({"photo": str(path), "output": None, **files.failed(error)})
+                self._display.error(f"{path}: {files.reason(error)}")
+        lens_groups = groups(shots)
+        with processes.pool(None, self._options.workers) as pool, self._display.progress() as bars:
+            self._learn_all(lens_groups, bars, pool)
+            by_path = {path: target for target, path in targets.items()}
+            rows = self._correct_all(lens_groups, by_path, bars, results, as_json=as_json)
+        if not as_json:
+            self._display.result(_table(rows))
+        return {"groups": rows, "results": results}
+
+    def _profile_of(self, group: PhotoGroup) -> Path:
         return self._profiles / f"{group.name}{ENDING}"
 
-    def learn(self, lens_groups: Sequence[PhotoGroup], bars: Progress) -> None:
-        """Learn the lenses of all groups from their usable photos, at most as many as the options say."""
-        most = [min(self._learning.most, group.scenes) for group in lens_groups]
+    def _learn_all(self, lens_groups: Sequence[PhotoGroup], bars: Progress, pool: Executor) -> None:
+        """Learn the lenses of all groups from their usable photos, at most as many as were asked for."""
+        most = [min(self._most, group.scenes) for group in lens_groups]
         task = bars.add_task("", total=sum(most))
         for number, group in enumerate(lens_groups):
-            self._learn(group, most[number], bars, task, sum(most[:number]))
+            target = self._profile_of(group)
+            if target not in self._calibrations:
+                self._calibrations[target] = calibrating.Calibration(
+                    calibrate.ProfileFile(target),
+                    sampling.Config(LensSettings(aperture=self._options.aperture)),
+                    any_lens=self._options.any_lens,
+                    pool=pool,
+                )
+            self._learn(group, self._calibrations[target], most[number], bars, task, sum(most[:number]))
         bars.remove_task(task)
 
-    def _learn(self, group: PhotoGroup, most: int, bars: Progress, task: TaskID, before: int) -> None:
-        target = self.profile_of(group)
-        if target not in self._calibrations:
-            self._calibrations[target] = self._calibration(target)
-        calibrated, counted = self._calibrations[target], 0
+    def _learn(
+        self,
+        group: PhotoGroup,
+        calibration: calibrating.Calibration,
+        most: int,
+        bars: Progress,
+        task: TaskID,
+        before: int,
+    ) -> None:
+        counted = 0
         for shot in group.to_learn_from():
             if counted == most:
                 break
             on_event = partial(_learning, bars, task, before + counted)
-            if self._learns(calibrated, shot, group, on_event):
-                counted += 1
+            counted += self._learns(calibration, shot, group, on_event)
         bars.update(task, completed=before + most)
         refused = [self._refused.get(shot.path) for shot in group.shots]
         if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
@@ -143,15 +130,6 @@ class _Folder:
             )
         self._learned[group.name, group.focal] = counted
 
-    def _calibration(self, target: Path) -> calibrating.Calibration:
-        config = sampling.Config(
-            LensSettings(aperture=self._options.aperture),
-            estimator=self._learning.estimator,
-            selector=self._learning.selector,
-        )
-        store = calibrate.ProfileFile(target)
-        return calibrating.Calibration(store, config, any_lens=self._options.any_lens, pool=self._pool)
-
     def _learns(
         self,
         calibrated: calibrating.Calibration,
@@ -161,10 +139,7 @@ class _Folder:
     ) -> bool:
         """Learn from one photo; return whether it counts, now or from an earlier run."""
         photo = sampling.photo_id(shot.path)
-        learning, options = self._learning, self._options
-        under = (
-            f"{learning.estimator}, {learning.selector}, aperture {options.aperture}, any {options.any_lens}"
-        )
+        under = f"aperture {self._options.aperture}, any {self._options.any_lens}"
         known = self._journal.verdict("not learned from", photo, under)
         if known is not None:
             self._refused[shot.path] = NotEnoughEvidenceError(known)
@@ -182,7 +157,7 @@ class _Folder:
             return False
         return True
 
-    def correct(
+    def _correct_all(
         self,
         lens_groups: Sequence[PhotoGroup],
         targets: Mapping[Path, Path],
@@ -195,7 +170,7 @@ class _Folder:
         task = bars.add_task("", total=sum(len(group.shots) for group in lens_groups))
         rows, number = [], 0
         for group in lens_groups:
-            profile = self.profile_of(group)
+            profile = self._profile_of(group)
             lens = Lens(files.profile_at(profile)) if profile.exists() else None
             states: Counter[str] = Counter()
             left: Counter[str] = Counter()

@@ -24,18 +24,7 @@ from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.workflow.sampling import photo_id
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
-AUTO = (
-    "correct",
-    "holiday",
-    "--lens",
-    "auto",
-    "--profiles",
-    "lenses",
-    "--estimator",
-    "default",
-    "--method",
-    "fast",
-)
+AUTO = ("correct", "holiday", "--lens", "auto", "--profiles", "lenses", "--method", "fast")
 
 
 @pytest.fixture(scope="module")

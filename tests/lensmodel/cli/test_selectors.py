@@ -1,4 +1,4 @@
-"""Who chooses the patches of a photo: the library, `calibrate` and `correct FOLDER` pass the name on."""
+"""Who chooses the patches of a photo: the library and `calibrate` pass the name on."""
 
 from __future__ import annotations
 
@@ -51,20 +51,14 @@ def test_the_library_takes_a_name_or_an_object(folder: Path, asked: list[object]
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("calibrate", "holiday/one.dng", "--profile", "new.lensprofile"),
-        ("correct", "holiday", "--lens", "auto", "--profiles", "lenses"),
-    ],
-    ids=lambda words: words[0],
-)
-@pytest.mark.parametrize(
     ("option", "taken"), [(("--selector", "good-regions"), "good-regions"), ((), "r-map")]
 )
 def test_the_command_passes_its_option_on(
-    words: tuple[str, ...], option: tuple[str, ...], taken: str, folder: Path, asked: list[object]
+    option: tuple[str, ...], taken: str, folder: Path, asked: list[object]
 ) -> None:
-    command(*words, *option, "--workers", "1", cwd=folder)
+    command(
+        "calibrate", "holiday/one.dng", "--profile", "new.lensprofile", *option, "--workers", "1", cwd=folder
+    )
 
     assert asked == [taken]
 

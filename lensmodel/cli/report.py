@@ -46,12 +46,6 @@ from lensmodel.report.tables import to_csv
 from lensmodel.workflow.correcting import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
-Aspect = Annotated[
-    float | None,
-    typer.Option(
-        min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture; default: as its photos."
-    ),
-]
 
 FORMS: Final = (".html", ".pdf", ".png", ".csv", ".json")
 COMPARED: Final = "comparison.pdf"
@@ -70,7 +64,6 @@ def report(
         ),
     ] = None,
     aperture: Aperture = None,
-    aspect: Aspect = None,
     against: Annotated[
         Path | None,
         typer.Option(
@@ -118,14 +111,14 @@ def report(
         raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
     with shown.busy("computing its PSFs at 200 places"):
-        found = measured(profile, aperture, aspect, photo or [], whole=output is not None)
+        found = measured(profile, aperture, photo or [], whole=output is not None)
     if output is not None:
         with shown.busy("drawing"):
             for target in targets:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
             if against is not None:
-                write_comparison(output, found, measured(against, aperture, aspect, [], whole=True))
+                write_comparison(output, found, measured(against, aperture, [], whole=True))
     if json_output:
         shown.document(found)
     else:
@@ -134,9 +127,7 @@ def report(
         shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
-def measured(
-    profile: Path, aperture: float | None, aspect: float | None, photos: Sequence[Path], *, whole: bool
-) -> LensReport:
+def measured(profile: Path, aperture: float | None, photos: Sequence[Path], *, whole: bool) -> LensReport:
     """Report on the lens of a profile: whole, in all colours, or only what the screen shows."""
     known = files.profile_at(profile)
     with files.as_usage():
@@ -144,7 +135,6 @@ def measured(
         return lens_report(
             known.model,
             name_of(known.lens) or profile.stem,
-            aspect=aspect,
             apertures=asked,
             lateral=[lateral_of(develop(path)) for path in photos],
             channels=("g", "r", "b") if whole else ("g",),
@@ -215,7 +205,6 @@ def export_psfs(
     r: Annotated[float | None, RADIUS] = None,
     phi: Annotated[float | None, ANGLE] = None,
     size: Size = 31,
-    aspect: Aspect = None,
     json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -248,7 +237,7 @@ def export_psfs(
             rows=rows,
             cols=cols,
             size=size,
-            aspect=aspect or filled_aspect(model),
+            aspect=filled_aspect(model),
             at=place,
         )
     export(output, psfs, written)

@@ -47,9 +47,6 @@ class Metadata(Answer):
     aperture: Quantity | None
     focal_mm: Quantity | None
     focus_m: Annotated[float, Field(ge=-1, le=1e9)] | None
-    iso: Quantity | None
-    exposure_s: Quantity | None
-    taken_at: Annotated[str, Field(max_length=40, pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?$")] | None
     orientation: Annotated[int, Field(ge=1, le=8)]
     pixel_pitch_um: Quantity | None
 

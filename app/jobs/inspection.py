@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,8 +28,7 @@ MAX_WORD: Final = 20  # bytes of what a child says of the place: a word
 
 # Fields of a header that have columns of the same name
 _COLUMNS: Final = (
-    *("camera_maker", "camera_model", "aperture", "focal_mm", "focus_m", "pixel_pitch_um"),
-    *("orientation", "iso", "exposure_s"),
+    *("camera_maker", "camera_model", "aperture", "focal_mm", "focus_m", "pixel_pitch_um", "orientation"),
 )
 
 
@@ -74,15 +72,13 @@ def _examined(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) 
 
 def _record(context: JobContext, photo: PhotoRow, info: dict[str, Any]) -> None:
     metadata, lens = info["metadata"], info["metadata"]["lens"]
-    taken, camera = metadata["taken_at"], (metadata["camera_maker"], metadata["camera_model"])
+    camera = (metadata["camera_maker"], metadata["camera_model"])
     context.store.photos.record_inspection(
         photo.public_id,
         LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
         width=info["width"],
         height=info["height"],
         body_key=body_key(*camera, metadata.get("body_serial")),
-        # cameras write local time without a zone; as UTC it at least sorts
-        taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
         **{name: metadata[name] for name in _COLUMNS},
     )
 

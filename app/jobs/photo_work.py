@@ -362,8 +362,8 @@ def _checked(listed: Any, folder: Path, places: Mapping[int, FieldPosition]) -> 
     try:
         samples = returned_samples(folder, count=len(listed))
         return [
-            NewSample(entry["idx"], replace(sample, position=places[entry["idx"]]), entry["diagnostics"])
-            for entry, sample in zip(listed, samples, strict=True)
+            NewSample(number, replace(sample, position=places[number]))
+            for number, sample in zip(listed, samples, strict=True)
         ]
     except DAMAGED as error:
         raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error

@@ -141,8 +141,8 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
     return {"patches": patches, "rejected": rejected, "lateral": lateral}
 
 
-def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
-    """Estimate the PSF of one field cell in each channel, from its patches."""
+def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[int]:
+    """Estimate the PSF of one field cell in each channel; return of which patch each sample is."""
     # The samples go to the folder
     developed = sampling.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
@@ -157,12 +157,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
         on_step=progress,
     )
     write_samples(folder, [result.sample for result in results])
-    listed = []
-    for result in results:
-        diagnostics = {name: _finite(value) for name, value in result.diagnostics.items()}
-        diagnostics.pop("predicted_error", None)  # the sample has it
-        listed.append({"idx": numbers[result.patch.row, result.patch.col], "diagnostics": diagnostics})
-    return listed
+    return [numbers[result.patch.row, result.patch.col] for result in results]
 
 
 def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -336,10 +331,6 @@ def _settings(stored: Mapping[str, Any]) -> LensSettings:
         focus_m=distances.read(stored["focus_m"]),
         channel=stored.get("channel", "g"),
     )
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
 
 
 def _numbers(value: Any) -> Any:  # noqa: ANN401 - JSON of any shape

@@ -5,8 +5,8 @@ Windows that were rejected before estimation are one compact value of their phot
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import Select, func, select, update
@@ -42,11 +42,10 @@ class NewPatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewSample:
-    """One sample that was estimated from the patch `idx`, and what the estimator says of itself."""
+    """One sample that was estimated from the patch `idx`."""
 
     idx: int
     sample: PsfSample
-    diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Patches(Repository):
@@ -59,7 +58,7 @@ class Patches(Repository):
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
-        of_plan = {"photo_id": photo.id, "epoch": epoch, "state": "pending", "attempts": 0}
+        of_plan = {"photo_id": photo.id, "epoch": epoch, "state": "pending"}
         columns = ("idx", "cell", "row", "col", "size", "r", "phi", "score")
         rows = [
             {**of_plan, **{name: getattr(patch, name) for name in columns}}
@@ -95,7 +94,6 @@ class Patches(Repository):
     @writes
     def begin_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
         """Take up the open patches of one cell; empty if there are none or the photo needs them no more."""
-        # The attempt is counted before it is made
         query = _patches_of(photo_id, epoch).where(
             PhotoRow.epoch == epoch,
             PhotoRow.state == "estimating",
@@ -105,7 +103,6 @@ class Patches(Repository):
         rows = list(session.scalars(query.order_by(PatchRow.idx)))
         for row in rows:
             row.state = "running"
-            row.attempts += 1
         return rows
 
     @writes
@@ -122,11 +119,7 @@ class Patches(Repository):
             PatchRow.idx.in_({sample.idx for sample in samples}),
         )
         patches = {patch.idx: patch for patch in session.scalars(of_numbers)}
-        rows = [
-            columns_of(new.sample, photo, patches[new.idx], new.diagnostics)
-            for new in samples
-            if new.idx in patches
-        ]
+        rows = [columns_of(new.sample, photo, patches[new.idx]) for new in samples if new.idx in patches]
         stored = insert_new(session, SampleRow, rows)
         for patch in patches.values():
             patch.state, patch.finished_at = "done", patch.finished_at or now()

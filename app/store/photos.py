@@ -49,7 +49,7 @@ FALLBACKS: Final = "fallbacks"
 # Columns that describe a photo; all are emptied when it is deleted
 DESCRIPTION: Final = (
     *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),
-    *("aperture", "focal_mm", "focus_m", "pixel_pitch_um", "iso", "exposure_s", "taken_at", "lateral"),
+    *("aperture", "focal_mm", "focus_m", "pixel_pitch_um", "lateral"),
     *("width", "height", "orientation", "location", "error_detail", "body_key"),
 )
 # Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
@@ -630,12 +630,12 @@ def _estimated(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) 
     places: dict[tuple[float, float], int] = {}
     for sample in samples:
         places.setdefault(_place(sample), len(places))
-    done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done", "attempts": 0}
+    done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done"}
     done |= {"row": 0, "col": 0, "size": 0, "finished_at": now()}  # a profile does not say where in pixels
     rows = [{**done, "idx": idx, "cell": idx, "r": r, "phi": phi} for (r, phi), idx in places.items()]
     insert_new(session, PatchRow, rows)
     patches = {row.idx: row for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
-    columns = [columns_of(sample, photo, patches[places[_place(sample)]], {}) for sample in samples]
+    columns = [columns_of(sample, photo, patches[places[_place(sample)]]) for sample in samples]
     insert_new(session, SampleRow, columns)
     photo.patches_total = photo.patches_done = len(places)
     session.flush()

@@ -75,9 +75,7 @@ class LensState:
     rebuild_epoch: int
 
 
-def columns_of(
-    sample: PsfSample, photo: PhotoRow, patch: PatchRow, diagnostics: Mapping[str, Any]
-) -> dict[str, Any]:
+def columns_of(sample: PsfSample, photo: PhotoRow, patch: PatchRow) -> dict[str, Any]:
     """Return a sample as a row; what its photo knows, its photo's row keeps, and `patch` what it encodes."""
     entry = entry_of(sample)
     entry["estimator"] = entry["estimator"][:MAX_ESTIMATOR] or PROFILE
@@ -89,11 +87,9 @@ def columns_of(
         "patch_id": patch.id,
         "channel": sample.settings.channel,
         **{column.key: entry[name] for name, column in _OWN.items()},
-        "dtype": DTYPE,
         "format_version": FORMAT_VERSION,
         "crc32": zlib.crc32(blob),
         "psf": blob,
-        "diagnostics": dict(diagnostics),
         "created_at": now(),
     }
 

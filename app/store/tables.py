@@ -177,10 +177,6 @@ class PhotoRow(Base):
     focal_mm: Mapped[float | None]
     focus_m: Mapped[float | None]  # as `app.distances` writes it
     pixel_pitch_um: Mapped[float | None]
-    iso: Mapped[float | None]
-    exposure_s: Mapped[float | None]
-    # By the camera's clock, whose zone is unknown
-    taken_at: Mapped[datetime | None] = mapped_column(DateTime())
     # Lateral colour that this photo shows: radial polynomials of red and blue
     lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
     epoch: Mapped[int] = mapped_column(default=1)
@@ -237,7 +233,6 @@ class PatchRow(Base):
     score: Mapped[float | None]
     state: Mapped[str] = mapped_column(String(20))
     reason: Mapped[str | None] = mapped_column(String(60))
-    attempts: Mapped[int] = mapped_column(default=0)
     finished_at: Mapped[datetime | None]
     # What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`
     encoded: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
@@ -268,12 +263,10 @@ class SampleRow(Base):
     weight: Mapped[float]
     predicted_error: Mapped[float | None]
     size: Mapped[int]
-    dtype: Mapped[str] = mapped_column(String(10))
     format_version: Mapped[int]
     crc32: Mapped[int] = mapped_column(BigInteger)
     psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     estimator: Mapped[str]
-    diagnostics: Mapped[dict[str, Any]]
     created_at: Mapped[datetime]
 
 

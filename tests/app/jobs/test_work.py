@@ -54,9 +54,6 @@ INFO = {
         "aperture": 2.8,
         "focal_mm": 24.0,
         "focus_m": -1.0,
-        "iso": 100.0,
-        "exposure_s": 0.01,
-        "taken_at": "2024-05-01T12:00:00",
         "orientation": 1,
         "pixel_pitch_um": 6.0,
     },
@@ -97,7 +94,7 @@ def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
         for channel in CHANNELS
     ]
     write_samples(folder, samples)
-    return Outcome("ok", value=[{"idx": number, "diagnostics": {}} for number in numbers])
+    return Outcome("ok", value=numbers)
 
 
 class Scripted:
@@ -268,7 +265,7 @@ def test_samples_lie_where_their_patches_do(
 
 def nobody_elses_patch(arguments: dict[str, Any], folder: Path) -> Outcome:
     listed = estimate(arguments, folder).value
-    return Outcome("ok", value=[entry | {"idx": 77} for entry in listed])
+    return Outcome("ok", value=[77 for _ in listed])
 
 
 def fewer_than_announced(arguments: dict[str, Any], folder: Path) -> Outcome:
@@ -862,7 +859,6 @@ WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "rejected": "fla
         ("inspect", spoilt(INFO, "width", 2**40)),
         ("inspect", spoilt(INFO, "width", "600")),
         ("inspect", spoilt(INFO, "metadata.aperture", 1e300)),
-        ("inspect", spoilt(INFO, "metadata.taken_at", "yesterday")),
         ("inspect", spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
         ("select", spoilt(SELECTION, "patches", [patch(0)] * 2001)),
         ("select", spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),

@@ -155,13 +155,13 @@ class Installation:
         with self.store.database.reading() as session:
             return list(session.scalars(select(PhotoRow.state)))
 
-    def makers(self, photo_id: str | None = None) -> set[float]:
+    def makers(self, photo_id: str | None = None) -> set[str]:
         """Return which workers made the samples, of a photo or of all."""
-        query = select(SampleRow.diagnostics).join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
+        query = select(SampleRow.estimator).join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
         if photo_id is not None:
             query = query.where(PhotoRow.public_id == photo_id)
         with self.store.database.reading() as session:
-            return {diagnostics["worker"] for diagnostics in session.scalars(query)}
+            return set(session.scalars(query))
 
     def send(self, host: int, number: int) -> dict[str, Any]:
         photo = b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + number.to_bytes(4, "big") * 20

@@ -282,12 +282,10 @@ def test_a_sample_is_stored_as_earlier_programs_read_it(store: Store, steps: Ste
         "weight": 0.5,
         "predicted_error": None,
         "size": 15,
-        "dtype": "<f4",
         "format_version": 2,
         "crc32": zlib.crc32(kernel),
         "psf": kernel,
         "estimator": "default/1",
-        "diagnostics": {},
     }
 
 

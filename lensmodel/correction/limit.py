@@ -9,13 +9,12 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.clipped import compact, positive
+from lensmodel.correction.clipped import compact
 from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.devices import chosen
@@ -40,10 +39,6 @@ _MOST: Final = (
 _NEAR, _NEXT = 2, 1
 """Radii beside lamps for the least and the most (chosen: specks in a dark glow are seen before all else, and
 darker twigs are not); beside paint of which one colour clips the least is that within one pixel more."""
-_BRIGHTER: Final = 4.0
-"""Brightness of broad white areas, in units of saturation: lamps, sunlit paint and white skies (chosen)."""
-_EVEN: Final = 5
-"""Side of the window in which glare is compared with light (chosen: pixel by pixel, noise would decide)."""
 _LAMP: Final = 2.0
 """Solved light, in units of saturation, from which a pixel counts as a lamp although the photo did not clip
 (chosen: edges overshoot by less, lamps that the blur has dimmed are brighter)."""
@@ -128,9 +123,9 @@ def limited(
     which were solved to be twice as bright as saturation, have rules of their own: around them, in the reach
     of the blur and some more, each colour stays below the photo's most within 1 pixel and above its least
     within 3, of lamps and white areas within 2; near white areas it gets no brighter. Broad clipped areas
-    stay as they are, and so does, where e is .1, what may be glare of white ones, four times as bright as
-    saturation. Colour, the shares of red, green and blue in the light, is drawn towards the photo's own at
-    the same place until their differences lie in the photo's range within 3 pixels; the light stays.
+    stay as they are, white ones in all colours. Colour, the shares of red, green and blue in the light, is
+    drawn towards the photo's own at the same place until their differences lie in the photo's range within 3
+    pixels; the light stays.
 
     Parameters
     ----------
@@ -161,9 +156,6 @@ def limited(
     if clipped.any() or solved.any():
         broad = np.stack([plane & ~compact(plane, reach) for plane in clipped])
         white = broad.sum(axis=0) > 1
-        if white.any():
-            doubt = np.float32(_BRIGHTER * min(error / _UNSURE, 1.0))
-            held += np.minimum(doubt * glare_share(photo, white, clip, blurs), 1.0) * (photo - held)
         number = clipped.sum(axis=0, dtype=np.float32)
         kinds = np.maximum(np.minimum(number, 1.0), np.float32(2.0) * ((number > 1.0) | solved))
         glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
@@ -185,16 +177,6 @@ def limited(
         more = np.float32(halo) * (high - low)
         np.clip(held, low - more, high + more, out=held)
     return held
-
-
-def glare_share(photo: Planes, white: Mask, clip: Real, blurs: Sequence[UniformBlur]) -> Real:
-    """Share of each pixel's light that the areas `white` give it, were they as bright as saturation."""
-    share = np.zeros(white.shape, np.float32)
-    for plane, level, blur in zip(photo, clip, map(positive, blurs), strict=True):
-        light = level * np.pad(white.astype(np.float32), blur.reach, mode="edge")
-        spread, lit = (ndimage.uniform_filter(p, _EVEN, mode="nearest") for p in (blur.forward(light), plane))
-        np.maximum(share, spread / np.maximum(lit, np.float32(1e-6)), out=share)
-    return np.minimum(share, np.float32(1.0))
 
 
 def widening(error: float) -> tuple[float, float]:

@@ -126,7 +126,7 @@ class SensorGeometry:
         if between is None or between[0] >= NYQUIST:
             return words
         low, high = (self.words(end, unit) for end in between)
-        return f"{words} ({low} to {high.replace('at least', 'over')})"
+        return f"{words} [{low} to {high.replace('at least', 'over')}]"
 
 
 @dataclass(frozen=True, slots=True)

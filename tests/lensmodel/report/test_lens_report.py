@@ -90,7 +90,7 @@ def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() ->
     sensor = SensorGeometry(5.0, 4000)
 
     assert [sensor.words(0.2, unit) for unit in sensor.units] == [".200", "800", "40"]
-    assert sensor.words(0.2, "lp/mm", (0.15, 0.6)) == "40 (30 to over 100)"
+    assert sensor.words(0.2, "lp/mm", (0.15, 0.6)) == "40 [30 to over 100]"
     assert sensor.words(1.0) == "at least .500"
     assert SensorGeometry().units == ("c/px",)
     assert SensorGeometry().words(0.2, "lp/mm") == "unknown"
@@ -143,7 +143,7 @@ def test_a_figure_has_a_range_as_wide_as_the_blur_is_unsure(
         assert low < spot.sagittal < high
         assert least < (high - low) / 2.0 / spot.sagittal < most
     low, high = found.tested[0].spots[0].mean_range
-    assert f"{center.mean:.3f} ({low:.3f} to {high:.3f})".replace("0.", ".") in found.verdict
+    assert f"{center.mean:.3f} [{low:.3f} to {high:.3f}]".replace("0.", ".") in found.verdict
 
 
 def test_tangential_and_sagittal_are_told_apart() -> None:
@@ -182,7 +182,7 @@ def test_sides_are_given_apart_and_their_two_directions_too() -> None:
 
     head, rows = place_table(found)
     assert head[:4] == ["Aperture", "Place", "T, c/px", "S, c/px"]
-    table = {row[1]: [float(cell.split(" (")[0]) for cell in row[2:4]] for row in rows}
+    table = {row[1]: [float(cell.split(" [")[0]) for cell in row[2:4]] for row in rows}
     assert list(table)[:5] == ["centre", "left", "right", "top", "bottom"]
     assert table["left"][1] > 1.1 * table["right"][1]
     assert table["left"][0] < 0.8 * table["left"][1]

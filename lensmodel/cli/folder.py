@@ -10,7 +10,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -21,7 +20,6 @@ from rich.progress import Progress, TaskID
 
 from lensmodel.cli import calibrate, files, outputs
 from lensmodel.cli.console import Display, aligned, gain_words, show_share
-from lensmodel.core import processes
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import camera_name, name_key, serial_key
@@ -78,8 +76,8 @@ class Folder:
                 results.append({"photo": str(path), "output": None, **files.failed(error)})
                 self._display.error(f"{path}: {files.reason(error)}")
         lens_groups = groups(shots)
-        with processes.pool(None, self._options.workers) as pool, self._display.progress() as bars:
-            self._learn_all(lens_groups, bars, pool)
+        with self._display.progress() as bars:
+            self._learn_all(lens_groups, bars)
             by_path = {path: target for target, path in targets.items()}
             rows = self._correct_all(lens_groups, by_path, bars, results, as_json=as_json)
         if not as_json:
@@ -89,7 +87,7 @@ class Folder:
     def _profile_of(self, group: PhotoGroup) -> Path:
         return self._profiles / f"{group.name}{ENDING}"
 
-    def _learn_all(self, lens_groups: Sequence[PhotoGroup], bars: Progress, pool: Executor) -> None:
+    def _learn_all(self, lens_groups: Sequence[PhotoGroup], bars: Progress) -> None:
         """Learn the lenses of all groups from their usable photos, at most as many as were asked for."""
         most = [min(self._most, group.scenes) for group in lens_groups]
         task = bars.add_task("", total=sum(most))
@@ -100,7 +98,6 @@ class Folder:
                     calibrate.ProfileFile(target),
                     sampling.Config(LensSettings(aperture=self._options.aperture)),
                     any_lens=self._options.any_lens,
-                    pool=pool,
                 )
             self._learn(group, self._calibrations[target], most[number], bars, task, sum(most[:number]))
         bars.remove_task(task)

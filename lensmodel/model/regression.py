@@ -26,9 +26,9 @@ from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, support
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
+from lensmodel.model.bandwidths import CrossValidation, bandwidth, cross_validate
 from lensmodel.model.local_frame import LocalKernels
 from lensmodel.model.neighbours import Answers, Neighbourhood
-from lensmodel.model.validation import CrossValidation, bandwidth, cross_validate
 from lensmodel.model.widths import WidthField
 
 _DRIFT: Final = 0.15

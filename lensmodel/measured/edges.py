@@ -119,7 +119,7 @@ def chart_edges(photo: LinearPhoto) -> tuple[FoundEdge, ...]:
 
 
 def squares_of(edges: Sequence[FoundEdge]) -> list[tuple[FoundEdge, ...]]:
-    """Group edges by the square whose sides they are; an edge that belongs to none comes alone."""
+    """Group edges by the square whose sides they are; those that belong to none are left out."""
     left = list(edges)
     groups: list[tuple[FoundEdge, ...]] = []
     for side in (-1.0, 1.0):  # dark squares, then bright ones of what is left
@@ -130,7 +130,7 @@ def squares_of(edges: Sequence[FoundEdge]) -> list[tuple[FoundEdge, ...]]:
         together = [tuple(e for e, l in zip(left, labels, strict=True) if l == n) for n in range(count)]
         groups += [group for group in together if len(group) > 1]
         left = [group[0] for group in together if len(group) == 1]
-    return [*groups, *((edge,) for edge in left)]
+    return groups
 
 
 def _share_corner(a: FoundEdge, b: FoundEdge, side: float) -> bool:

@@ -91,8 +91,8 @@ def test_tangential_and_sagittal_are_not_mixed(chart: tuple[LinearPhoto, tuple[S
         apart.append(true[1] / true[0])
     assert max(apart) > 1.8  # else the test would say nothing
     for errors in (tangential, sagittal):
-        assert np.median(np.abs(errors)) < 0.07
-        assert np.quantile(np.abs(errors), 0.8) < 0.15
+        assert np.median(np.abs(errors)) < 0.04
+        assert np.quantile(np.abs(errors), 0.8) < 0.1
 
 
 @cache

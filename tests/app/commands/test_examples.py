@@ -72,7 +72,12 @@ COMMANDS = dict(commands(ROOT))
 EXAMPLES = {line: name for name, command in COMMANDS.items() for line in examples_of(command)}
 
 
-@pytest.mark.parametrize("line", EXAMPLES)
+PAGES = [HERE.parents[1] / "README.md", *(HERE.parents[1] / "docs").rglob("*.md")]
+PRINTED = r"^ {4,}(?:\.venv/bin/)?lensmodel ([a-z][^\\\n#]*[^\\\s#])[ ]*(?:#.*)?$"  # not those of two lines
+DOCUMENTED = {line for page in PAGES for line in re.findall(PRINTED, page.read_text("utf-8"), re.MULTILINE)}
+
+
+@pytest.mark.parametrize("line", sorted({*EXAMPLES, *DOCUMENTED}))
 def test_each_example_is_understood_by_its_command(line: str) -> None:
     name = max((name for name in COMMANDS if f"{line} ".startswith(f"{name} ")), key=len)
     words = shlex.split(line.removeprefix(name))

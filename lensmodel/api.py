@@ -20,7 +20,7 @@ from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.tags.location import gps_directory
-from lensmodel.workflow.calibrating import Calibration, InMemory
+from lensmodel.workflow.calibrating import Calibration, LensStore
 from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
@@ -137,7 +137,7 @@ def calibrate(
     begin = None if isinstance(model, str) else model
     reasons = []
     with processes.pool(None, workers, estimators.resolve(config.of_lens(lens).method)) as pool:
-        calibration = Calibration(InMemory(lens), config, begin=begin, any_lens=any_lens, pool=pool)
+        calibration = Calibration(LensStore(lens), config, begin=begin, any_lens=any_lens, pool=pool)
         for verdict in calibration.learn(paths, executor, on_event=on_event):
             path, count = verdict.photo, verdict.samples
             if verdict.error is not None:

@@ -150,7 +150,7 @@ def _result(verdict: calibrating.PhotoVerdict, display: Display) -> dict[str, An
     return {"state": "counted", "samples": verdict.samples}
 
 
-class ProfileFile:
+class ProfileFile(calibrating.LensStore):
     """The store of a lens in a file.
 
     Another run may add to the same file meanwhile: the profile is read again whenever the file has
@@ -158,8 +158,8 @@ class ProfileFile:
     """
 
     def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
+        super().__init__()
         self._target, self._model = target, model
-        self._lens: Lens | None = None
         self._stamp_read = _stamp(target) if force else None
 
     def lens(self) -> Lens | None:

@@ -10,7 +10,7 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from lensmodel import photo
 from lensmodel.core import processes
@@ -121,28 +121,18 @@ def _lens_words(lens: Mapping[str, str]) -> str:
     return " ".join(lens[name] for name in ("model", "serial") if lens.get(name))
 
 
-class LensStore(Protocol):
-    """Where a lens is kept while it learns: in memory, or in a file that other runs may add to."""
+class LensStore:
+    """Where a lens is kept while it learns: in memory; subclasses keep it where other runs may add to it."""
 
-    def lens(self) -> Lens | None:
-        """Return the newest lens: the same object until another run has changed it."""
-
-    def keep(self, lens: Lens) -> None:
-        """Keep a lens that has learned from one photo more."""
-
-
-class InMemory:
-    """The store of a single run, which forgets the lens with it."""
-
-    def __init__(self, lens: Lens | None) -> None:
+    def __init__(self, lens: Lens | None = None) -> None:
         self._lens = lens
 
     def lens(self) -> Lens | None:
-        """Return the lens that was kept last."""
+        """Return the newest lens: the same object until another run has changed it."""
         return self._lens
 
     def keep(self, lens: Lens) -> None:
-        """Keep a lens."""
+        """Keep a lens that has learned from one photo more."""
         self._lens = lens
 
 

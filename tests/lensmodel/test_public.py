@@ -144,16 +144,6 @@ def test_the_map_is_that_of_the_kernels_and_row_0_is_the_top() -> None:
     assert lens.mtf50_map(2, 3, aperture=2.0).shape == (2, 2, 3)
 
 
-def test_a_lens_comes_back_from_its_file(tmp_path: Path) -> None:
-    lens, _ = field_of_gaussians()
-    lens.save(tmp_path / "a.lensprofile")
-
-    back = Lens.load(tmp_path / "a.lensprofile")
-
-    asked = {"aperture": 2.0, "size": 15}
-    assert back.psf(0.7, 0.2, **asked).kernel == pytest.approx(lens.psf(0.7, 0.2, **asked).kernel, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     "change",
     [{"r": [0.1, 0.2]}, {"kernels": np.ones((5, 5))}, {"channel": ["g", "r"]}, {"aperture": [1.0, 2.0]}],

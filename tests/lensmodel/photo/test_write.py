@@ -20,7 +20,6 @@ import rawpy
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
-from skimage import io
 
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
@@ -322,19 +321,6 @@ def test_exiftool_finds_no_fault_and_the_same_values(
     assert read["DateTimeOriginal"] == "2020:02:03 04:05:06"
     assert read["Orientation"] == (1 if output.startswith("png") else 6)
     assert "SerialNumber" not in read
-
-
-def test_skimage_and_pillow_read_the_numbers_that_we_read(tmp_path: Path) -> None:
-    photo.write_image(tmp_path / "x.tif", planes(), PLAIN, format="tiff16")
-    photo.write_image(tmp_path / "x.png", planes(), PLAIN, format="png16")
-    photo.write_image(tmp_path / "8.png", planes(), PLAIN, format="png8")
-
-    assert (io.imread(tmp_path / "x.tif") == read_numbers(tmp_path / "x.tif")).all()
-    assert (read_numbers(tmp_path / "x.png") == read_numbers(tmp_path / "x.tif")).all()
-    with Image.open(tmp_path / "8.png") as image:
-        assert (np.asarray(image) == read_numbers(tmp_path / "8.png")).all()
-    with Image.open(tmp_path / "x.png") as image:  # Pillow shows 16 bits as 8
-        agree(np.asarray(image), read_numbers(tmp_path / "8.png"), atol=1)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -51,7 +51,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return paths
 
 
-class Noting(calibrating.InMemory):
+class Noting(calibrating.LensStore):
     """Notes how many samples a lens has whenever it is kept."""
 
     def __init__(self, lens: Lens | None = None) -> None:

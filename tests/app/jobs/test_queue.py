@@ -113,10 +113,6 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
     assert calls == ["p"]
 
 
-def test_a_job_that_nobody_asked_for_is_unknown(engine: DbosEngine) -> None:
-    assert engine.status(Job("photo", ("never", 1))) == "unknown"
-
-
 def test_patches_run_side_by_side_one_more_than_there_are_slots(url: str) -> None:
     together = threading.Barrier(3, timeout=stretched(20))
     engine = DbosEngine(url, "this-process", slots=2)

@@ -46,10 +46,6 @@ def _span(text: str) -> timedelta:
     return timedelta(hours=int(match[1]) * HOURS[match[2]])
 
 
-def _span_or_none(text: str | None) -> timedelta | None:
-    return None if text is None or text == "never" else _span(text)
-
-
 @contextmanager
 def _opened(data: Data) -> Iterator[Accounts]:
     """Open the keys of an installation, its schema brought up to date."""
@@ -65,12 +61,6 @@ def _opened(data: Data) -> Iterator[Accounts]:
         yield Accounts(database)
     finally:
         database.close()
-
-
-def _show(text: str) -> None:
-    """Print a new key alone on the standard output, so that it can be passed on."""
-    typer.echo("Shown once and stored nowhere: keep it where you keep passwords.", err=True)
-    typer.echo(text)
 
 
 @keys.command()
@@ -118,7 +108,7 @@ def create(
         raise UsageError(
             f"an owner's name has 1 to 100 printable characters and no vertical bar, got {owner!r}"
         )
-    lasts = _span_or_none(expires)
+    lasts = None if expires == "never" else _span(expires)
     with _opened(data) as store:
         text = store.create_key(
             name,
@@ -128,7 +118,8 @@ def create(
             quota_bytes=None if quota_gb is None else int(quota_gb * GIB),
             quota_photos=quota_photos,
         )
-    _show(text)
+    typer.echo("Shown once and stored nowhere: keep it where you keep passwords.", err=True)
+    typer.echo(text)  # alone on the standard output, so that it can be passed on
 
 
 @keys.command(name="list")

@@ -146,7 +146,8 @@ class JobContext:
                 with self.storage.as_file(photo.blob_key, folder, copied=copied) as path:
                     yield path
             except FileNotFoundError as error:
-                if self._is_stored(photo.blob_key):
+                with suppress(FileNotFoundError):  # OSError while the folder is away
+                    self.storage.size(photo.blob_key)
                     raise OSError(errno.ENODEV, "the folder of the blobs was away", photo.blob_key) from error
                 text = f"the file of photo {photo.public_id} is no longer stored; upload it again"
                 raise JobFailedError("unknown_photo", text) from error
@@ -162,14 +163,6 @@ class JobContext:
                     file = self.storage.as_file(row.blob_key, folder, copied=self.sandbox.account is not None)
                     paths.append(opened.enter_context(file))
             yield paths
-
-    def _is_stored(self, key: str) -> bool:
-        """Say whether there is a blob; OSError while its folder is away: nothing is known then."""
-        try:
-            self.storage.size(key)
-        except FileNotFoundError:
-            return False
-        return True
 
     def developed_folder(self, photo_id: str) -> Path:
         """Return the folder of the developed photo, in a cache of this machine."""

@@ -81,7 +81,7 @@ class PhotoWork:
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
-        rows = self._context.store.photos.begin_cell(photo_id, epoch, cell)
+        rows = self._context.store.photos.patches_of_cell(photo_id, epoch, cell)
         if not rows:
             return
         numbers = [row.idx for row in rows]
@@ -219,7 +219,9 @@ class _Steps:
         selection = checked(Selected, selection)
         if selection["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, photo.epoch, selection["lateral"])
-        self._store.photos.plan_patches(photo.public_id, photo.epoch, _plan_of(selection))
+        windows = enumerate([*selection["patches"], *selection["rejected"]])
+        plan = [NewPatch(idx=number, **window) for number, window in windows]
+        self._store.photos.plan_patches(photo.public_id, photo.epoch, plan)
 
     def estimate(self) -> None:
         """Hand out the cells and wait until each is done, rejected or given up."""
@@ -380,14 +382,6 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     if photo.aperture is None:
         return "the photo does not say its aperture: give the f-number"
     return ""
-
-
-def _plan_of(selection: dict[str, Any]) -> list[NewPatch]:
-    """Return the patches and windows of the task `select` as rows to insert."""
-    return [
-        NewPatch(idx=number, **window)
-        for number, window in enumerate([*selection["patches"], *selection["rejected"]])
-    ]
 
 
 def _patch_of(row: PatchRow) -> Patch:

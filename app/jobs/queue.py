@@ -84,7 +84,7 @@ class DbosEngine:
         }
         DBOS(config=config)
         for kind, handler in handlers.items():
-            DBOS.workflow(name=kind)(_plain(handler))
+            DBOS.workflow(name=kind)(handler)
         DBOS.launch()
         for queue, limit in self._concurrency.items():
             DBOS.register_queue(
@@ -154,15 +154,6 @@ class DbosEngine:
     def stop(self) -> None:
         """Run no more jobs, without waiting for those that are running."""
         DBOS.destroy(destroy_registry=True)
-
-
-def _plain(handler: Handler) -> Handler:
-    """Wrap a bound method: the library registers functions."""
-
-    def run(*arguments: str | int) -> None:
-        handler(*arguments)
-
-    return run
 
 
 def _listed(**which: Any) -> list[Any]:  # noqa: ANN401 - of `DBOS.list_workflows`

@@ -66,7 +66,7 @@ def _tables(store: Store) -> Iterator[Violation]:
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:
-    waiting = sum(store.jobs.load().jobs.values())
+    waiting = sum(store.jobs.load()[0].values())
     if waiting and not store.jobs.live(settings.lease_seconds):
         says = f"{waiting} jobs are unfinished and no worker lives"
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")

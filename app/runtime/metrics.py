@@ -68,14 +68,14 @@ class Tables(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield the present values."""
-        load = self._store.jobs.load()
+        jobs, oldest_s = self._store.jobs.load()
         depth = GaugeMetricFamily("lensmodel_queue_jobs", "Unfinished jobs.", labels=("kind", "state"))
-        for (kind, state), count in load.jobs.items():
+        for (kind, state), count in jobs.items():
             depth.add_metric((kind, state), count)
         age = GaugeMetricFamily(
             "lensmodel_queue_oldest_seconds", "Age of the oldest job that nobody began.", labels=("kind",)
         )
-        for kind, seconds in load.oldest_s.items():
+        for kind, seconds in oldest_s.items():
             age.add_metric((kind,), seconds)
         workers = GaugeMetricFamily("lensmodel_workers", "Workers heard of within their lease.")
         workers.add_metric((), len(self._store.jobs.live(self._lease_s)))

@@ -138,14 +138,13 @@ class Sandbox:
         *,
         module: str | None = None,
         preload: Sequence[str] | None = None,
-        confined: bool = True,
         cache: Path | None = None,
         account: SystemAccount | None = None,
         niceness: int = child.NICENESS,
     ) -> None:
         self._niceness = niceness
-        self.account = account if confined else None
-        self.scratch, self.budget, self._confined = scratch, budget, confined
+        self.scratch, self.budget, self.account = scratch, budget, account
+        self._confined = True
         configured = os.environ.get("NUMBA_CACHE_DIR")
         self.cache = Path(configured).resolve() if configured and self.account is None else cache
         self._module = module or TASKS_MODULE

@@ -75,22 +75,6 @@ class Result:
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Load:
-    """Waiting jobs at one moment.
-
-    Parameters
-    ----------
-    jobs : mapping of (kind, state) to int
-        Unfinished jobs.
-    oldest_s : mapping of kind to float
-        Seconds for which the oldest job has waited; 0 where none waits.
-    """
-
-    jobs: Mapping[tuple[str, str], int]
-    oldest_s: Mapping[str, float]
-
-
 def params_hash(params: Mapping[str, Any]) -> str:
     """Return the SHA-256 of the canonical JSON of the parameters."""
     return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -276,8 +260,8 @@ class Jobs(Repository):
         return jobs
 
     @reads
-    def load(self, session: Session) -> Load:
-        """Return the numbers, by reads of indexes."""
+    def load(self, session: Session) -> tuple[dict[tuple[str, str], int], dict[str, float]]:
+        """Return unfinished jobs by kind and state, and for how many seconds the oldest of a kind waits."""
         jobs = {(kind, state): 0 for kind, states in _STATES.items() for state in states}
         oldest = dict.fromkeys(_STATES, 0.0)
         for kind, table, since in (
@@ -290,7 +274,7 @@ class Jobs(Repository):
                 jobs[kind, state] = count
                 if state == _STATES[kind][0]:
                     oldest[kind] = max((now() - first).total_seconds(), 0.0)
-        return Load(jobs, oldest)
+        return jobs, oldest
 
     # --- workers ----------------------------------------------------------------------------------
 

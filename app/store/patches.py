@@ -18,8 +18,6 @@ from app.store.samples import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.psf import PsfSample
 
-OPEN: Final = ("pending", "running")
-
 # Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
 # diagonal is 3,600 pixels
 DIGITS: Final = 4
@@ -87,23 +85,20 @@ class Patches(Repository):
     @reads
     def cells(self, session: Session, photo_id: str, epoch: int) -> list[int]:
         """Return the numbers of the cells that still have patches to estimate."""
-        query = _patches_of(photo_id, epoch).where(PatchRow.state.in_(OPEN))
+        query = _patches_of(photo_id, epoch).where(PatchRow.state == "pending")
         cells = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
         return sorted(cell for cell in cells if cell is not None)
 
-    @writes
-    def begin_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
-        """Take up the open patches of one cell; empty if there are none or the photo needs them no more."""
+    @reads
+    def patches_of_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
+        """Return the open patches of one cell; empty if there are none or the photo needs them no more."""
         query = _patches_of(photo_id, epoch).where(
             PhotoRow.epoch == epoch,
             PhotoRow.state == "estimating",
             PatchRow.cell == cell,
-            PatchRow.state.in_(OPEN),
+            PatchRow.state == "pending",
         )
-        rows = list(session.scalars(query.order_by(PatchRow.idx)))
-        for row in rows:
-            row.state = "running"
-        return rows
+        return list(session.scalars(query.order_by(PatchRow.idx)))
 
     @writes
     def add_samples(self, session: Session, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
@@ -147,7 +142,7 @@ class Patches(Repository):
         if indices is not None:
             which.append(PatchRow.idx.in_(indices))
         if cell is not None:
-            which += [PatchRow.cell == cell, PatchRow.state.in_(OPEN)]
+            which += [PatchRow.cell == cell, PatchRow.state == "pending"]
         state = "rejected" if rejected else "failed"
         session.execute(
             update(PatchRow).where(*which).values(state=state, reason=reason[:60], finished_at=now())

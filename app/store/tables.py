@@ -41,7 +41,7 @@ CORRECTION_ACTIVE: Final = ("queued", "running")
 PROFILE_FILE: Final = "lensprofile"
 PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
-PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
+PATCH_STATES: Final = ("pending", "done", "rejected", "failed")
 CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
 EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
 

@@ -277,7 +277,7 @@ def upgrade() -> None:
         sa.Column("finished_at", TIME, nullable=True),
         sa.Column("encoded", sa.LargeBinary(), nullable=True),
         sa.CheckConstraint(
-            "state IN ('pending', 'running', 'done', 'rejected', 'failed', 'cancelled')",
+            "state IN ('pending', 'done', 'rejected', 'failed')",
             name=op.f("ck_patch_state"),
         ),
         sa.ForeignKeyConstraint(

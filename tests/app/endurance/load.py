@@ -182,9 +182,9 @@ def main() -> int:
             for thread in threads:
                 thread.join()
             end = time.monotonic() + PATIENCE_S
-            while any(store.jobs.load().jobs.values()) and time.monotonic() < end:
+            while any(store.jobs.load()[0].values()) and time.monotonic() < end:
                 time.sleep(1.0)
-            unsettled = sum(store.jobs.load().jobs.values())
+            unsettled = sum(store.jobs.load()[0].values())
             findings = examine(settings, store, Storage(settings.storage)).findings
             store.close()
     print(json.dumps({"answers": dict(load.answers), "unfinished": unsettled, "faults": load.faults[:5]}))

@@ -34,8 +34,7 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.correction import Deconvolver, Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
-from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.blur.uniform import fast_shape
+from lensmodel.correction.blur import UniformBlur, fast_shape
 
 _TILE = 256  # pixels: a tile of the engine
 _KERNEL = 25  # pixels: of a blur of 2 px (chosen)

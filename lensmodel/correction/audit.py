@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.types import CHANNELS, ZONES, NoiseModel, Plane, Planes, Zone
-from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.blur.uniform import fast_shape
-from lensmodel.correction.compiled.common import Complex, Real, through
-from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.blur import UniformBlur, fast_shape
+from lensmodel.correction.compiled.common import Complex, Real, smooth, through
 
 Window: TypeAlias = tuple[slice, slice]
 

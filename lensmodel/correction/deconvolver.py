@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import NoiseModel, Plane, Planes, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator, UniformBlur
+from lensmodel.correction.blur import UniformBlur
 
 TINY = 1e-6
 """Least light that is divided by, in units of saturation (chosen: far below the noise of any sensor, far
@@ -109,7 +109,7 @@ class Deconvolver(Protocol):
     """Non-blind deconvolution of one plane: step 3 of Hirsch and Schölkopf (ICCV 2015, section 7)."""
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Estimate the latent plane.
 
@@ -117,7 +117,7 @@ class Deconvolver(Protocol):
         ----------
         blurred : Plane, shape (H, W), float32
             Linear light, as the photo shows it.
-        blur : BlurOperator
+        blur : UniformBlur
             From the latent plane, which is wider than the frame by the reach of the blur, onto the frame.
         sensor : Sensor
             Noise, clipping, and which pixels were measured.
@@ -129,11 +129,6 @@ class Deconvolver(Protocol):
         -------
         Restored
             The latent plane inside the frame, shape (H, W), float32.
-
-        Raises
-        ------
-        InvalidInputError
-            If the method cannot invert such an operator.
         """
 
 
@@ -213,19 +208,3 @@ def restore_planes(
         for plane, blur, sensor in zip(blurred, blurs, sensors, strict=True)
     ]
     return Solution(np.stack(restored))
-
-
-def uniform(blur: BlurOperator, method: str) -> UniformBlur:
-    """Return `blur` if it is one kernel, which methods that solve in the Fourier domain need.
-
-    Raises
-    ------
-    InvalidInputError
-        For any other operator.
-    """
-    if not isinstance(blur, UniformBlur):
-        raise InvalidInputError(
-            f"method {method!r} needs one kernel, got {type(blur).__name__}; "
-            "use correct_planes, which cuts the field into cells of one kernel"
-        )
-    return blur

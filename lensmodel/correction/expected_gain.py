@@ -17,9 +17,8 @@ from lensmodel.core.types import ZONES, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.wiener import frequency_counts
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
-from lensmodel.correction.scene_power import ring_power, scene_power
+from lensmodel.correction.scene_power import frequency_counts, ring_power, scene_power
 from lensmodel.correction.tiles.lattice import Cell
 
 WORTH_DB: Final = 0.1

@@ -8,8 +8,8 @@ import numpy as np
 
 from lab.correction.methods.mixture import shipped_mixture
 from lensmodel.core.types import Plane, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator
-from lensmodel.correction.deconvolver import Restored, Sensor, uniform
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Restored, Sensor
 from lensmodel.correction.tiles.canvas import Canvas
 
 _WHITE = 0.9  # of the photographs that the mixture was fitted to, see `lab.cases`
@@ -33,14 +33,13 @@ class EpllDeconvolver:
     stride: int = 3  # one window in `stride`² is used, on a grid moved each time
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        kernel = uniform(blur, "epll")
         light = max(float(np.percentile(blurred, 99.5)), 1e-3) / _WHITE
-        canvas = Canvas(blurred.shape[0], blurred.shape[1], max(kernel.reach, 4))
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], max(blur.reach, 4))
         y = canvas.fill(np.asarray(blurred / np.float32(light), dtype=np.float32))
-        K = kernel.spectrum(canvas.shape)
+        K = blur.spectrum(canvas.shape)
         weight = light * light / max(float(sensor.variance(blurred).mean()), 1e-9)
         x = shipped_mixture().restored(y, K, weight, self.betas, self.stride, on_step)
         restored = np.ascontiguousarray(canvas.cut(x) * np.float32(light))

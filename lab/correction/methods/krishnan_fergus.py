@@ -11,8 +11,8 @@ from scipy import fft
 
 from lab.correction.methods.half_quadratic import growing, half_quadratic
 from lensmodel.core.types import Plane, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator
-from lensmodel.correction.deconvolver import Restored, Sensor, uniform
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Restored, Sensor
 from lensmodel.correction.methods.shrinkage import Shrinkage
 from lensmodel.correction.tiles.canvas import Canvas
 
@@ -32,14 +32,13 @@ class KrishnanFergus:
     alpha: float = 2.0 / 3.0  # exponent of the prior
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        kernel = uniform(blur, "krishnan-fergus")
-        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], blur.reach)
         data = canvas.fill(blurred)
         shape = canvas.shape
-        K = kernel.spectrum(shape)
+        K = blur.spectrum(shape)
         fidelity = 0.2 / max(float(sensor.variance(blurred).mean()), 1e-9)
         rows = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.fftfreq(shape[0]))
         cols = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.rfftfreq(shape[1]))

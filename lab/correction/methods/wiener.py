@@ -8,9 +8,9 @@ import numpy as np
 from scipy import fft
 
 from lensmodel.core.types import Plane, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator
-from lensmodel.correction.deconvolver import Restored, Sensor, uniform
-from lensmodel.correction.methods.wiener import wiener_spectrum
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Restored, Sensor
+from lensmodel.correction.scene_power import wiener_spectrum
 from lensmodel.correction.tiles.canvas import Canvas
 
 
@@ -24,13 +24,12 @@ class Wiener:
     caution: float = 1.0  # factor on the noise variance; above 1 the result is smoother
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        kernel = uniform(blur, "wiener")
-        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], blur.reach)
         noise = self.caution * float(sensor.variance(blurred).mean())
-        K = kernel.spectrum(canvas.shape)
+        K = blur.spectrum(canvas.shape)
         spectrum = wiener_spectrum(canvas.fill(blurred), K, noise, float(blurred.var()))
         latent = np.asarray(fft.irfft2(spectrum, canvas.shape), dtype=np.float32)
         on_step(1, 1)

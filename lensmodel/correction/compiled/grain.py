@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.compiled.common import ONE, ZERO, Real
-from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.compiled.common import ONE, ZERO, Real, smooth
 
 _GRAIN = np.float32(3.0)
 """Standard deviations of the noise within which a residual is grain (chosen: noise exceeds them in one pixel

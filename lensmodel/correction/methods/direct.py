@@ -12,18 +12,24 @@ from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Plane, Planes, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator, UniformBlur
+from lensmodel.correction.blur import UniformBlur, transfers
 from lensmodel.correction.clipped import Lights
-from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
-from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.compiled.common import (
+    ONE,
+    ZERO,
+    Complex,
+    Number,
+    Real,
+    smooth,
+    to_plane,
+    to_spectrum,
+)
 from lensmodel.correction.compiled.tile import fill
-from lensmodel.correction.deconvolver import Restored, Sensor, Solution, uniform
-from lensmodel.correction.methods.wiener import frequency_squared
+from lensmodel.correction.deconvolver import Restored, Sensor, Solution
 from lensmodel.correction.posterior import GRID
-from lensmodel.correction.scene_power import ring_power, scene_law
+from lensmodel.correction.scene_power import frequency_squared, ring_power, scene_law
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.transfers import transfers
 
 _FLOOR: Final = np.float32(1e-3)
 """Added to |K|²: the square of what a transfer function is expected to be off by within a cell (chosen:
@@ -78,11 +84,10 @@ class DirectFilter:
     """Cells may be larger: a filter that is quick has no use for kernels that are exact everywhere."""
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        kernel = uniform(blur, "fast")
-        restored = self.deconvolve_planes(blurred[None], [kernel], [sensor])
+        restored = self.deconvolve_planes(blurred[None], [blur], [sensor])
         on_step(1, 1)
         return Restored(restored.planes[0], steps=1)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.correction.devices import Array, Device
-from lensmodel.correction.methods.wiener import prior
+from lensmodel.correction.scene_power import prior
 
 if TYPE_CHECKING:
     from lensmodel.correction.methods.sparse_gradient import SparseProblem

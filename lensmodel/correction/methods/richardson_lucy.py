@@ -8,14 +8,12 @@ from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Plane, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator, UniformBlur
-from lensmodel.correction.blur.uniform import fast_shape
+from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.compiled.richardson_lucy import richardson_lucy
-from lensmodel.correction.deconvolver import LEAST_PREDICTED, TINY, Restored, Sensor
+from lensmodel.correction.deconvolver import TINY, Restored, Sensor
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
@@ -61,7 +59,7 @@ class RichardsonLucy:
         _check(self.iterations)
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
         base = background(sensor)
@@ -131,7 +129,7 @@ class SaturationAwareRichardsonLucy:
             )
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
         latent, reach = first_guess(blurred, blur)
@@ -163,7 +161,7 @@ def richardson_lucy_steps(
     latent: Plane,
     blurred: Plane,
     reach: Plane,
-    blur: BlurOperator,
+    blur: UniformBlur,
     sensor: Sensor,
     *,
     steps: int,
@@ -192,47 +190,23 @@ def richardson_lucy_steps(
     count = np.arange(1, steps + 1)
     fixed = np.minimum((count - 1) / (count + 2), ALPHA_MAX) * (acceleration == "fixed")
     alphas, adaptive = fixed.astype(np.float32), acceleration == "adaptive"
-    if isinstance(blur, UniformBlur):
-        shape = fast_shape(latent.shape)
-        latent = np.array(latent, dtype=np.float32, order="C")
-        richardson_lucy(
-            latent,
-            data,
-            reach.astype(np.float32),
-            blur.spectrum(shape),
-            np.float32(base),
-            np.float32(sensor.clip),
-            *_bend(sharpness),
-            alphas,
-            adaptive,
-            shape[1],
-            lights,
-        )
-        on_step(steps, steps)
-        return latent
-    previous, change = latent, np.zeros_like(latent)
-    for step, alpha in enumerate(alphas, start=1):
-        start = np.maximum(latent + alpha * (latent - previous), TINY)
-        predicted = np.maximum(blur.forward(start), 0.0)
-        recorded, slope = response(predicted, sensor.clip, sharpness)
-        predictable = np.maximum(recorded + base, LEAST_PREDICTED * data)
-        error = (data / np.maximum(predictable, TINY) - 1.0) * slope
-        update = 1.0 + blur.adjoint(error) / reach
-        if lights:
-            update = _split(update, error, start, blur=blur, reach=reach, clip=sensor.clip)
-        previous, latent = latent, np.maximum(start * np.maximum(update, 0.0), TINY)
-        if adaptive:
-            before, change = change, latent - start
-            alphas[step : step + 1] = _measured_alpha(change, before)
-        on_step(step, steps)
+    shape = fast_shape(latent.shape)
+    latent = np.array(latent, dtype=np.float32, order="C")
+    richardson_lucy(
+        latent,
+        data,
+        reach.astype(np.float32),
+        blur.spectrum(shape),
+        np.float32(base),
+        np.float32(sensor.clip),
+        *_bend(sharpness),
+        alphas,
+        adaptive,
+        shape[1],
+        lights,
+    )
+    on_step(steps, steps)
     return latent
-
-
-def _measured_alpha(change: Plane, before: Plane) -> float:
-    """Measure alpha of Biggs and Andrews from the last two changes g; 0 while there is only one."""
-    norm = float(np.vdot(before, before.astype(np.float64)))
-    share = float(np.vdot(change, before.astype(np.float64))) / norm if norm > 0.0 else 0.0
-    return min(max(share, 0.0), 1.0)
 
 
 @lru_cache(maxsize=8)
@@ -253,16 +227,14 @@ def background(sensor: Sensor) -> float:
     return min(sensor.noise.read / sensor.noise.shot, 1.0)
 
 
-def first_guess(blurred: Plane, blur: BlurOperator) -> tuple[Plane, Plane]:
+def first_guess(blurred: Plane, blur: UniformBlur) -> tuple[Plane, Plane]:
     """Back-projected data as a start, and the normaliser F^T 1.
 
     F^T 1 falls below 1 where part of the light fell outside the frame. It is floored: latent
     pixels that hardly touch the data must not explode; they start from the nearest data.
     """
     light = np.maximum(blurred, TINY)
-    reach = (
-        blur.covered(blurred.shape) if isinstance(blur, UniformBlur) else blur.adjoint(np.ones_like(blurred))
-    )
+    reach = blur.covered(blurred.shape)
     floor = _REACH_FLOOR * float(reach.max())
     wide = (reach.shape[0] - blurred.shape[0]) // 2
     start = np.where(
@@ -279,26 +251,6 @@ def response(light: Plane, clip: float, sharpness: float) -> tuple[Plane, Plane]
     recorded = clip * (light / clip - np.logaddexp(0.0, over) / sharpness)
     slope = 0.5 * (1.0 - np.tanh(0.5 * over))  # the logistic function without overflow
     return recorded.astype(np.float32), slope.astype(np.float32)
-
-
-def _split(
-    update: Plane, error: Plane, latent: Plane, *, blur: BlurOperator, reach: Plane, clip: float
-) -> Plane:
-    """Keep what is poorly known about lights out of the update of all other pixels."""
-    bright = latent >= _LIGHT * clip
-    if not bright.any():
-        return update
-    disc = np.hypot(*np.mgrid[-3:4, -3:4]) <= 3.0
-    hard = ndimage.binary_dilation(bright, structure=disc)
-    # A square maximum filter of the operator's reach covers the kernel without knowing its shape.
-    spread = max(latent.shape[0] - error.shape[0], 0) + 1
-    touched = ndimage.maximum_filter(hard.astype(np.uint8), size=spread, mode="constant") > 0
-    clean = blur.frame(np.asarray(~touched, dtype=np.float32))
-    calm = 1.0 + blur.adjoint(error * clean) / reach
-    soft = np.minimum(
-        ndimage.gaussian_filter(hard.astype(np.float32), 3.0, mode="constant", truncate=10 / 3), 1.0
-    )
-    return np.asarray(calm + (update - calm) * soft, dtype=np.float32)
 
 
 def _check(iterations: int) -> None:

@@ -12,21 +12,20 @@ from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS, Plane, Planes, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator, UniformBlur
+from lensmodel.correction.blur import UniformBlur, transfers
 from lensmodel.correction.clipped import Lights
 from lensmodel.correction.compiled.grain import spread_grain
 from lensmodel.correction.compiled.half_quadratic import half_quadratic
 from lensmodel.correction.compiled.tile import fill
-from lensmodel.correction.deconvolver import Restored, Sensor, Solution, uniform
+from lensmodel.correction.deconvolver import Restored, Sensor, Solution
 from lensmodel.correction.devices import chosen
 from lensmodel.correction.methods.half_quadratic_on_device import half_quadratic_on_device
 from lensmodel.correction.methods.shrinkage import Shrinkage
-from lensmodel.correction.methods.wiener import prior
+from lensmodel.correction.scene_power import prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
 from lensmodel.correction.tiles.local_statistics import BlockMeans, signal_variance, smoothed, spread_blocks
 from lensmodel.correction.tiles.mosaic import refilled
-from lensmodel.correction.tiles.transfers import transfers
 
 # Luma, and two chroma directions, orthonormal.
 _OPPONENT = np.array(
@@ -97,7 +96,7 @@ class SparseGradient:
             raise InvalidInputError(f"weights of the prior must be positive, got {self}")
 
     def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
         # as three equal colours, each of which adds its datum but not its gradients to the sum
@@ -108,8 +107,7 @@ class SparseGradient:
                 for name in ("weight", "mosaic_weight")
             },
         )
-        kernel = uniform(blur, "standard")
-        solved = alike.deconvolve_planes(np.stack([blurred] * 3), [kernel] * 3, [sensor] * 3)
+        solved = alike.deconvolve_planes(np.stack([blurred] * 3), [blur] * 3, [sensor] * 3)
         on_step(self.steps, self.steps)
         return Restored(solved.planes[0], steps=self.steps)
 

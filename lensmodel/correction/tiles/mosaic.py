@@ -11,10 +11,9 @@ from scipy import fft
 
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
-from lensmodel.correction.compiled.common import Number, Real
-from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.compiled.common import Number, Real, smooth
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.wiener import wiener_spectrum
+from lensmodel.correction.scene_power import wiener_spectrum
 from lensmodel.correction.tiles.canvas import Canvas
 
 _WINDOW: Final = 2.0

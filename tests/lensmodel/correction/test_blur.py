@@ -12,8 +12,8 @@ from lensmodel.correction.blur import (
     UniformBlur,
     crop_to_support,
     support_radius,
+    transfers,
 )
-from lensmodel.correction.tiles.transfers import transfers
 
 
 def kernels(side: int = 7) -> st.SearchStrategy[np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from lensmodel.correction.compiled.filters import smooth
+from lensmodel.correction.compiled.common import smooth
 from lensmodel.correction.compiled.grain import spread_grain
 
 LIGHT = np.array([0.3, 0.4, 0.2], dtype=np.float32)

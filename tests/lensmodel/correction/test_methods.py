@@ -7,7 +7,6 @@ import pytest
 from scipy import ndimage
 from skimage import restoration
 
-from lab.correction.filter_flow import EfficientFilterFlow
 from lab.correction.frame_window import Constant
 from lab.correction.methods import compared
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
@@ -189,14 +188,6 @@ def test_method_is_repeatable_and_leaves_its_input_alone(name: str) -> None:
 
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(blurred, before)
-
-
-@pytest.mark.parametrize("name", ["standard", "fast", "wiener", "krishnan-fergus"])
-def test_method_of_one_kernel_says_what_to_use_for_a_field(name: str) -> None:
-    flow = EfficientFilterFlow(40, 40, ((delta(3),),))
-
-    with pytest.raises(InvalidInputError, match="correct_planes"):
-        compared.create(name).deconvolve(scene(40, 40), flow, sensor=CLEAN)
 
 
 def test_unknown_method_lists_the_known_ones() -> None:

@@ -1,8 +1,9 @@
-"""One kernel for the whole plane."""
+"""Lens blur of a plane by one kernel, and its adjoint."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +13,8 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel, Plane
-from lensmodel.correction.blur.operator import support_radius
 from lensmodel.correction.compiled.common import through, transfer
+from lensmodel.correction.compiled.tile import spectra_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,3 +220,93 @@ def _moved(side: int, shift: float, reach: int) -> NDArray[np.float64]:
 def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the smallest size not below `shape` that transforms quickly."""
     return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))
+
+
+def support_radius(kernel: Kernel, energy: float = 0.999) -> int:
+    """Half side, in pixels, of the centred square that holds `energy` of the kernel's sum.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+    energy : float
+        Share in 0..1.
+
+    Returns
+    -------
+    int
+    """
+    middle = kernel.shape[0] // 2
+    t = np.abs(np.arange(kernel.shape[0]) - middle)
+    ring = np.maximum(t[:, None], t[None, :])
+    held = np.cumsum(np.bincount(ring.ravel(), weights=kernel.ravel()))
+    return int(np.searchsorted(held, energy * held[-1]))
+
+
+def crop_to_support(kernel: Kernel, energy: float = 0.999) -> Kernel:
+    """Cut a kernel to its support; the middle pixel stays the middle, the sum is 1 again.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+    energy : float
+        Share of the sum that the support holds, 0..1.
+
+    Returns
+    -------
+    Kernel, shape (s, s)
+        s odd, at most k.
+    """
+    middle, radius = kernel.shape[0] // 2, support_radius(kernel, energy)
+    return as_kernel(kernel[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1])
+
+
+Transfers = tuple[NDArray[np.complex64], NDArray[np.complex64]]
+
+
+def transfers(
+    blurs: Sequence[UniformBlur],
+    shape: tuple[int, int],
+    reach: float,
+    *,
+    drifting: bool = True,
+) -> Transfers:
+    """Return K, `(channel, rows, cols)`, and its change per pixel, `(channel, 2, rows, cols)`.
+
+    The latter is empty where a kernel has none or `drifting` is false. Each step of a solver inverts K
+    alone and takes the change to the other side, as data. That converges only where the change is
+    smaller than K, so it is limited to half of K at `reach` pixels from the middle.
+    """
+    taps = _taps(blurs, drifting=drifting)
+    half = shape[1] // 2 + 1
+    K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
+    rates = np.empty((len(taps) if taps.shape[1] > 1 else 0, 2, shape[0], half), dtype=np.complex64)
+    spectra_of(taps, np.float32(reach), shape[1], K, rates)
+    return K, rates
+
+
+def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32]:
+    """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
+    drifts = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
+    drifting = drifting and len(drifts) == len(blurs)
+    kernels = [blur.taps for blur in blurs]
+    ends = [
+        [(before.taps, after.taps, max(pixels, 1.0)) for before, after, pixels in pair] for pair in drifts
+    ]
+    sides = [kernel.shape[0] for kernel in kernels]
+    if drifting:
+        sides += [end.shape[0] for pair in ends for both in pair for end in both[:2]]
+    side = max(sides)
+    taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
+
+    def place(channel: int, index: int, kernel: NDArray[np.float32], factor: float) -> None:
+        low = (side - kernel.shape[0]) // 2
+        taps[channel, index, low : side - low, low : side - low] += factor * kernel
+
+    for c, kernel in enumerate(kernels):
+        place(c, 0, kernel, 1.0)
+    if drifting:
+        for c, pair in enumerate(ends):
+            for index, (before, after, pixels) in enumerate(pair, start=1):
+                place(c, index, before, -1.0 / pixels)
+                place(c, index, after, 1.0 / pixels)
+    return taps

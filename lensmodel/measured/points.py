@@ -10,17 +10,10 @@ colour are left out. Places c_i and fluxes f_i are refined between two solutions
 saturated pixel is refused whole: its neighbours hold what ran over. Each pixel is weighted by its own noise,
 from the sky and the light that the previous kernel predicts there: most pixels of a point are dark, so that
 the mean noise is right for none of them.
-
-Points of light in a photo: by SEP where installed, else by our own search.
-
-Both only say where lights may be; which of them are isolated, unsaturated and single is decided here,
-alike for both, and places are refined when the PSF is solved for.
 """
 
 from __future__ import annotations
 
-import importlib.util
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -54,7 +47,6 @@ class Points:
 
     across: int = 7  # cells of the frame; the points of a cell are stacked
     down: int = 5
-    detector: str = "auto"  # "auto" or "own", see `find_lights`
 
     name: ClassVar[str] = "points"
     version: ClassVar[int] = 1
@@ -72,7 +64,7 @@ class Points:
         require_photos(self, photos)
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
-        lights = isolated_lights(find_lights(plane, self.detector), size)
+        lights = isolated_lights(find_lights(plane), size)
         usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
         cells: dict[tuple[int, int], list[PointLight]] = {}
         for light in usable:
@@ -217,7 +209,6 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
     return replace(stamp, place=place, flux=stamp.flux * float(terms[0]))
 
 
-logger = logging.getLogger(__name__)
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
 # Of its flux, that another light beside it may have: a fainter one is an error like those of noise (chosen)
 _NEIGHBOUR: Final = 0.1
@@ -257,34 +248,13 @@ def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     return sky, max(scatter, 1e-7)
 
 
-def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[PointLight]:
-    """Find points of light, brightest first: by SEP where it is installed, unless `detector` is "own"."""
+def find_lights(plane: NDArray[np.floating]) -> list[PointLight]:
+    """Find points of light, brightest first.
+
+    They are the highest of their 5 x 5 neighbours after a little smoothing, at the centroid of 5 x 5 pixels.
+    """
     sky, scatter = sky_of(plane)
-    clean = np.ascontiguousarray(plane - sky, dtype=np.float64)
-    if detector == "auto" and importlib.util.find_spec("sep") is not None:
-        rows = importlib.import_module("sep").extract(clean, _SIGMAS / 2, err=scatter, minarea=4)
-        lights = [PointLight(float(r["y"]), float(r["x"]), float(r["peak"])) for r in rows]
-    else:
-        logger.info("pip install 'lensmodel[stars]' finds faint and crowded lights better")
-        lights = _by_maxima(clean, scatter)
-    return sorted(lights, key=lambda light: -light.peak)
-
-
-def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
-    """Lights that have no other beside them that would disturb, within `reach` pixels."""
-    places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
-    peaks = np.array([light.peak for light in lights])
-    kept = []
-    for number, light in enumerate(lights):
-        away = np.abs(places - places[number]).max(axis=1)
-        near = (away < reach) & (peaks > _NEIGHBOUR * light.peak)
-        if near.sum() == 1:
-            kept.append(light)
-    return kept
-
-
-def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[PointLight]:
-    """Highest of their 5 x 5 neighbours after a little smoothing, with the centroid of 5 x 5 pixels."""
+    clean = plane - sky
     smooth = ndimage.gaussian_filter(clean, 1.0)
     # smoothing by sigma 1 leaves 1 / (2 sqrt(pi)) of the scatter of white noise
     peaks = (smooth == ndimage.maximum_filter(smooth, 5)) & (
@@ -304,4 +274,17 @@ def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[PointLight]:
                 float(clean[row - 1 : row + 2, col - 1 : col + 2].max()),
             )
         )
-    return lights
+    return sorted(lights, key=lambda light: -light.peak)
+
+
+def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
+    """Lights that have no other beside them that would disturb, within `reach` pixels."""
+    places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
+    peaks = np.array([light.peak for light in lights])
+    kept = []
+    for number, light in enumerate(lights):
+        away = np.abs(places - places[number]).max(axis=1)
+        near = (away < reach) & (peaks > _NEIGHBOUR * light.peak)
+        if near.sum() == 1:
+            kept.append(light)
+    return kept

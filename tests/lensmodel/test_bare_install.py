@@ -16,7 +16,7 @@ LIBRARY = Path(__file__).parents[2] / "docs" / "library.md"
 ABSENT = [
     *("alembic", "dbos", "fastapi", "httpx2", "jinja2", "obstore", "prometheus_client", "pydantic"),
     *("pydantic_settings", "sqlalchemy", "sse_starlette", "starlette", "structlog", "uvicorn"),
-    *("astropy", "distributed", "matplotlib", "sep", "skimage", "sklearn"),
+    *("astropy", "distributed", "matplotlib", "skimage", "sklearn"),
 ]
 """What the extras bring, as it is imported."""
 

@@ -225,20 +225,18 @@ def test_a_photo_without_a_target_is_refused() -> None:
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
     scene = targets.light_scene(60, SHAPE, np.random.default_rng(3))[1]
     photo = photo_of(scene, lopsided())
-    found = Points(across=2, down=2, detector="own").measure([photo], size=21, channels=("g",))
+    found = Points(across=2, down=2).measure([photo], size=21, channels=("g",))
     errors = [distance(one.kernel, lopsided()).rel_l2 for one in found]
     assert len(found) == 4
     assert max(errors) < 0.06
-    lit = Points(across=2, down=2, detector="own").measure(
-        [photo_of(scene + 0.27, lopsided())], size=21, channels=("g",)
-    )
+    lit = Points(across=2, down=2).measure([photo_of(scene + 0.27, lopsided())], size=21, channels=("g",))
     assert (
         max(distance(one.kernel, lopsided()).rel_l2 for one in lit) < 0.15
     )  # 100 times the light of the sky
     assert min(one.error for one in lit) > max(one.error for one in found)
     bright = photo_of(40.0 * scene, lopsided())
     with pytest.raises(NotEnoughEvidenceError, match="expose less"):
-        Points(detector="own").measure([bright], size=21)
+        Points().measure([bright], size=21)
 
 
 def test_lights_beside_others_are_left_out() -> None:
@@ -246,7 +244,7 @@ def test_lights_beside_others_are_left_out() -> None:
     for row, col in ((40, 40), (40, 48), (80, 120)):
         plane[row - 8 : row + 9, col - 8 : col + 9] += gaussian(17, np.eye(2))
     plane += np.random.default_rng(0).normal(0, 1e-4, plane.shape)
-    lights = find_lights(plane, "own")
+    lights = find_lights(plane)
     assert len(lights) == 3
     assert [(round(one.row), round(one.col)) for one in isolated_lights(lights, 21)] == [(80, 120)]
 

@@ -13,14 +13,10 @@ far as that outweighs the data; else it comes out with a checkerboard of its own
 Closed lenses are not perfect. What they blur besides diffraction is missing in k, and `FLOOR` says how
 much that is as a rule.
 
-The transfer function of a lens that only diffracts, in front of square pixels.
-
-How strong noise can be at most: the finest detail of the quietest place of a photo.
-
 Where a scene has detail everywhere, as one for an aperture pair should, no flat place shows the noise, and
-detail passes for noise: of a simulated scene of leaves and grain `photo.estimate_noise` said sixty times too
-much. Noise is also in the finest detail of the quietest place, with whatever scene is there: the power there
-is an upper bound; a photo taken wide open, whose lens took the finest detail away, comes close to it.
+detail passes for noise: behind leaves and grain five times as much is estimated, which doubles the error of
+kernels. Noise is also in the finest detail of the quietest place, with whatever scene is there: the power
+there is an upper bound; a photo taken wide open, whose lens took the finest detail away, comes close to it.
 """
 
 from __future__ import annotations
@@ -131,7 +127,7 @@ class AperturePair:
         half = self.side // 2
         corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
         for degree in (1, 1, 3):
-            warp, _ = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
+            warp = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
         return warp
 
     def _window(

@@ -67,12 +67,9 @@ class Warp:
 
     def scale(self, row: float, col: float) -> float:
         """How many units of the reference a pixel takes, along the axis where it takes most."""
-        return float(np.linalg.norm(self.jacobian(row, col), 2))
-
-    def jacobian(self, row: float, col: float) -> NDArray[np.float64]:
-        """Derivative of the place by the pixel, (2, 2)."""
         r, c = self(np.array([row + 0.5, row - 0.5, row, row]), np.array([col, col, col + 0.5, col - 0.5]))
-        return np.array([[r[0] - r[1], r[2] - r[3]], [c[0] - c[1], c[2] - c[3]]])
+        derivative = [[r[0] - r[1], r[2] - r[3]], [c[0] - c[1], c[2] - c[3]]]
+        return float(np.linalg.norm(derivative, 2))
 
     def moved(self, pixels: NDArray[np.float64], shifts: NDArray[np.float64], degree: int) -> Warp:
         """Bend the warp so that the reference shows up `shifts` further in the photo at `pixels`."""
@@ -166,7 +163,7 @@ def matched(
     *,
     least_clarity: float,
     degree: int,
-) -> tuple[Warp, int]:
+) -> Warp:
     """Bend a warp to the matches of all windows that are clear."""
     pixels, shifts = [], []
     for row, col in corners:
@@ -181,7 +178,7 @@ def matched(
             "flat, in focus and without anything before it"
         )
     most = max(d for d in range(degree + 1) if len(_powers(d)) * 2 <= max(len(pixels), 2))
-    return warp.moved(np.array(pixels), np.array(shifts), most), len(pixels)
+    return warp.moved(np.array(pixels), np.array(shifts), most)
 
 
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across

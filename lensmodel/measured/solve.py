@@ -148,7 +148,6 @@ class Solved:
     kernel: Kernel  # (k, k), not centred
     # sum of the kernel before it was normalised: what the latent picture must be multiplied with
     light: float
-    offset: float  # the mean of c
     shift: tuple[float, float]  # its centre of mass, (row, col) pixels from the middle
     error: float  # expected relative L2
     misfit: float  # mean squared residual over that of the noise: q
@@ -222,7 +221,6 @@ def solve(
     return Solved(
         kernel=kernel,
         light=light,
-        offset=_weighted_mean(observed, weight) - float(_means_of_latent(latent, weight, size) @ k),
         shift=(off[0] + moved[0], off[1] + moved[1]),
         error=_error_of(eq.a + np.diag(prior), k),
         misfit=misfit,
@@ -319,24 +317,6 @@ def _normal_equations(
         b += x.T @ y
         power += float(y @ y)
     return a, b, power
-
-
-def _weighted_mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
-    """Return the mean of values that count by their weight."""
-    return float((values * weight).sum() / weight.sum())
-
-
-def _means_of_latent(
-    latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
-) -> NDArray[np.float64]:
-    """Return the weighted mean of x(p - u) for each u, in the order of the kernel's values."""
-    height, width = weight.shape
-    means = np.empty((size, size))
-    for i in range(size):
-        for j in range(size):
-            part = latent[size - 1 - i : size - 1 - i + height, size - 1 - j : size - 1 - j + width]
-            means[i, j] = np.vdot(part, weight)
-    return means.ravel() / weight.sum()
 
 
 def _stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:

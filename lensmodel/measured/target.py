@@ -125,7 +125,7 @@ class Target:
         ]
         warp = placed.warp
         for degree in (1, 3, 5, 5):
-            warp, _ = matched(
+            warp = matched(
                 warp, partial(_light, placed.page), plane, corners, side, least_clarity=_CLEAR, degree=degree
             )
         return replace(placed, warp=warp)

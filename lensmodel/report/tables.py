@@ -47,13 +47,8 @@ def to_csv(report: LensReport) -> str:
     if report.lateral is not None:
         for channel, values in (("r", report.lateral.red), ("b", report.lateral.blue)):
             for r, value in zip(report.lateral.radii, values, strict=True):
-                row = {
-                    "quantity": "lateral colour",
-                    "channel": channel,
-                    "r": _number(r),
-                    "value": _number(value),
-                }
-                writer.writerow(row | {"unit": "px"})
+                known = {"quantity": "lateral colour", "channel": channel, "unit": "px"}
+                writer.writerow(known | {"r": _number(r), "value": _number(value)})
     return out.getvalue()
 
 

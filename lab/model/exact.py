@@ -27,6 +27,7 @@ from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import variables as va
+from lensmodel.model.bandwidths import reference_bandwidth
 
 
 def pixel_to_local(
@@ -134,7 +135,7 @@ class PaperModel:
         d, n = 4 + len(varying), len(points)
         sigma = points.std(axis=0)
         sigma[3:5] = np.sqrt((sigma[3:5] ** 2).mean())  # one bandwidth for the circle
-        scale = np.array([va.reference_bandwidth(max(float(s), 1e-6), d, n) for s in sigma])
+        scale = np.array([reference_bandwidth(max(float(s), 1e-6), d, n) for s in sigma])
         return cls(cKDTree(points / scale), np.concatenate(values), scale, tuple(varying), neighbours)
 
     def kernel_at_settings(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:

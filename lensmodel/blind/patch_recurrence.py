@@ -16,7 +16,6 @@ with the third power of the side and not with the fourth, see `window_products`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,10 +30,8 @@ from scipy import fft, ndimage
 from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
-from lensmodel.core.psf import as_kernel, otf, resized
+from lensmodel.core.psf import as_kernel, delta, otf, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
-
-log = logging.getLogger(__name__)
 
 _BORDER = 3
 """Pixels left out along the rim: fewer patches overlap there (chosen)."""
@@ -49,6 +46,7 @@ _COMPONENTS = 10
 """By which neighbours are found: they hold nearly all of a patch's power (chosen)."""
 _NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
 
+_LEAST_SIDE = 5  # pixels of a kernel on the coarsest level (chosen)
 _STRIDE = 2  # pixels from patch to patch: every pixel is in several (chosen)
 _TOLERANCE = 0.5  # by what share a match may be farther than the nearest one: exact search is slower (chosen)
 
@@ -233,7 +231,6 @@ class PatchRecurrence:
     beta: float = 0.2  # weight of the matched image in the image step; too large makes kernels too wide
     bandwidth: float = 0.03  # h of the match, in ranges of the patch; at least twice the noise
     ridge: float = 2.5e-2  # lambda2 over the mean diagonal of the normal matrix
-    support: int | None = None  # odd side of the estimated kernel; None takes it from `size`
 
     name = "michaeli-irani"
     version = 1
@@ -273,22 +270,21 @@ class PatchRecurrence:
     ) -> PsfEstimate:
         kept = usable(patches, noise, size)
         scaled = [_Scaled.of(patch, model) for patch, model in kept]
-        widest = self.support or size
         while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
             levels -= 1
-        kernel, latent = start, [view.y for view in (s.at(levels - 1) for s in scaled)]
+        kernel = delta(_LEAST_SIDE) if start is None else start
+        latent = [view.y for view in (s.at(levels - 1) for s in scaled)]
         total, done = levels * self.iterations, 0
         for level in reversed(range(levels)):
-            side = max(5, _odd(widest / ALPHA**level))
+            side = max(_LEAST_SIDE, _odd(size / ALPHA**level))
             views = [s.at(level) for s in scaled]
-            kernel = _start(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
+            kernel = resized(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
             latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
             for _ in range(self.iterations):
                 kernel = self._step(views, latent, kernel, side)
                 done += 1
                 on_step(done, total)
-        report = {"support": float(widest), "levels": float(levels)}
-        assert kernel is not None, "there is a level, and an iteration on it"
+        report = {"support": float(size), "levels": float(levels)}
         return finished(kernel, size=size, error=_ERROR, diagnostics=report)
 
     def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> Kernel:
@@ -352,18 +348,8 @@ def _odd(value: float) -> int:
     return 2 * round((value - 1) / 2) + 1
 
 
-def _start(kernel: Kernel | None, side: int) -> Kernel:
-    if kernel is None:
-        delta = np.zeros((side, side))
-        delta[side // 2, side // 2] = 1.0
-        return as_kernel(delta)
-    return resized(kernel, side)
-
-
-def _upscaled(kernel: Kernel | None, side: int) -> Kernel:
+def _upscaled(kernel: Kernel, side: int) -> Kernel:
     """Stretch a kernel to the next finer level."""
-    if kernel is None:
-        return _start(None, side)
     grown = round(kernel.shape[0] * ALPHA)
     fine = np.maximum(resized_image(np.asarray(kernel), (grown + 1 - grown % 2,) * 2), 0.0)
     return resized(as_kernel(fine), side)

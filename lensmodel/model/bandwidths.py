@@ -1,4 +1,4 @@
-"""What samples say of each other: bandwidths, robust weights and held-out errors, by leaving one photo out.
+"""Bandwidths by eq. (8) of the paper and by leaving one photo out; with that robust weights, held-out errors.
 
 Every answer is a linear combination f_i = sum_j w_ij C_j, so the squared error of all held-out
 samples follows from the Gram matrix G = C C' alone::
@@ -20,8 +20,9 @@ psi is Tukey's biweight; a sample that fits better than the median keeps its wei
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,18 @@ from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.local_frame import LocalKernels
+
+FALLBACK: Final[Mapping[str, float]] = {
+    "aperture_stops": 0.5,
+    "wavelength_nm": 20.0,  # red and green differ by 70 nm: 0.2 percent of each other's weight
+    "focal_octaves": 0.25,
+    "focus_dioptres": 0.5,
+}
+"""Bandwidths of settings that do not vary among the samples, and upper limits of those that do."""
+
+_FLOOR_R, _FLOOR_PHI = 0.02, 0.12  # least bandwidths: blur does not change faster over the field (chosen)
+_SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
+_PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
 
 MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 """Of the bandwidth by the rule: in steps of a root of two, in which errors hardly differ (chosen)."""
@@ -51,6 +64,44 @@ _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statis
 _ROUNDS = 4  # of reweighting: each costs as much, and later ones change the weights less (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
 _SPOILT = 0.5  # factor below which a photo is spoilt: it counts for less than half of its claim (chosen)
+
+
+def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
+    """Bandwidth by the normal reference rule, h = sigma (4 / ((d + 2) n))^(1 / (d + 4)), eq. (8)."""
+    return sigma * (4.0 / ((dimensions + 2) * max(count, 1))) ** (1.0 / (dimensions + 4))
+
+
+def by_rule(where: NDArray[np.float64]) -> dict[str, float]:
+    """Bandwidths of place and settings by eq. (8), apart from those of (u, v).
+
+    n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
+    about another place. d counts the place and those settings that vary.
+    """
+    _, counts = np.unique(where[:, 4], return_counts=True)
+    varying = [3, 5, 6]
+    spread = {column: float(np.nanstd(_known(where[:, column]))) for column in varying}
+    d = 2 + sum(value > _SAME for value in spread.values())
+    n = int(counts.max())
+    bandwidths = {
+        "r": max(_PLACE_SHARE * reference_bandwidth(float(where[:, 0].std()), d, n), _FLOOR_R),
+        "phi": max(_PLACE_SHARE * reference_bandwidth(math.sqrt(0.5), d, n), _FLOOR_PHI),
+        **FALLBACK,
+    }
+    for column, sigma in spread.items():
+        name = va.COLUMNS[column]
+        if sigma > _SAME:
+            bandwidths[name] = min(FALLBACK[name], reference_bandwidth(sigma, d, n))
+    return bandwidths
+
+
+def _of_support(widths: Mapping[str, float]) -> dict[str, float]:
+    """Bandwidths of eq. (8) itself: by them one tells near from far, whatever smoothing is best."""
+    return {**widths, "r": widths["r"] / _PLACE_SHARE, "phi": widths["phi"] / _PLACE_SHARE}
+
+
+def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    known = values[~np.isnan(values)]
+    return known if known.size else np.zeros(1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +250,7 @@ class CrossValidation:
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
     """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
-    bandwidths = rule = va.support_widths(rule) if settings.mode == PAPER else dict(rule)
+    bandwidths = rule = _of_support(rule) if settings.mode == PAPER else dict(rule)
     bandwidths["r"] = settings.r or rule["r"] * choice.r
     bandwidths["phi"] = settings.phi or rule["phi"] * choice.phi
     bandwidths["aperture_stops"] = settings.stops or rule["aperture_stops"]
@@ -233,7 +284,7 @@ def cross_validate(
     base: NDArray[np.float64],
 ) -> CrossValidation:
     """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
-    rule = va.bandwidths(where)
+    rule = by_rule(where)
     names, photo = np.unique([s.photo for s in samples], return_inverse=True)
     counting = np.flatnonzero(base > 0)
     several = len(np.unique(photo[counting])) >= 2

@@ -26,7 +26,7 @@ from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import camera_bodies, support
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
-from lensmodel.model.bandwidths import CrossValidation, bandwidth, cross_validate
+from lensmodel.model.bandwidths import CrossValidation, bandwidth, by_rule, cross_validate
 from lensmodel.model.local_frame import LocalKernels
 from lensmodel.model.neighbours import Answers, Neighbourhood
 from lensmodel.model.widths import WidthField
@@ -71,7 +71,7 @@ class Regression:
             widths = WidthField.fit(common, validation.weights)
             local = local.rescaled(points, widths)
             validation = cross_validate(common, settings, local, points, base)
-        used = bandwidth(va.bandwidths(points), settings, validation.choice)
+        used = bandwidth(by_rule(points), settings, validation.choice)
         return cls(
             pitch_um,
             widths,

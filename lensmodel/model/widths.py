@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, second_moments
-from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
+from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 
 # Of 1, r, r^2, then the rest: weak, only against too few samples (chosen)
@@ -33,8 +33,6 @@ _HUBER = 0.15  # of a logarithm of the width: the scatter of estimates (chosen)
 _MIN_SAMPLES = 6  # below, widths are carried nowhere: the fit over the field has more terms (chosen)
 _MOST = 3000  # samples: the cost of the fit grows with them (chosen)
 _ROUNDS = 4  # of reweighting: each costs as much, and later ones change less (chosen)
-
-Scale = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +50,8 @@ class WidthField:
         if not np.isfinite((self.reference, self.stops, self.focal, self.wavelength)).all():
             raise InvalidInputError(f"the origins of a width field must be finite, got {self}")
 
-    def at(self, position: FieldPosition, settings: LensSettings) -> Scale:
-        """Widths along u and v at a place, over the reference width; kept within 0.45 and 2.5."""
-        u, v = self.over(va.point(position, settings)[None])[0]
-        return float(u), float(v)
-
     def over(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Widths of `at` for points `(n, 7)` of `variables`, shape (n, 2)."""
+        """Widths along u and v at points `(n, 7)` of `variables`, over the reference width, shape (n, 2)."""
         if self.slopes is None:
             return np.ones((len(where), 2))
         # no matrix product: how that rounds hangs on how many places are asked for at once

@@ -110,13 +110,10 @@ def relation_features(
     sample_xy: NDArray[np.floating],
     sample_settings: NDArray[np.floating],
 ) -> NDArray[np.float32]:
-    """How each sample lies to each query, (..., q, 2), (..., q, SETTINGS), (..., n, 2), (..., n, SETTINGS).
+    """How each sample lies to each query, as float32 of shape (..., q, n, RELATION).
 
-    Returns
-    -------
-    ndarray of float32, shape (..., q, n, RELATION)
-        The first `DISTANCES` are squared distances: in the plane, along the radius, in log f-number, focal
-        length and focus.
+    Of places (..., q, 2) and settings (..., q, SETTINGS) of queries and samples. The first `DISTANCES` are
+    squared distances: in the plane, along the radius, in log f-number, focal length and focus.
     """
     octants = octant_of(query_xy)
     at = to_octant_place(octants, query_xy)[..., :, None, :]

@@ -69,18 +69,11 @@ def outer_cells() -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Memory:
-    """Samples as the queries see them: places, settings, and keys and values of each attention.
+    """Samples as the queries see them: places, settings, and keys and values of each attention."""
 
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-    settings : ndarray, shape (n, SETTINGS)
-    keys, values : ndarray of float32, shape (blocks, heads, n, width)
-    """
-
-    xy: NDArray[np.float64]
-    settings: NDArray[np.float64]
-    keys: Array
+    xy: NDArray[np.float64]  # (n, 2)
+    settings: NDArray[np.float64]  # (n, SETTINGS)
+    keys: Array  # (blocks, heads, n, width)
     values: Array
 
     def part(self, index: NDArray[np.int64]) -> Memory:
@@ -90,23 +83,14 @@ class Memory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldAnswer:
-    """The PSF at a place and settings.
+    """The PSF at a place and settings."""
 
-    Parameters
-    ----------
-    kernels : ndarray of float64, shape (3, SIDE, SIDE)
-        Of red, green and blue; non-negative, of sum 1, centre of mass in the middle.
-    error : ndarray of float64, shape (3,)
-        Expected relative L2 distance to the true kernels.
-    ring_error : ndarray of float64, shape (3, RINGS)
-        Expected r.m.s. error of the transfer function in each ring of frequency.
-    weights : ndarray of float64, shape (n,)
-        How much each sample counted, of sum 1: the mean over the attention of all blocks and heads.
-    """
-
+    # (3, SIDE, SIDE), of red, green and blue; non-negative, of sum 1, centre of mass in the middle
     kernels: NDArray[np.float64]
-    error: NDArray[np.float64]
+    error: NDArray[np.float64]  # (3,), expected relative L2 distance to the true kernels
+    # (3, RINGS), expected r.m.s. error of the transfer function in each ring of frequency.
     ring_error: NDArray[np.float64]
+    # (n,), how much each sample counted, of sum 1: the mean over the attention of all blocks and heads
     weights: NDArray[np.float64]
 
 
@@ -121,20 +105,11 @@ def _softmax(x: Array, axis: int = -1) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldNetwork:
-    """Encoder and decoder with their weights; see the module.
-
-    Parameters
-    ----------
-    weights : mapping of str to ndarray of float32
-    provenance : mapping
-        Of the weights: code, seeds, population, figures.
-    name : str
-        Fingerprint of the weights.
-    """
+    """Encoder and decoder with their weights; see the module."""
 
     weights: Mapping[str, Array]
-    provenance: Mapping[str, Any]
-    name: str
+    provenance: Mapping[str, Any]  # of the weights: code, seeds, population, figures
+    name: str  # fingerprint of the weights
 
     @classmethod
     def load(cls) -> FieldNetwork:
@@ -143,13 +118,7 @@ class FieldNetwork:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> FieldNetwork:
-        """Read weights: npz of float16 with a JSON text of their provenance, as `lab.population` writes.
-
-        Raises
-        ------
-        InvalidInputError
-            If they are of another network.
-        """
+        """Read weights: npz of float16 with a JSON text of their provenance, as `lab.population` writes."""
         with np.load(BytesIO(data)) as stored:
             provenance = json.loads(bytes(stored["provenance"]).decode())
             weights = {n: stored[n].astype(np.float32) for n in stored.files if n != "provenance"}
@@ -199,26 +168,10 @@ class FieldNetwork:
     def encode(
         self, statistics: NDArray[np.floating], xy: NDArray[np.floating], conditions: Conditions
     ) -> NDArray[np.float32]:
-        """Tokens of the patches of one photo.
+        """Tokens (n, d) of the patches of one photo, whose order does not matter to any of them.
 
-        Parameters
-        ----------
-        statistics : ndarray, shape (n, LENGTH)
-            Of `patch_statistics`, turned by `to_octant`.
-        xy : ndarray, shape (n, 2)
-            Places in half diagonals, x to the right, y upwards.
-        conditions : Conditions
-            Of the photo.
-
-        Returns
-        -------
-        ndarray of float32, shape (n, d)
-            In the order of the patches; that order does not matter to any of them.
-
-        Raises
-        ------
-        InvalidInputError
-            If shapes do not fit, or a value is not finite.
+        `statistics` (n, LENGTH) are those of `patch_statistics`, turned by `to_octant`; `xy` (n, 2) places in
+        half diagonals, x to the right, y upwards.
         """
         statistics, xy = np.asarray(statistics, np.float32), np.asarray(xy, np.float64)
         if statistics.ndim != 2 or statistics.shape[1] != LENGTH or xy.shape != (len(statistics), 2):
@@ -241,19 +194,7 @@ class FieldNetwork:
     def memory(
         self, tokens: NDArray[np.floating], xy: NDArray[np.floating], conditions: Sequence[Conditions]
     ) -> Memory:
-        """Keys and values of samples of any photos; they do not depend on what will be asked.
-
-        Parameters
-        ----------
-        tokens : ndarray, shape (n, d)
-        xy : ndarray, shape (n, 2)
-        conditions : sequence of Conditions, n
-
-        Raises
-        ------
-        NoSamplesError
-            If there are none.
-        """
+        """Keys and values of samples (n, d) of any photos; they do not depend on what will be asked."""
         if not len(tokens):
             raise NoSamplesError("no sample of the lens; calibrate it with photos first")
         tokens = np.asarray(tokens, np.float32)
@@ -264,20 +205,7 @@ class FieldNetwork:
         )
 
     def query(self, memory: Memory, xy: NDArray[np.floating], conditions: Conditions) -> FieldAnswer:
-        """Answer at one place.
-
-        Parameters
-        ----------
-        memory : Memory
-        xy : ndarray, shape (2,)
-            Place in half diagonals, x to the right, y upwards.
-        conditions : Conditions
-            What is asked for.
-
-        Returns
-        -------
-        FieldAnswer
-        """
+        """Answer at a place, shape (2,) in half diagonals, x to the right, y upwards, as it is asked for."""
         place, rows = np.asarray(xy, np.float64)[None], conditions.row()[None]
         x = np.concatenate([place_features(place), condition_features(rows)], -1)
         x = self._linear("ask.1", _gelu(self._linear("ask.0", x)))

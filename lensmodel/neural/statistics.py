@@ -239,18 +239,9 @@ def patch_statistics(
 
 
 def to_octant(statistics: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Turn statistics into the frame of the octant of their place.
+    """Turn statistics (n, LENGTH) of `patch_statistics` into the frames of the octants of their places.
 
-    Parameters
-    ----------
-    statistics : ndarray of float32, shape (n, LENGTH)
-        As `patch_statistics` gives them.
-    xy : ndarray of float, shape (n, 2)
-        Places in half diagonals, x to the right, y upwards.
-
-    Returns
-    -------
-    ndarray of float32, shape (n, LENGTH)
+    `xy` (n, 2) are in half diagonals, x to the right, y upwards.
     """
     octants = octant_of(np.asarray(xy))
     out = np.empty_like(statistics)

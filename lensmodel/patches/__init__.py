@@ -3,12 +3,11 @@
 from lensmodel.patches.checks import LEAST_PARTS, LEAST_PATCHES, require_enough
 from lensmodel.patches.rmap import r_map
 from lensmodel.patches.select import RMapSelector, Selector, select, selectors
-from lensmodel.patches.windows import REASONS, Patch, Reason, Rejection, Selection
+from lensmodel.patches.windows import Patch, Reason, Rejection, Selection
 
 __all__ = [
     "LEAST_PARTS",
     "LEAST_PATCHES",
-    "REASONS",
     "Patch",
     "RMapSelector",
     "Reason",

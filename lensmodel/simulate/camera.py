@@ -21,14 +21,12 @@ from scipy.interpolate import CubicSpline
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes, StepHook, ignore_step
+from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes
 from lensmodel.photo.dng import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
 logger = logging.getLogger(__name__)
-
-_BITS: Final = (8, 16)  # of the raw files that cameras write
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,6 @@ class SimulatedCamera:
     pitch_um: float = 4.5  # pixel pitch in micrometres
     full_well_electrons: float = 20000.0  # electrons at the white level; a higher ISO means fewer
     read_noise: float = 4.0  # standard deviation in electrons
-    bits: int = 14  # of the mosaic's numbers
     black: int = 512  # black and white level
     white: int = 15872
     pattern: str = "RGGB"  # colours of the 2 x 2 pattern, row by row
@@ -59,10 +56,9 @@ class SimulatedCamera:
             raise InvalidInputError(
                 f"pattern must be one of {', '.join(BAYER_PATTERNS)}, got {self.pattern!r}"
             )
-        if not _BITS[0] <= self.bits <= _BITS[1] or not 0 <= self.black < self.white < 2**self.bits:
+        if not 0 <= self.black < self.white < 2**16:
             raise InvalidInputError(
-                f"levels must satisfy 0 <= black < white < 2^bits with 8 to 16 bits, got black {self.black}, "
-                f"white {self.white}, {self.bits} bits"
+                f"levels must satisfy 0 <= black < white < 2^16, got {self.black}, {self.white}"
             )
         if not (self.full_well_electrons > 0 and self.read_noise >= 0 and 0.5 <= self.pitch_um <= 50.0):
             raise InvalidInputError(
@@ -110,29 +106,17 @@ class SimulatedCamera:
 
     def mosaic(self, planes: Planes, rng: np.random.Generator | None) -> NDArray[np.uint16]:
         """Raw numbers of the light `planes` (sensor values, saturation 1); no noise without `rng`."""
-        self._check(planes)
-        light = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
-        return self._numbers(self._noisy(light, rng))
-
-    def _check(self, planes: Planes) -> None:
         expected = (len(CHANNELS), self.height, self.width)
         if planes.shape != expected:
             raise InvalidInputError(f"planes must have the camera's shape {expected}, got {planes.shape}")
-
-    def _noisy(
-        self, light: NDArray[np.float32], rng: np.random.Generator | None
-    ) -> NDArray[np.float32] | NDArray[np.float64]:
-        if rng is None:
-            return light
-        electrons = rng.poisson(np.maximum(light, 0.0) * self.full_well_electrons).astype(np.float64)
-        electrons += rng.normal(0.0, self.read_noise, light.shape)
-        return electrons / self.full_well_electrons
-
-    def _numbers(self, level: NDArray[np.floating]) -> NDArray[np.uint16]:
+        level: NDArray[np.floating] = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
+        if rng is not None:
+            electrons = rng.poisson(np.maximum(level, 0.0) * self.full_well_electrons).astype(np.float64)
+            electrons += rng.normal(0.0, self.read_noise, level.shape)
+            level = electrons / self.full_well_electrons
         # a full well clips at the white level; read noise may fall below the black level
-        return np.clip(np.rint(self.black + level * (self.white - self.black)), 0, self.white).astype(
-            np.uint16
-        )
+        numbers = np.rint(self.black + level * (self.white - self.black))
+        return np.clip(numbers, 0, self.white).astype(np.uint16)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,14 +141,13 @@ def photograph(
     *,
     exposure: float = 1.0,
     options: BlurOptions | None = None,
-    on_step: StepHook = ignore_step,
 ) -> SimulatedPhoto:
     """Take a photo: blur (`blurred`), exposure, colour response, noise, clipping, mosaic."""
     if not (math.isfinite(exposure) and exposure > 0):
         raise InvalidInputError(f"exposure must be positive, got {exposure}")
     options = replace(options or BlurOptions(), pitch_um=camera.pitch_um)
     frame = camera.frame
-    clean = blurred(scene, lens, settings, frame, options, on_step=on_step)
+    clean = blurred(scene, lens, settings, frame, options)
     clean = camera.balanced(clean * np.float32(exposure))
     sharp = _with_margin(scene, frame, 0)
     logger.info("simulated photo of %s at f/%s", lens.model, settings.aperture)
@@ -206,8 +189,6 @@ def blurred(
     settings: LensSettings,
     frame: Frame,
     options: BlurOptions | None = None,
-    *,
-    on_step: StepHook = ignore_step,
 ) -> Planes:
     """Blur a scene `(3, H + 2 m, W + 2 m)` as the lens does: every point becomes the kernel of its place.
 
@@ -232,27 +213,18 @@ def blurred(
     padded = _with_margin(scene, frame, half)
     grid = _Grid.over(padded.shape[1:], frame, options.step)
     out = np.zeros((3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half), dtype=np.float32)
-    total = len(CHANNELS) * (len(grid.exact_rows) + len(grid.rows))
-    done = 0
     for index, channel in enumerate(CHANNELS):
-        kernels = []
-        for row in grid.exact_rows:
-            kernels.append(
-                [
-                    _kernel(lens, settings.with_channel(channel), grid.field(row, col), frame, options)
-                    for col in grid.exact_cols
-                ]
-            )
-            done += 1
-            on_step(done, total)
+        own = settings.with_channel(channel)
+        kernels = [
+            [_kernel(lens, own, grid.field(row, col), frame, options) for col in grid.exact_cols]
+            for row in grid.exact_rows
+        ]
         spread = grid.spread(np.asarray(kernels, dtype=np.float32))
         for i, row in enumerate(grid.rows):
             for j, col in enumerate(grid.cols):
                 for top, left, light in grid.windowed(padded[index], row, col):
                     image = _convolved(light, spread[i, j])
                     out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
-            done += 1
-            on_step(done, total)
     inner = out[:, 2 * half : 2 * half + frame.height, 2 * half : 2 * half + frame.width]
     return np.ascontiguousarray(np.maximum(inner, 0.0))
 

@@ -15,6 +15,7 @@ from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES
 from lensmodel.model.local_frame import LocalKernels
 from lensmodel.model.neighbours import Answers, Neighbourhood
+from lensmodel.model.variables import point
 from lensmodel.model.widths import WidthField
 
 SIZE = 21
@@ -212,7 +213,7 @@ def test_widths_are_carried_into_the_corner() -> None:
 
 def test_width_field_finds_widths_along_both_axes() -> None:
     field = WidthField.fit(photos(4))
-    inner, outer = (field.at(FieldPosition(r, 0.7), GREEN) for r in (0.2, 0.9))
+    inner, outer = field.over(np.array([point(FieldPosition(r, 0.7), GREEN) for r in (0.2, 0.9)]))
 
     assert outer[0] / inner[0] == pytest.approx((0.8 + 1.2 * 0.81) / (0.8 + 1.2 * 0.04), rel=0.05)
     assert outer[1] / inner[1] == pytest.approx((1.0 + 2.0 * 0.81) / (1.0 + 2.0 * 0.04), rel=0.05)

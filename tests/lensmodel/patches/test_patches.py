@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy import ndimage
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, NoiseModel, Plane, ignore_step
-from lensmodel.patches import REASONS, Patch, Selection, r_map, require_enough, select, selectors
+from lensmodel.patches import Patch, Reason, Selection, r_map, require_enough, select, selectors
 from lensmodel.patches import windows as blocks
 from lensmodel.patches.checks import look_at, part_of
 from lensmodel.patches.select import EVIDENCE_FLOOR
@@ -224,7 +225,7 @@ def test_strips_leave_no_trace_in_the_sums(photo: Plane, monkeypatch: pytest.Mon
 
 
 def test_every_window_is_chosen_or_has_a_reason(selection: Selection) -> None:
-    assert {r.reason for r in selection.rejected} <= set(REASONS)
+    assert {r.reason for r in selection.rejected} <= set(get_args(Reason))
     places = [(r.row, r.col) for r in selection.rejected] + [(p.row, p.col) for p in selection.patches]
     assert len(places) == len(set(places)) == 17 * 28
 

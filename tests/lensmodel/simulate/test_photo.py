@@ -179,7 +179,7 @@ def test_noise_has_the_variance_of_the_noise_model() -> None:
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_mosaic_shows_each_colour_where_the_pattern_says(pattern: str) -> None:
-    camera = SimulatedCamera(16, 16, pattern=pattern, bits=12, black=100, white=4000)
+    camera = SimulatedCamera(16, 16, pattern=pattern, black=100, white=4000)
     planes = np.stack([np.full((16, 16), level, dtype=np.float32) for level in (0.1, 0.5, 0.9)])
     mosaic = camera.mosaic(planes, None)
 

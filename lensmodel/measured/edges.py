@@ -97,7 +97,10 @@ class SlantedEdges:
                     measured_psfs.append(_square_psf(photos[0], channel, square, size))
             on_step(done, len(squares))
         if not measured_psfs:
-            raise NotEnoughEvidenceError("no square could be measured; is the photo in focus and unclipped?")
+            raise NotEnoughEvidenceError(
+                "no square could be measured, which takes two of its edges and the corner between them; "
+                "photograph dark squares or a checkerboard, in focus and unclipped"
+            )
         return measured_psfs
 
 

@@ -38,13 +38,13 @@ from app.store.database import Database
 from app.store.migrate import upgrade
 from app.store.tables import KeyRow
 from lab import targets
+from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app, main
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.measured.page import TargetPage
 from lensmodel.model import LensModel, LensProfile, save_profile
-from lensmodel.simulate import edge_chart
 
 HERE = Path(__file__).parents[1]
 PATIENCE_S = 240.0
@@ -163,9 +163,9 @@ def marked(lines: Iterable[str]) -> list[Any]:
 
 
 def write_what_measures(folder: Path) -> None:
-    """Write a photo of a printed page and of a chart of edges, and one scene at two apertures."""
+    """Write a photo of a printed page and of a chart of squares, and one scene at two apertures."""
     page = 0.8 * targets.target_scene(TargetPage(1000), (360, 510), targets.Setup(fill=0.97))[1]
-    chart = edge_chart(Frame(720, 960), margin=0).scene[1]
+    chart = squares_chart(Frame(720, 960), rows=3, cols=4)[0][1, MARGIN:-MARGIN, MARGIN:-MARGIN]
     noise = 0.4 + 0.12 * np.random.default_rng(7).standard_normal((720, 960))
     noise = np.clip(ndimage.gaussian_filter(noise, 0.5), 0.05, 0.9)
     for name, light, sigma, aperture in (

@@ -1,4 +1,4 @@
-"""Compile the inner loops, lest each task do it again: `python -m app.jobs.warming`.
+"""Compile the inner loops, lest each task do it again: `python -m app.jobs.warming NICENESS`.
 
 It reads no photo but its own, and so may write where Numba keeps compiled code (`NUMBA_CACHE_DIR`); tasks may
 only read there.
@@ -7,6 +7,7 @@ only read there.
 from __future__ import annotations
 
 import contextlib
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from PIL import Image
 from scipy import ndimage
 
 from app.runtime.processes import end_with_parent
-from app.sandbox.child import NICENESS, give_way
+from app.sandbox.child import give_way
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
@@ -62,6 +63,6 @@ def _learn_and_correct(developed: photo.LinearPhoto) -> None:
 
 if __name__ == "__main__":
     end_with_parent()
-    give_way(NICENESS)
+    give_way(int(sys.argv[1]))
     with tempfile.TemporaryDirectory() as scratch:
         warm(Path(scratch))

@@ -336,7 +336,7 @@ class Worker:
                 return
             own = {"NUMBA_CACHE_DIR": str(cache), PARENT: str(os.getpid())}
             subprocess.run(  # noqa: S603 - our own interpreter, our own module
-                [sys.executable, "-m", WARMING],
+                [sys.executable, "-m", WARMING, str(self._settings.task_niceness)],
                 env=clean_environment() | own,
                 check=True,
                 timeout=self._settings.task_seconds,

@@ -36,9 +36,6 @@ Mask = NDArray[np.bool_]
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
 )
-_NEAR, _NEXT = 2, 1
-"""Radii beside lamps for the least and the most (chosen: specks in a dark glow are seen before all else, and
-darker twigs are not); beside paint of which one colour clips the least is that within one pixel more."""
 _LAMP: Final = 2.0
 """Solved light, in units of saturation, from which a pixel counts as a lamp although the photo did not clip
 (chosen: edges overshoot by less, lamps that the blur has dimmed are brighter)."""
@@ -324,17 +321,20 @@ def _hold_light(
 def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow: int, near: Mask) -> None:
     """Hold each colour around clipped light and lamps within that of the photo, in place; mark where that is.
 
-    `kinds` is 2 for lamps and for what clips in more than one colour, and 1 for other clipped light.
+    Specks in a dark glow are seen before all else, and darker twigs are not: so the most is that within 1
+    pixel, the least that within 2 or 3. `kinds` is 2 for lamps and for what clips in more than one colour,
+    and 1 for other clipped light.
     """
     rows, cols = kinds.shape
-    unused, kind, glare = np.empty_like(kinds), np.empty_like(kinds), np.empty_like(kinds)
+    unused, darker = np.empty_like(kinds), np.empty_like(kinds)
+    kind, glare = np.empty_like(kinds), np.empty_like(kinds)
     least, dimmest, brightest = np.empty_like(kinds), np.empty_like(kinds), np.empty_like(kinds)
     extremes(kinds, kinds, glow, unused, kind)
     extremes(white, white, glow // 2, unused, glare)
     for c in range(3):
-        extremes(y[c], y[c], _NEXT, unused, brightest)
-        extremes(y[c], y[c], _NEAR, dimmest, unused)
-        extremes(y[c], y[c], _NEAR + 1, least, unused)
+        extremes(y[c], y[c], 1, darker, brightest)
+        extremes(darker, y[c], 1, dimmest, unused)  # within 2
+        extremes(dimmest, y[c], 1, least, unused)  # within 3
         for i in range(rows):
             for j in range(cols):
                 near[i, j] = kind[i, j] > np.float32(0.0)

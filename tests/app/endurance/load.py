@@ -67,7 +67,7 @@ class Load:
 
     def run(self, deed: Any, pause_s: float) -> None:
         """Do one thing again and again until the end."""
-        with httpx2.Client(base_url=self.service.http.base_url, timeout=60.0) as http:
+        with httpx2.Client(timeout=60.0) as http:
             while not self.stop.is_set():
                 with contextlib.suppress(
                     httpx2.HTTPError, IndexError
@@ -77,7 +77,8 @@ class Load:
 
     def ask(self, http: httpx2.Client, method: str, path: str, **options: Any) -> httpx2.Response:
         """Ask, and note what was answered."""
-        answer = http.request(method, path, **options)
+        # at another port in each of its lives
+        answer = http.request(method, self.service.http.base_url.join(path), **options)
         self.answers[f"{method} {answer.status_code}"] += 1
         if answer.status_code == 500:
             self.faults.append(f"{method} {path}: {answer.text[:300]}")

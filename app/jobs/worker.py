@@ -175,8 +175,8 @@ class Worker:
             self._begin()
             threading.Event().wait()
         except InterruptedByUser:
-            shutil.rmtree(self._scratch / self.id, ignore_errors=True)
             self._do(lambda: self._store.jobs.bury(self.id))
+            shutil.rmtree(self._scratch / self.id, ignore_errors=True)  # last: jobs still run
             logging.shutdown()
             os._exit(0)  # threads in the middle of a job must not go on to report it finished
 

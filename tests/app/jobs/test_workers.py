@@ -182,6 +182,24 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
     assert store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
 
 
+@pytest.mark.slow
+def test_another_worker_takes_over_from_one_that_died_for_ever(
+    crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]]
+) -> None:
+    send(1)
+    first = crew.hire()
+    until(lambda: done_patches(store) >= 2)
+    crew.kill(first)
+    left = done_patches(store)
+
+    crew.hire()
+    until(lambda: states(store) == ["counted"])
+
+    assert left < CELLS
+    check_counts(store, 1)
+    until(lambda: len(store.jobs.workers()) == 1)
+
+
 def test_the_loss_of_the_engines_database_loses_no_photo_and_that_of_the_tables_ends_a_worker(
     crew: Crew, store: Store, settings: Settings, send: Callable[[int], list[PhotoRow]]
 ) -> None:

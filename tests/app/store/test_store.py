@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import zlib
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -11,18 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 from servers import postgres
-from sqlalchemy import Text, cast, event, func, select, text
+from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError
 from uploads import receive
 
 from app.errors import BusyError
 from app.runtime.settings import Settings, table
-from app.store import NewPatch, Store, database
+from app.store import LensName, NewPatch, Store, database
 from app.store.database import Database
 from app.store.jobs import Result
 from app.store.migrate import current, downgrade, head, upgrade
 from app.store.owners import ANY_OWNER
-from app.store.tables import Base, PatchRow, PhotoRow
+from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian
 
@@ -166,6 +167,18 @@ def test_an_aperture_sent_with_the_same_bytes_ends_the_wait_for_it(store: Store,
     assert steps.fresh(photo).aperture == 4.0
 
 
+def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+
+    after = steps.fresh(photo)
+    state, samples = store.lenses.samples_of(lens)
+    assert (after.state, after.epoch) == ("counted", photo.epoch)
+    assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory are told to forget the old ones
+
+
 def test_a_photo_that_waits_for_its_lens_does_not_fail_for_the_end_of_its_job(
     store: Store, steps: Steps
 ) -> None:
@@ -253,6 +266,38 @@ def test_samples_come_back_as_they_were_written(store: Store, steps: Steps) -> N
     np.testing.assert_allclose(sample.kernel, gaussian(15, np.eye(2)), atol=1e-7)
 
 
+def test_a_sample_is_stored_as_earlier_programs_read_it(store: Store, steps: Steps) -> None:
+    steps.counted(width=2.0)
+    kernel = gaussian(15, 2.0 * np.eye(2)).astype("<f4").tobytes()
+    with store.database.reading() as session:
+        row = session.scalars(select(SampleRow).order_by(SampleRow.id).limit(1)).one()
+        stored = {column.key: getattr(row, column.key) for column in SampleRow.__table__.columns}
+
+    del stored["id"], stored["photo_id"], stored["patch_id"], stored["lens_id"], stored["created_at"]
+    assert stored == {
+        "version_added": 1,
+        "channel": "r",
+        "r": 0.05,
+        "phi": 0.0,
+        "weight": 0.5,
+        "predicted_error": None,
+        "size": 15,
+        "format_version": 2,
+        "crc32": zlib.crc32(kernel),
+        "psf": kernel,
+        "estimator": "default/1",
+    }
+
+
+def test_only_samples_of_later_versions_are_read_on(store: Store, steps: Steps) -> None:
+    first, second = steps.counted(), steps.counted()
+
+    state, samples = store.lenses.samples_of(steps.lens_id(first), after_version=1)
+
+    assert state.version == 2
+    assert {stored.photo for stored in samples} == {second.public_id}
+
+
 def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: Store, steps: Steps) -> None:
     photo = steps.counted()
     lens = steps.lens_id(photo)
@@ -307,10 +352,8 @@ def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, 
 
     store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
-    after = steps.fresh(photo)
     state, samples = store.lenses.samples_of(steps.lens_id(photo))
-    assert (after.state, after.epoch) == ("counted", photo.epoch)  # it does not start anew
-    assert (state.version, state.rebuild_epoch, len(samples)) == (2, 1, 6)  # models in memory forget the old
+    assert state.version == 2
     assert {stored.settings.aperture for stored in samples} == {2.0}
 
 
@@ -341,6 +384,17 @@ def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> Non
     assert not store.jobs.finish(run, Result("k", "e", "image/tiff", 1, "n"), {})
     assert not store.jobs.start(row.public_id)
     assert not store.jobs.is_live(row.public_id)
+
+
+def test_another_owner_sees_nothing(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.get(photo.public_id, "stranger") is None
+    assert store.lenses.get(lens, "stranger") is None
+    assert store.photos.page("stranger", before=None, limit=10) == []
+    assert not store.photos.cancel(photo.public_id, "stranger")
+    assert store.photos.delete(photo.public_id, "stranger") is None
 
 
 def test_a_worker_declared_dead_cannot_beat_again(store: Store, steps: Steps) -> None:
@@ -438,8 +492,12 @@ def test_the_page_of_the_service_lists_all_settings() -> None:
 def test_a_database_server_needs_shared_storage() -> None:
     with pytest.raises(ValueError, match="s3://"):
         Settings(database_url="postgresql+psycopg://db/lens")
+
+
+def test_the_jobs_of_a_database_server_lie_where_all_machines_see_them() -> None:
     settings = Settings(database_url="postgresql+psycopg://db/lens", storage_url="s3://lensmodel")
-    assert settings.jobs == settings.database  # where all machines see them
+
+    assert settings.jobs == settings.database
 
 
 def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
@@ -512,6 +570,17 @@ def test_a_correction_whose_twin_ends_meanwhile_is_created(
     assert (row.state, created) == ("queued", True)
 
 
+def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
+    store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = steps.counted()
+    blocked_once(monkeypatch, database)
+
+    assert store.photos.change(photo.public_id, OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
+
+    assert steps.lens_id(photo) != steps.lens_id(steps.counted())
+
+
 def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:
     photo, other = steps.receive(), steps.receive()
     store.photos.delete(photo.public_id, OWNER)
@@ -554,9 +623,58 @@ def test_what_is_written_after_a_deletion_is_deleted_later(store: Store, steps: 
     assert set(prefixes) <= set(store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)))
 
 
-def test_a_page_is_found_by_an_index_however_many_rows_there_are(store: Store) -> None:
+def many(store: Store, count: int = 10_000) -> None:
+    """Give each of two owners lenses with a photo and a correction each."""
+    with store.database.writing() as session:
+        for owner in (1, 2):
+            session.add(OwnerRow(id=owner, name=f"owner {owner}", created_at=datetime.now(UTC)))
+        session.flush()
+        numbers = range(count)
+        rows = [
+            (LensRow, {"identity_key": "k", "serial_source": "none", "created_at": datetime.now(UTC)}),
+            (
+                PhotoRow,
+                {
+                    "filename": "p",
+                    "kind": "dng",
+                    "byte_size": 1,
+                    "blob_key": "k",
+                    "calibrate": True,
+                    "given": {},
+                    "state": "stored",
+                    **dict.fromkeys(("received_at", "stage_at"), datetime.now(UTC)),
+                },
+            ),
+            (
+                CorrectionRow,
+                {
+                    "lens_version": 1,
+                    "params": {},
+                    "params_hash": "h",
+                    "state": "succeeded",
+                    "created_at": datetime.now(UTC),
+                },
+            ),
+        ]
+        for table, common in rows:
+            values = [
+                {**common, "id": k + 1, "public_id": f"{table.__tablename__}{k:08}", "owner_id": 1 + k % 2}
+                for k in numbers
+            ]
+            for k, value in enumerate(values):
+                if table is LensRow:
+                    value["identity_key"] = str(k)
+                elif table is PhotoRow:
+                    value |= {"sha256": f"{k:064}", "lens_id": k + 1}
+                else:
+                    value |= {"photo_id": k + 1, "lens_id": k + 1}
+            session.execute(insert(table), values)
+
+
+def test_a_page_of_ten_thousand_lenses_is_found_by_an_index(store: Store) -> None:
     if not store.database.is_sqlite:
         pytest.skip("reads SQLite's plans")
+    many(store)
     seen: list[tuple[str, Any]] = []
 
     def note(connection: object, cursor: object, statement: str, *rest: Any) -> None:
@@ -565,7 +683,7 @@ def test_a_page_is_found_by_an_index_however_many_rows_there_are(store: Store) -
 
     event.listen(store.database.reader, "before_cursor_execute", note)
     for page in (store.lenses.page, store.photos.page, store.jobs.corrections):
-        page("owner 1", before=None, limit=50)
+        assert len(page("owner 1", before=None, limit=50)) == 50
     event.remove(store.database.reader, "before_cursor_execute", note)
 
     with store.database.reader.connect() as connection:

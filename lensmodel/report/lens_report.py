@@ -158,6 +158,7 @@ class Spot:
     tangential_range: Range
     sagittal_range: Range
     predicted_error: float  # expected relative L2 of the kernel
+    unknown: bool  # whether too little is known of the place to call this the lens
     kernel: tuple[tuple[float, ...], ...]
 
     @property
@@ -224,7 +225,7 @@ class ApertureReport:
     def unknown(self) -> tuple[bool, ...]:
         """Whether too little is known of a place to draw it as if it were the lens."""
         known = zip(self.predicted_error, self.extrapolated, strict=True)
-        return tuple(gone or not (self.measured or error < UNKNOWN) for error, gone in known)
+        return tuple(_is_unknown(error, gone, self.measured) for error, gone in known)
 
     @property
     def zones(self) -> dict[Zone, float]:
@@ -418,12 +419,16 @@ def _tested(
     answers = [model.query(place, settings, size) for place in places]
     measured = all(is_measured(sample) for sample in model.samples)
     figures = [_figures(answer, place, measured) for answer, place in zip(answers, places, strict=True)]
-    outside = _outside_chart(model, places)
-    kernels = list(model.kernels(around, settings, size))
-    curves = _contrast(kernels, rings, [f for f, _ in frequencies])
     corners = [("the centre", FieldPosition(0.0, 0.0))]
     corners += [(place_in_words(place), place) for place in corner_places(aspect)]
     sides = [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
+    outside = _outside_chart(model, [*places, *(place for _, place in (*corners, *sides))])
+    spots = tuple(
+        _spot(model, words, place, settings, size, measured=measured, outside=bool(out))
+        for (words, place), out in zip((*corners, *sides), outside[len(places) :], strict=True)
+    )
+    kernels = list(model.kernels(around, settings, size))
+    curves = _contrast(kernels, rings, [f for f, _ in frequencies])
     return ApertureReport(
         settings=settings,
         aspect=aspect,
@@ -436,15 +441,16 @@ def _tested(
         sagittal_range=tuple(figure["sagittal_range"] for figure in figures),
         predicted_error=tuple(float(answer.predicted_error) for answer in answers),
         extrapolated=tuple(
-            bool(answer.extrapolated or out) for answer, out in zip(answers, outside, strict=True)
+            bool(answer.extrapolated or out)
+            for answer, out in zip(answers, outside[: len(places)], strict=True)
         ),
         radii=RADII,
         curves=tuple(
             Curve(f, lp, *(tuple(values.tolist()) for values in curves[i]))
             for i, (f, lp) in enumerate(frequencies)
         ),
-        spots=tuple(_spot(model, words, place, settings, size, measured) for words, place in corners),
-        sides=tuple(_spot(model, words, place, settings, size, measured) for words, place in sides),
+        spots=spots[: len(corners)],
+        sides=spots[len(corners) :],
         centring=centring(model, settings),
         measured=measured,
     )
@@ -466,12 +472,25 @@ def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray
 
 
 def _spot(
-    model: LensModel, words: str, place: FieldPosition, settings: LensSettings, size: int, measured: bool
+    model: LensModel,
+    words: str,
+    place: FieldPosition,
+    settings: LensSettings,
+    size: int,
+    *,
+    measured: bool,
+    outside: bool,
 ) -> Spot:
     answer = model.query(place, settings, size)
     kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
     error = float(answer.predicted_error)
-    return Spot(words, place, **_figures(answer, place, measured), predicted_error=error, kernel=kernel)
+    unknown = _is_unknown(error, answer.extrapolated or outside, measured)
+    figures = _figures(answer, place, measured)
+    return Spot(words, place, **figures, predicted_error=error, unknown=unknown, kernel=kernel)
+
+
+def _is_unknown(error: float, extrapolated: bool, measured: bool) -> bool:
+    return bool(extrapolated or not (measured or error < UNKNOWN))
 
 
 class _Figures(TypedDict):
@@ -547,12 +566,15 @@ def sharpness(found: ApertureReport) -> str:
     words = f"this copy is {level} in the centre (MTF50 {figure})"
     share = worst.mean / max(center, 1e-6)
     if share >= _EVEN:
-        fall = "its corners are just as sharp"
+        fall = f"its corners {'seem' if worst.unknown else 'are'} just as sharp"
     else:
         how = (
             "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
         )
-        fall = f"its worst corner, {worst.side}, is {how} ({worst.words})"
+        verb = "seems" if worst.unknown else "is"
+        fall = f"its worst corner, {worst.side}, {verb} {how} ({worst.words})"
+    if worst.unknown:
+        fall += ", but too little is known there"
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
     return f"{begin}, and {fall}."
 

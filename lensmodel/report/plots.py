@@ -410,7 +410,8 @@ def _points(place: Place, found: ApertureReport) -> None:
     for ax, spot in zip(place.subplots(1, len(found.spots)), found.spots, strict=True):
         ax.imshow(np.array(spot.kernel), cmap="gray", vmin=0.0)
         weight = "bold" if spot is found.worst else "normal"
-        ax.set_title(spot.side.removeprefix("the "), fontsize=8.5, weight=weight, loc="center")
+        name = spot.side.removeprefix("the ") + (" (not known)" if spot.unknown else "")
+        ax.set_title(name, fontsize=8.5, weight=weight, loc="center")
         ax.set(xticks=[], yticks=[])
         ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
         ax.grid(visible=False)

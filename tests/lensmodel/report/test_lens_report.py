@@ -23,8 +23,17 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings, PsfAnswer
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
-from lensmodel.report import LensReport, SensorGeometry, Side, compare, filled_aspect, lens_report
+from lensmodel.report import (
+    LensReport,
+    SensorGeometry,
+    Side,
+    compare,
+    filled_aspect,
+    lens_report,
+    sharpness,
+)
 from lensmodel.report.html import to_html
+from lensmodel.report.lens_report import UNKNOWN
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
 from lensmodel.report.plots import charts, comparison_page, overview, pages, to_pdf, to_png
 from lensmodel.report.tables import place_table, to_csv
@@ -197,9 +206,23 @@ def test_the_verdict_names_the_worst_corner_and_does_not_contradict_the_map() ->
     found = report_of(bad_side=0.8)
 
     assert found.tested[0].worst.place in {"the upper right corner", "the lower right corner"}
-    assert re.search(r"worst corner, the (upper|lower) right, is (much|clearly) softer", found.verdict)
+    assert re.search(r"worst corner, the (upper|lower) right, seems (much|clearly) softer", found.verdict)
     assert "the right is softer than the opposite side" in found.verdict
     assert "its corners are just as sharp" in report_of(corner=0.8).verdict
+
+
+@pytest.mark.parametrize("corner", [0.8, 2.0])
+def test_the_verdict_is_as_sure_of_the_corners_as_the_map(corner: float) -> None:
+    found = report_of(corner=corner).tested[0]
+    unknown, known = (
+        replace(found, spots=tuple(replace(spot, unknown=gone) for spot in found.spots))
+        for gone in (True, False)
+    )
+
+    assert re.search(r"seems? .*, but too little is known there\.$", sharpness(unknown))
+    assert re.search(r"(is|are) (just as|nearly as|clearly|much) ", sharpness(known))
+    assert "little is known" not in sharpness(known)
+    assert [spot.unknown for spot in found.spots] == [spot.predicted_error >= UNKNOWN for spot in found.spots]
 
 
 def test_a_point_within_a_pixel_is_reported_as_at_least_nyquist() -> None:

@@ -121,6 +121,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     plan = correction_routes.find_correction(call, correction_id)
     correction = views.correction_out(plan)
     report = correction.report or {}
+    audit = report.get("audit") or {}
     photo, row = views.photo_out(plan.photo), plan.photo
     can_look = correction.roi is None and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
     changed = not report.get("nothing_to_correct")
@@ -135,6 +136,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         zones=zones if changed else [],
         most_gain=most_gain,
         nothing=words.nothing_words(row.kind),
-        audit=words.held_back(report.get("audit") or {}) if changed else None,
+        audit=words.held_back(audit) if changed else None,
+        held=words.held_map(audit, row.height or 0, row.width or 0, row.orientation or 1) if can_look else [],
         places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from app.pages.pictures import upright_point
 from app.pages.shown import WaitingGroup
 from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
@@ -246,6 +247,19 @@ def held_back(audit: Mapping[str, Any]) -> tuple[str, list[str]] | None:
         "Applied almost in full." if share < LEAST else words,
         [f"{CHECKS.get(name, name)}: {part:.1%}" for name, part in checks.most_common() if part >= LEAST],
     )
+
+
+def held_map(
+    audit: Mapping[str, Any], height: int, width: int, orientation: int
+) -> list[tuple[int, int, int, float]]:
+    """Return the tiles that were held back in the upright photo: left, top, side in pixels, and the share."""
+    side = audit.get("tile_side") or 0
+    found = []
+    for tile in audit.get("tiles") or []:
+        middle = (tile["row"] + side / 2, tile["col"] + side / 2)
+        row, col = upright_point(*middle, height, width, orientation)
+        found.append((col - side // 2, row - side // 2, side, tile["held_back"]))
+    return found
 
 
 def active(photo: PhotoOut) -> bool:

@@ -27,7 +27,7 @@ from app.main import create_app
 from app.pages.batch import unused_name
 from app.pages.pictures import in_sensor, upright_point
 from app.pages.shown import grouped
-from app.pages.words import plain
+from app.pages.words import held_map, plain
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
@@ -90,6 +90,8 @@ def finished(
     assert run is not None
     audit = {
         "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},
+        "tiles": [{"row": 0, "col": 200, "held_back": 0.4}],
+        "tile_side": 100,
     }
     result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
     report = {"zones": {}, "nothing_to_correct": nothing, "audit": audit}
@@ -184,7 +186,14 @@ def test_a_corrected_dng_is_looked_at_and_its_audit_told(
     assert 'id="viewer"' in page
     assert "10% of the correction was held back over the whole photo." in page
     assert "detail that does not match the photo: 10.0%" in page
+    assert '<rect x="200" y="0" width="100" height="100" fill-opacity="0.37"/>' in page
     assert "open it in your RAW developer" in page
+
+
+def test_what_was_held_back_is_drawn_where_it_is_on_a_photo_held_upright() -> None:
+    audit = {"tiles": [{"row": 0, "col": 200, "held_back": 0.4}], "tile_side": 100}
+
+    assert held_map(audit, 600, 800, 6) == [(499, 200, 100, 0.4)]  # at the right, 200 pixels down
 
 
 def test_the_page_of_a_photo_shows_its_correction(client: TestClient, corrected: dict[str, Any]) -> None:

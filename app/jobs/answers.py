@@ -129,19 +129,10 @@ class Held(Answer):
     held_back: Share
 
 
-class HeldPlace(Held):
-    """One of the worst places."""
-
-    check: Text
-    zone: Zone
-    severity: float | None
-
-
 class Audit(Answer):
     """What the audit held back, and where."""
 
     zones: dict[Zone, ZoneAudit]
-    worst: Annotated[list[HeldPlace], Field(max_length=1000)]
     tiles: Annotated[list[Held], Field(max_length=100_000)] = []
     tile_side: Count = 0
 

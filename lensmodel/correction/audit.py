@@ -55,7 +55,6 @@ HELD: Final = 0.1
 """Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth is only
 just seen, a half only what is spoilt)."""
 MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
-PLACES: Final = 12  # worst places to name (chosen: as many as a person looks at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,28 +89,6 @@ class Evidence:
             raise InvalidInputError(f"every kind of evidence needs one entry per channel, got {counts}")
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """What one check held back of a tile.
-
-    Parameters
-    ----------
-    check : str
-        Name of the check.
-    held_back : float
-        Mean share of the correction that it alone would hold back, 0 to 1.
-    worst : float
-        The largest multiple of the limit.
-    at : tuple of int
-        Pixel `(row, col)` of the tile where that is.
-    """
-
-    check: str
-    held_back: float
-    worst: float
-    at: tuple[int, int]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TileAudit:
     """Verdict on one tile.
@@ -120,15 +97,15 @@ class TileAudit:
     ----------
     keep : Plane, shape (rows, cols)
         Share of the correction that is kept, 0 to 1; 1 everywhere on a sound tile.
-    findings : tuple of Finding
-        One for each check.
     held_back : float
-        Mean share of the correction that is held back.
+        Mean share of the correction that is held back, 0 to 1.
+    checks : Mapping[str, float]
+        The same by check, each as if alone.
     """
 
     keep: Plane
-    findings: tuple[Finding, ...]
     held_back: float
+    checks: Mapping[str, float]
 
     def without_map(self) -> TileAudit:
         """Return the figures alone: the maps of all tiles are as large as a photo's plane."""
@@ -186,24 +163,24 @@ def audit_tile(
     clip = np.asarray(np.minimum(evidence.clip, 1e9), dtype=np.float32)
     keep = np.ones(shape, dtype=np.float32)
     part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
-    held, worst, row, col = _spikes(y, x, noise, clip, _point_gains(evidence), part, _FOOT, keep)
-    found = Finding(ISOLATED, held / keep[inner].size, worst / _STANDS_OUT, (row - part[0], col - part[2]))
+    spikes = _spikes(y, x, noise, clip, _point_gains(evidence), part, _FOOT, keep)
+    checks = {ISOLATED: spikes / keep[inner].size}
     _powers(y, x, noise, clip, powers)
     wide = around(powers)
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
     severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
     if evidence.blurs is not None:
         severities[REBLUR] = _misfit(y, x, evidence)
-    findings = [found]
+    blocks = tuple(slice(a // SIDE, max(-(-b // SIDE), 1)) for a, b in (part[:2], part[2:]))
     for check, severity in severities.items():
         share = np.clip(
             np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
         )
         if share.min() < 1.0:
             _lower(keep, share)
-        findings.append(_finding(check, severity, share, inner))
+        checks[check] = float(1.0 - share[blocks].mean(dtype=np.float64))
     keep = keep[inner]
-    return TileAudit(keep, tuple(findings), float(1.0 - keep.mean(dtype=np.float64)))
+    return TileAudit(keep, float(1.0 - keep.mean(dtype=np.float64)), checks)
 
 
 def held_back(
@@ -229,22 +206,6 @@ def held_back(
     mixed *= audit.keep
     mixed += before
     return mixed, audit
-
-
-def _finding(check: str, severity: Real, share: Real, inner: Window) -> Finding:
-    """Sum up one check in the blocks of the inner part."""
-    part = tuple(
-        slice((s.start or 0) // SIDE, max(-(-(s.stop if s.stop is not None else n * SIDE) // SIDE), 1))
-        for s, n in zip(inner, severity.shape, strict=True)
-    )
-    values = severity[part]
-    row, col = np.unravel_index(int(values.argmax()), values.shape)
-    at = [
-        max((int(k) + p.start) * SIDE + SIDE // 2 - (s.start or 0), 0)
-        for k, p, s in zip((row, col), part, inner, strict=True)
-    ]
-    held = float(1.0 - share[part].mean(dtype=np.float64))
-    return Finding(check, held, float(values[row, col]) / LIMITS[check], (at[0], at[1]))
 
 
 def _point_gains(evidence: Evidence) -> Real:
@@ -319,16 +280,13 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
     part: tuple[int, int, int, int],
     foot: Real,
     keep: Real,
-) -> tuple[float, float, int, int]:
-    """Lower `keep` around pixels that stand out of a colour.
-
-    Returns the sum of what is held back of such pixels in `part`, the worst figure there, and its pixel.
-    """
+) -> float:
+    """Lower `keep` around pixels that stand out of a colour; return the sum of what such in `part` lose."""
     rows, cols = keep.shape
     zero, one, limit, most = np.float32(0.0), np.float32(1.0), np.float32(_STANDS_OUT), np.float32(_SPIKE)
     shown, out = np.empty((rows, cols), np.float32), np.zeros(cols, np.float32)
     least, wide = (most * limit) ** 2, foot.size // 2
-    held, worst, at, beside = 0.0, 0.0, part[0], part[2]
+    held = 0.0
     for c in range(3):
         shot, read = noise[c, 0], noise[c, 1]
         for i in range(rows):
@@ -356,13 +314,11 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
                 share = min(max(figure / limit - one, zero), one)
                 if part[0] <= i < part[1] and part[2] <= j < part[3]:
                     held += share
-                    if figure > worst:
-                        worst, at, beside = figure, i, j
                 for k in range(max(i - wide, 0), min(i + wide + 1, rows) if share > zero else 0):
                     for l in range(max(j - wide, 0), min(j + wide + 1, cols)):
                         left = one - share * foot[k - i + wide] * foot[l - j + wide]
                         keep[k, l] = min(keep[k, l], left)
-    return held, worst, at, beside
+    return held
 
 
 def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
@@ -457,32 +413,6 @@ def _lower(keep: Real, shares: Real) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A place where a check objects.
-
-    Parameters
-    ----------
-    check : str
-        Name of the check.
-    row, col : int
-        Pixel of the photo, in sensor orientation.
-    zone : {"center", "mid", "corner"}
-        Zone of the tile.
-    severity : float
-        Multiple of the limit, above 1.
-    held_back : float
-        Mean share of the correction that the check alone holds back in its tile.
-    """
-
-    check: str
-    row: int
-    col: int
-    zone: Zone
-    severity: float
-    held_back: float
-
-
-@dataclass(frozen=True, slots=True)
 class HeldTile:
     """A tile of the photo, by its first pixel, and the share of its correction that was held back."""
 
@@ -515,14 +445,12 @@ class ZoneAudit:
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What the audit of a photo held back, why, and where most.
+    """What the audit of a photo held back, why, and where.
 
     Parameters
     ----------
     zones : Mapping[Zone, ZoneAudit]
         Zones without a tile are left out.
-    worst : tuple of Place
-        The worst first, at most one of a check in a tile.
     tiles : tuple of HeldTile
         The map: those of which at least a hundredth was held back.
     tile_side : int
@@ -530,7 +458,6 @@ class AuditReport:
     """
 
     zones: Mapping[Zone, ZoneAudit]
-    worst: tuple[Place, ...]
     tiles: tuple[HeldTile, ...] = ()
     tile_side: int = 0
 
@@ -561,25 +488,20 @@ def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side:
         in_zone = [audit for name, _, audit in listed if name == zone]
         if in_zone:
             zones[zone] = _zone(in_zone)
-    places = [
-        Place(f.check, top + f.at[0], left + f.at[1], zone, f.worst, f.held_back)
-        for zone, (top, left), audit in listed
-        for f in audit.findings
-        if f.held_back > 0.0
-    ]
-    places.sort(key=lambda place: (-place.held_back, -place.severity, place.row, place.col))
     held = tuple(
         HeldTile(top, left, audit.held_back) for _, (top, left), audit in listed if audit.held_back >= MAPPED
     )
-    return AuditReport(zones, tuple(places[:PLACES]), held, tile_side)
+    return AuditReport(zones, held, tile_side)
 
 
 def _zone(audits: list[TileAudit]) -> ZoneAudit:
     shares = [audit.held_back for audit in audits]
-    checks: dict[str, float] = {}
-    for audit in audits:
-        for finding in audit.findings:
-            checks[finding.check] = checks.get(finding.check, 0.0) + finding.held_back / len(audits)
+    names = {name for audit in audits for name in audit.checks}
+    checks = {
+        name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits]))
+        for name in CHECKS
+        if name in names
+    }
     return ZoneAudit(
         len(audits),
         sum(share > HELD for share in shares),

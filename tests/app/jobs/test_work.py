@@ -864,8 +864,8 @@ def test_an_answer_that_no_task_gives_ends_the_photo(
     [
         {"zones": {"elsewhere": {}}},
         {"zones": {"mid": {"reasons": ["x"] * 100}}},
-        {"zones": {}, "audit": {"zones": {}, "worst": [{"row": 1}]}},
-        {"zones": {}, "audit": {"zones": {"mid": {"tiles": "many"}}, "worst": []}},
+        {"zones": {}, "audit": {"zones": {}, "tiles": [{"row": 1}]}},
+        {"zones": {}, "audit": {"zones": {"mid": {"tiles": "many"}}}},
     ],
 )
 def test_a_report_that_no_correction_makes_ends_it(

@@ -106,20 +106,21 @@ class Storage:
     @property
     def _store(self) -> ObjectStore:
         """The blobs."""
-        if not self.is_there:
-            raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
+        self._require_folder()
         if self._opened is None:
             assert self.folder is not None
             self._opened = LocalStore(prefix=self.folder)
         return self._opened
 
-    def put(self, key: str, data: bytes) -> None:
-        """Store bytes under a key, replacing what was there."""
-        obstore.put(self._store, key, data)
+    def _require_folder(self) -> None:
+        """Raise OSError if the folder is away; a write meanwhile may have made another in its place."""
+        if not self.is_there:
+            raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
 
-    def put_file(self, key: str, path: Path) -> None:
-        """Store a file under a key, replacing what was there."""
-        obstore.put(self._store, key, path)
+    def put(self, key: str, data: bytes | Path) -> None:
+        """Store bytes, or a file, under a key, replacing what was there."""
+        obstore.put(self._store, key, data)
+        self._require_folder()
 
     @asynccontextmanager
     async def writer(self, key: str) -> AsyncIterator[AsyncBlobWriter]:
@@ -129,6 +130,7 @@ class Storage:
         )
         async with opened as sink:
             yield sink
+        self._require_folder()
 
     def rename(self, key: str, to: str) -> None:
         """Give a blob another key, on which there is none yet; raises as `get`."""
@@ -206,6 +208,7 @@ class Storage:
             # a loop, not an iterator as the source: obstore cannot read while it writes
             for piece in pieces:
                 sink.write(bytes(piece))
+        target._require_folder()
 
     def check_usable(self) -> None:
         """Raise an error if folder or bucket is away, or a folder cannot take more; nothing is written."""

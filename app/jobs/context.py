@@ -190,7 +190,7 @@ class JobContext:
                 reads = [path, *siblings]
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=reads)
                 if (folder / SHOWN).is_file():
-                    self.storage.put_file(f"{photo.folder}{SHOWN}", folder / SHOWN)
+                    self.storage.put(f"{photo.folder}{SHOWN}", folder / SHOWN)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete, or absent
             return target

@@ -139,10 +139,10 @@ class CorrectionWork:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         base = row.run_folder
         key = f"{base}result{path.suffix}"
-        self._context.storage.put_file(key, path)
+        self._context.storage.put(key, path)
         for shown in (*SIDES.values(), *LAYER_FILES.values()):
             if (path.parent / shown).is_file():
-                self._context.storage.put_file(f"{base}{shown}", path.parent / shown)
+                self._context.storage.put(f"{base}{shown}", path.parent / shown)
         stem = PurePath(row.photo.filename).stem or "photo"
         result = Result(
             key=key,
@@ -178,7 +178,7 @@ class CorrectionWork:
                 metrics = checked(Measured, metrics)
                 if (folder / REPORT).is_file():
                     key = report_key(lens_id, version, state.rebuild_epoch)
-                    self._context.storage.put_file(key, folder / REPORT)
+                    self._context.storage.put(key, folder / REPORT)
         except NotWantedError:
             return
         except JobFailedError as error:

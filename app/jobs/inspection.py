@@ -66,7 +66,7 @@ def _examined(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) 
             raise
         _record_place(context, photo, folder)
         if (folder / THUMBNAIL).is_file():
-            context.storage.put_file(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
+            context.storage.put(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
         return checked(Inspected, info)
 
 
@@ -103,7 +103,7 @@ def _record_place(context: JobContext, photo: PhotoRow, folder: Path) -> None:
             with cleaned.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             key = f"{photo.folder}cleaned-{digest[:16]}"
-            context.storage.put_file(key, cleaned)
+            context.storage.put(key, cleaned)
             photos.record_location(photo, word, key=key, digest=digest)
             return
     photos.record_location(photo, word)

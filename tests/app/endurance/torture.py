@@ -16,11 +16,13 @@ import argparse
 import contextlib
 import os
 import random
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -149,6 +151,7 @@ def folder_away(settings: Settings) -> Iterator[None]:
     try:
         yield
     finally:
+        shutil.rmtree(folder, ignore_errors=True)  # a write that began before has made another one
         aside.rename(folder)
 
 
@@ -225,9 +228,11 @@ def in_environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def send_late(store: Store, storage: Storage, number: int, chance: random.Random) -> None:
+def send_late(
+    store: Store, storage: Storage, number: int, chance: random.Random, ended: threading.Event
+) -> None:
     """Send a photo whose upload takes so long that it is due for deletion, until one is accepted."""
-    while True:
+    while not ended.is_set():
         try:
             send(store, storage, number, within=timedelta(hours=-2), pause_s=chance.uniform(0.0, 1.0))
         except (BusyError, exc.DBAPIError, BaseError, OSError):
@@ -280,6 +285,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         If anything was lost, counted twice, or seen by another owner.
     """
     plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
+    ended = threading.Event()
     with contextlib.ExitStack() as stack:
         given = stack.enter_context(installation(folder, servers=servers))
         settings = given.settings
@@ -295,7 +301,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
             chances = [random.Random(chance.random()) for _ in numbers]
             each = zip(numbers, chances, strict=True)
             late = stack.enter_context(ThreadPoolExecutor(1)).submit(
-                lambda: [send_late(store, storage, *one) for one in each]
+                lambda: [send_late(store, storage, *one, ended) for one in each]
             )
             for _ in range(plan.workers):
                 crew.hire()
@@ -329,6 +335,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
             late.result()  # what it did not foresee
             check(settings, store, storage, plan)
         finally:
+            ended.set()
             crew.close()
             store.close()
     return (

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import obstore
 import pytest
+from obstore.store import LocalStore
 from PIL import Image
 from sqlalchemy import update
 
@@ -312,6 +314,23 @@ def test_a_file_is_not_lost_whose_disk_went_away_for_a_moment(
 
     work.photo(photo.public_id, 1)
     assert steps.fresh(photo).state == "counted"
+
+
+def test_a_write_while_the_disk_goes_away_does_not_pass_for_stored(
+    context: JobContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, put = context.storage.folder, obstore.put
+    assert folder is not None
+    aside = folder.with_name("aside")
+
+    def put_elsewhere(store: LocalStore, key: str, data: bytes) -> None:
+        folder.rename(aside)
+        put(store, key, data)
+
+    monkeypatch.setattr(obstore, "put", put_elsewhere)
+    with pytest.raises(OSError, match="is away"):
+        context.storage.put("photos/p/original", b"a photo")
+    assert not (aside / "photos/p").exists()
 
 
 def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
@@ -685,18 +704,17 @@ def test_a_correction_with_a_version_without_samples_fails(
 def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
     context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key, put_file = ask(context, counted, steps), context.storage.put_file
+    key, put = ask(context, counted, steps), context.storage.put
 
     def cancelled_meanwhile(blob: str, path: Path) -> None:
-        put_file(blob, path)
+        put(blob, path)
         context.store.jobs.cancel(key, ANY_OWNER)
 
-    monkeypatch.setattr(context.storage, "put_file", cancelled_meanwhile)
+    monkeypatch.setattr(context.storage, "put", cancelled_meanwhile)
     sandbox.answers["correct"] = [write_result]
     CorrectionWork(context).correction(key)
 
-    with pytest.raises(FileNotFoundError):
-        context.storage.size(f"corrections/{key}/result.tif")
+    assert not list(context.storage.listed(f"corrections/{key}/"))
 
 
 def test_a_child_cannot_hand_in_a_file_from_elsewhere(

@@ -56,7 +56,7 @@ def test_a_developed_photo_comes_from_the_blobs_upright(
     Image.fromarray(scene).save(tmp_path / "p.jpg", exif=exif, quality=95)
     tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
     photo = steps.counted()
-    Storage(settings.storage).put_file(f"{photo.folder}{SHOWN}", tmp_path / SHOWN)
+    Storage(settings.storage).put(f"{photo.folder}{SHOWN}", tmp_path / SHOWN)
 
     assert opened(client, f"/ui/photos/{photo.public_id}/tiles/before/whole.jpg").size == (90, 120)
 
@@ -85,7 +85,7 @@ def finished(
     blobs.put(f"{folder}result.dng", b"a file that the pages never open")
     for name in SIDES.values():
         write_tiles(settings.data_dir / name, a_picture())
-        blobs.put_file(f"{folder}{name}", settings.data_dir / name)
+        blobs.put(f"{folder}{name}", settings.data_dir / name)
     run = store.jobs.start(made["id"])
     assert run is not None
     audit = {

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage, optimize, special
 
 from lab.charts import by_zone, measure_edges
@@ -168,6 +169,14 @@ def test_published_edge_of_known_angle_and_width_is_measured_right(shared_data: 
 
     assert measured.angle_deg == pytest.approx(16.776550, abs=5e-3)
     assert 0.216 < measured.mtf50 < 0.226  # two independent tools say 0.218 and 0.224
+
+
+@pytest.mark.tools
+def test_a_real_edge_is_as_sharp_as_other_tools_say(shared_data: Path) -> None:
+    measured = slanted_edge(np.asarray(Image.open(shared_data / "edges" / "slant.png").convert("L")) / 255.0)
+
+    assert measured.angle_deg == pytest.approx(6.0, abs=0.01)
+    assert measured.mtf50 == pytest.approx(0.478, rel=0.05)  # another says 0.454; the edge is nearly ideal
 
 
 def test_crossing_interpolates_and_says_the_end_when_there_is_none() -> None:

@@ -287,7 +287,7 @@ def test_example_runs(
 ) -> None:
     words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
     if "auto" in words:
-        words += ["--estimator", "default", "--learn-from", "1"]
+        words += ["--learn-from", "1"]
     if EXAMPLES[line] == "measure":
         write_what_measures(folder)
     quick = line in QUICK and line not in ALONE

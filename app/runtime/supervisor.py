@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 # How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`, and less
 # than a command that was interrupted may take (`lensmodel.cli.ending`)
 STOP_S: Final = 8.0
+POLL_S: Final = 0.2  # seconds between two looks at the members (chosen): two calls of waitpid
 # Modules of the members; tests replace the worker
 WORKER, API = "app.runtime.worker_main", "app.runtime.server"
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -149,12 +150,13 @@ def _run(settings: Settings, listener: socket.socket) -> int:
         write_atomically(file, (text + "\n").encode())
         # it answers once the API is up: connections wait in the socket until then
         print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
-        for name, process in members.items():
-            if process.poll() is not None:
-                log.error(
-                    "the %s process ended with status %d, and with it the service", name, process.poll()
-                )
+        ended: list[str] = []
+        while not ended:
+            time.sleep(POLL_S)
+            ended = [name for name, process in members.items() if process.poll() is not None]
+        for name in ended:
+            status = members[name].returncode
+            log.error("the %s process ended with status %d, and with it the service", name, status)
     except InterruptedByUser:
         return 0
     finally:

@@ -75,14 +75,29 @@ class Folder:
             except (LensModelError, OSError) as error:
                 results.append({"photo": str(path), "output": None, **files.failed(error)})
                 self._display.error(f"{path}: {files.reason(error)}")
-        lens_groups = groups(shots)
+        lens_groups, unread = groups(shots), len(results)
         with self._display.progress() as bars:
             self._learn_all(lens_groups, bars)
             by_path = {path: target for target, path in targets.items()}
             rows = self._correct_all(lens_groups, by_path, bars, results, as_json=as_json)
         if not as_json:
             self._display.result(_table(rows))
+            self._say_more(rows, unread, {target.parent for target in targets})
         return {"groups": rows, "results": results}
+
+    def _say_more(self, rows: Sequence[Mapping[str, Any]], unread: int, folders: Iterable[Path]) -> None:
+        """Say what the table does not: what was not read, which lens is little known, and where files are."""
+        if unread:
+            self._display.note(f"not in the table: files that could not be read, {unread}; see above why")
+        for row in rows:
+            if row["learned_from"] == 1:
+                self._display.note(
+                    f"{row['camera']}, {row['lens']}: learned from one photo; with five or more its blur is "
+                    "known better, and scenes do not pass for it"
+                )
+        if any(row["corrected"] for row in rows):
+            where = ", ".join(str(folder) for folder in sorted(set(folders)))
+            self._display.note(f"corrected photos are in {where}, lens profiles in {self._profiles}")
 
     def _profile_of(self, group: PhotoGroup) -> Path:
         return self._profiles / f"{group.name}{ENDING}"

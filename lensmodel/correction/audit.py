@@ -496,12 +496,7 @@ def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side:
 
 def _zone(audits: list[TileAudit]) -> ZoneAudit:
     shares = [audit.held_back for audit in audits]
-    names = {name for audit in audits for name in audit.checks}
-    checks = {
-        name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits]))
-        for name in CHECKS
-        if name in names
-    }
+    checks = {name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits])) for name in CHECKS}
     return ZoneAudit(
         len(audits),
         sum(share > HELD for share in shares),

@@ -202,7 +202,9 @@ def settings_of(developed: LinearPhoto, given: LensSettings | None = None) -> Le
 def require_aperture(said: PhotoMetadata, given: LensSettings | None = None) -> None:
     """Refuse a photo of unknown aperture."""
     if said.aperture is None and (given is None or given.aperture is None):
-        raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
+        raise MetadataMissingError(
+            "it does not say its aperture; give its f-number by --aperture, 2.8 for f/2.8"
+        )
 
 
 def photo_id(path: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import signal
 import socket
@@ -20,6 +21,7 @@ import pytest
 import tifffile
 from deadline import Deadline, stretched
 from in_process import lensmodel
+from PIL import Image
 from running import (
     BRIEF,
     OWN_ACCOUNT,
@@ -90,14 +92,73 @@ def test_a_photo_calibrates_the_lens_that_it_names(service: Service, first: dict
     assert lens["samples"] >= first["patches"]["total"]
 
 
-def test_the_psf_has_the_width_of_the_blur(service: Service, first: dict[str, Any]) -> None:
+def test_the_psf_has_the_width_of_the_blur_and_the_same_numbers_in_each_format(
+    service: Service, first: dict[str, Any]
+) -> None:
     place: dict[str, str | float] = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
     base = f"/v1/lenses/{first['lens_id']}/psf"
     answer = service.http.get(f"{base}.json", params=place)
     kernel = np.array(answer.json()["psf"]["data"])
+    raw = np.load(io.BytesIO(service.http.get(f"{base}.npy", params=place).content))
+    tiff = tifffile.imread(io.BytesIO(service.http.get(f"{base}.tiff", params=place).content))
+    picture = Image.open(io.BytesIO(service.http.get(f"{base}.png", params=place).content))
+    again = service.http.get(f"{base}.json", params=place, headers={"If-None-Match": answer.headers["etag"]})
 
     assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
     assert rms_width(kernel) == pytest.approx(SIGMA, rel=0.25)
+    np.testing.assert_allclose(raw, kernel, atol=1e-6)
+    np.testing.assert_allclose(tiff, kernel, atol=1e-6)
+    assert picture.size == (21, 21)
+    assert again.status_code == 304
+
+
+def test_the_same_bytes_again_are_the_same_photo(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    again = service.upload(photos / "first.dng", status=200)
+
+    assert again["id"] == first["id"]
+    assert len(additions(service, first["lens_id"], first["id"])) == 1
+
+
+def test_events_tell_the_way_of_a_photo_to_its_end(service: Service, photos: Path) -> None:
+    photo = service.upload(photos / "second.dng")
+    with service.http.stream(
+        "GET", f"/v1/jobs/{photo['id']}/events", timeout=stretched(PATIENCE_S)
+    ) as events:
+        assert events.headers["content-type"].startswith("text/event-stream")
+        seen = [json.loads(line[5:]) for line in events.iter_lines() if line.startswith("data:")]
+
+    done = [job["progress"]["done"] for job in seen]
+    assert seen[-1]["state"] == "succeeded"
+    assert done == sorted(done)
+    assert len(seen) > 2
+
+
+def test_a_region_is_corrected_to_jpeg(service: Service, first: dict[str, Any]) -> None:
+    roi = {"x": 100, "y": 50, "width": 200, "height": 120}
+    output = {"format": "jpeg", "color_space": "srgb"}
+    wish = {"photo_id": first["id"], "output": output, "roi": roi, "method": "fast"}
+    made = service.http.post("/v1/corrections", json=wish).json()
+    job = service.job(made["id"])
+    picture = Image.open(io.BytesIO(service.http.get(f"/v1/corrections/{made['id']}/result").content))
+
+    assert job["state"] == "succeeded", job
+    assert (picture.format, picture.size) == ("JPEG", (200, 120))
+
+
+def test_a_cancelled_photo_never_counts(service: Service, first: dict[str, Any], photos: Path) -> None:
+    version = lens_of(service, first)["version"]
+    photo = service.upload(photos / "fourth.dng")
+    service.job(photo["id"], until=lambda job: job["stage"] == "estimating")
+    cancelled = service.http.post(f"/v1/jobs/{photo['id']}/cancel")
+    again = service.http.post(f"/v1/jobs/{photo['id']}/cancel")
+    time.sleep(1.0)
+
+    assert cancelled.status_code == 202
+    assert again.status_code == 409
+    assert service.get(f"/v1/photos/{photo['id']}")["state"] == "cancelled"
+    assert lens_of(service, first)["version"] == version
 
 
 def test_a_photo_without_serial_waits_and_goes_on_once_its_lens_is_named(

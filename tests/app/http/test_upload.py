@@ -275,3 +275,31 @@ def test_an_upload_cut_off_by_the_client_leaves_no_blob(client: TestClient, sett
 
     assert blobs(settings) == []
     assert sent[0]["status"] == 400
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [("selector=best", "good-regions"), ("selector=good-regions&kind=target", "leave one out")],
+)
+def test_a_selector_that_nobody_can_follow_is_refused(
+    client: TestClient, settings: Settings, query: str, said: str
+) -> None:
+    answer = client.post(f"/v1/photos?filename=p.tif&{query}", content=TIFF)
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
+    assert said in answer.json()["detail"]
+    assert blobs(settings) == []
+
+
+@pytest.mark.parametrize("name", ["фото.dng", "Müller.dng"])
+def test_a_form_names_its_file_in_any_script(client: TestClient, name: str) -> None:
+    body = form((f'name="file"; filename="{name}"', TIFF))
+
+    assert client.post("/v1/photos", content=body, headers=FORM).json()["filename"] == name
+
+
+def test_a_name_with_folders_does_not_leave_the_storage(client: TestClient, settings: Settings) -> None:
+    photo = client.post("/v1/photos", files={"file": ("../../../evil.dng", TIFF)}).json()
+
+    assert photo["filename"] == "evil.dng"
+    assert [path.name for path in blobs(settings)] == ["original"]

@@ -208,3 +208,7 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
     assert number == MAX_DEATHS["cell"]
     assert status == "lost"
     assert ran.jobs == []
+
+
+def test_a_job_that_nobody_asked_for_is_unknown(engine: DbosEngine) -> None:
+    assert engine.status(Job("photo", ("never", 1))) == "unknown"

@@ -910,3 +910,20 @@ def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(
     work.photo(photo.public_id, photo.epoch)
 
     assert (steps.fresh(photo).state, len(steps.fresh(photo).camera_model)) == ("counted", 200)
+
+
+def test_a_cancelled_correction_stays_cancelled(
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    key = ask(context, counted, steps)
+
+    def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
+        context.store.jobs.cancel(key, ANY_OWNER)
+        return write_result(arguments, folder)
+
+    sandbox.answers["correct"] = [cancel]
+    CorrectionWork(context).correction(key)
+
+    row = context.store.jobs.correction(key, ANY_OWNER)
+    assert row is not None
+    assert (row.state, row.result_key) == ("cancelled", None)

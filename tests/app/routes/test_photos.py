@@ -405,3 +405,28 @@ def test_jobs_of_photos_and_corrections_share_a_list(client: TestClient, steps: 
 
     assert [job["kind"] for job in first["items"] + second["items"]] == ["correction", "photo"]
     assert second["next"] is None
+
+
+def test_a_photo_of_somebody_else_does_not_exist(client: TestClient, steps: Steps) -> None:
+    steps.owner = "stranger"
+    photo = steps.counted()
+    lens_id = steps.lens_id(photo)
+
+    for path in (
+        f"photos/{photo.public_id}",
+        f"photos/{photo.public_id}/patches",
+        f"jobs/{photo.public_id}",
+        f"jobs/{photo.public_id}/events",
+        f"lenses/{lens_id}",
+        f"lenses/{lens_id}/psf?r=0.5",
+        f"lenses/{lens_id}/field.png",
+        f"lenses/{lens_id}/calibrations",
+        f"lenses/{lens_id}/lateral-colour",
+    ):
+        assert client.get(f"/v1/{path}").status_code == 404, path
+    assert client.delete(f"/v1/photos/{photo.public_id}").status_code == 404
+    assert client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True}).status_code == 404
+    assert client.post(f"/v1/jobs/{photo.public_id}/cancel").status_code == 404
+    assert client.post("/v1/corrections", json={"photo_id": photo.public_id}).status_code == 404
+    assert get(client, "/v1/photos")["items"] == []
+    assert get(client, "/v1/lenses")["items"] == []

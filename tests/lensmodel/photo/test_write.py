@@ -20,6 +20,7 @@ import rawpy
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
+from skimage import io
 
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
@@ -424,3 +425,16 @@ def test_a_packet_of_names_that_xml_cannot_write_is_still_xml() -> None:
     described = next(packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
     assert described.get("{http://ns.adobe.com/tiff/1.0/}Model") == "X T -3 <& >"
     assert described.get("{http://ns.adobe.com/exif/1.0/aux/}Lens") == "x "
+
+
+def test_skimage_and_pillow_read_the_numbers_that_we_read(tmp_path: Path) -> None:
+    photo.write_image(tmp_path / "x.tif", planes(), PLAIN, format="tiff16")
+    photo.write_image(tmp_path / "x.png", planes(), PLAIN, format="png16")
+    photo.write_image(tmp_path / "8.png", planes(), PLAIN, format="png8")
+
+    assert (io.imread(tmp_path / "x.tif") == read_numbers(tmp_path / "x.tif")).all()
+    assert (read_numbers(tmp_path / "x.png") == read_numbers(tmp_path / "x.tif")).all()
+    with Image.open(tmp_path / "8.png") as image:
+        assert (np.asarray(image) == read_numbers(tmp_path / "8.png")).all()
+    with Image.open(tmp_path / "x.png") as image:  # Pillow shows 16 bits as 8
+        agree(np.asarray(image), read_numbers(tmp_path / "8.png"), atol=1)

@@ -216,3 +216,14 @@ def test_sides_that_may_differ_by_much_are_undecided(sides: float, error: float,
     assert _verdict(softer, None, 5).verdict == verdict
     assert ("%" in _verdict(softer, None, 5).text) is (error < 1.0)
     assert _verdict(replace(softer, significant=True, amount=0.5), None, 5).verdict == "decentred"
+
+
+def test_a_larger_shift_is_a_larger_asymmetry() -> None:
+    amounts = []
+    for shift in (0.05, 0.15, 0.3):
+        lens = aligned("astigmatism", decentred=(shift, 0.0))
+        found = centring(quick(true_samples(lens, 2)), wide_open(lens))
+        assert found.softer is not None
+        amounts.append(found.softer.amount)
+
+    assert amounts[0] < amounts[1] < amounts[2]

@@ -36,7 +36,7 @@ class UnknownError(ServiceError):
     """No photo, lens, correction or job of that id, or somebody else's."""
 
     def __init__(self, what: str, key: str) -> None:
-        super().__init__(f"there is no {what} {key[:60]}: it may be deleted", code=f"unknown_{what}")
+        super().__init__(f"there is no {what} {key[:60]}: it may have been deleted", code=f"unknown_{what}")
 
 
 class NotReadyError(ServiceError):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.store.tables import KeyRow
 
 keys = typer.Typer(
-    help="""Make, list and end the keys of a service that others can reach.
+    help="""Make, list and revoke the keys of a service that others can reach.
 
 Examples:
 
@@ -29,7 +29,7 @@ Examples:
 
     lensmodel keys list
 
-Exit status: 0 done, 1 it could not be, 2 wrong usage.""",
+Exit status: 0 done, 1 it failed, 2 wrong usage.""",
     no_args_is_help=True,
 )
 
@@ -101,7 +101,7 @@ def create(
 
         lensmodel keys create --owner anna --scope read --expires 90d --label notebook
 
-    Exit status: 0 made, 1 it could not be, 2 wrong usage.
+    Exit status: 0 made, 1 it failed, 2 wrong usage.
     """
     name = owner.strip()
     if not (0 < len(name) <= 100 and name.isprintable() and "|" not in name):
@@ -136,7 +136,7 @@ def listed(
 
         lensmodel keys list --owner anna --json
 
-    Exit status: 0 listed, 1 it could not be, 2 wrong usage.
+    Exit status: 0 listed, 1 it failed, 2 wrong usage.
     """
     from app.store.owners import ANY_OWNER  # noqa: PLC0415 - as above
 

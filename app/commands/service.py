@@ -117,4 +117,4 @@ def config(
     from app.sandbox import confine  # noqa: PLC0415 - only this command asks
 
     for name, in_force in confine.available(settings.task_user, settings.data_dir).items():
-        typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not to be had here'}")
+        typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not available here'}")

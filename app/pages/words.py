@@ -24,7 +24,7 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "needs_lens": "Which lens was it?",
     "counted": "Used",
     "stored": "Ready to correct",
-    "excluded": "You left it out of the lens",
+    "excluded": "Left out, as you chose",
     "cancelled": "Left out",
 }
 FAILURES: Final[Mapping[str, str]] = {

@@ -180,7 +180,7 @@ def _admit(call: Call) -> None:
     check_usage(limits, usage, usage.working_photos, "photos")
     max_photos = most(limits, usage)[1]
     if usage.photos >= max_photos:
-        text = f"{usage.photos} photos are there, {max_photos} may be: delete some"
+        text = f"{usage.photos} photos are stored, and {max_photos} are allowed: delete some"
         raise QuotaError(text, headers={"Retry-After": "3600"})
 
 

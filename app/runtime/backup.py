@@ -51,8 +51,8 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
     """Bring a backup folder up to date with an installation, which may be running."""
     if not database.is_sqlite:
         raise InvalidInputError(
-            "the rows are in a database server: back them up by pg_dump, and after them the blobs by the "
-            "means of their storage; docs/topics/operating.md says how"
+            "the rows are in a database server: back them up with pg_dump, then the blobs with the tools of "
+            "their storage; docs/topics/operating.md says how"
         )
     migrate.check(database)
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
                 target.remove(key)
             return Backup(made_at, photos, len(named), sum(kept[key] for key in named))
     part.unlink()
-    raise BackupError(f"{len(missing)} blobs are named and missing, {missing[0]} first: run lensmodel doctor")
+    raise BackupError(f"{len(missing)} blobs are missing, the first is {missing[0]}: run lensmodel doctor")
 
 
 def _rows(database: Path, part: Path) -> tuple[int, set[str]]:

@@ -68,7 +68,7 @@ def _tables(store: Store) -> Iterator[Violation]:
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:
     waiting = sum(store.jobs.load()[0].values())
     if waiting and not store.jobs.live(settings.lease_seconds):
-        says = f"{waiting} jobs are unfinished and no worker lives"
+        says = f"{waiting} jobs are unfinished and no worker is running"
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")
 
 
@@ -76,7 +76,7 @@ def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
     """Compare the stored blobs with the tables, which are read last, since blobs are written first."""
     if not storage.is_there:
         where = str(storage.folder)
-        yield Violation("blobs", where, "the folder of the blobs is away", "mount its disk, or restore it")
+        yield Violation("blobs", where, "the folder of the blobs is missing", "mount its disk, or restore it")
         return
     sizes = dict(storage.listed())
     with store.database.reading() as session:

@@ -34,7 +34,7 @@ REQUEST_SECONDS: Final = Histogram(
     buckets=_QUICK,
 )
 MODELS: Final = Counter(
-    "lensmodel_model_cache", "Models asked for, by what became of that.", ("outcome",), registry=API
+    "lensmodel_model_cache", "Requests for a model, by outcome.", ("outcome",), registry=API
 )
 MODEL_BYTES: Final = Gauge(
     "lensmodel_model_cache_bytes", "Memory of the fitted models of this process.", registry=API

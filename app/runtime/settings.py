@@ -33,7 +33,7 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(default=Path("lensmodel-data"), description="Folder of everything that is kept.")
     database_url: str = Field(
-        default="", description="SQLAlchemy address; empty = sqlite file in the data folder."
+        default="", description="SQLAlchemy address; empty = SQLite file in the data folder."
     )
     storage_url: str = Field(
         default="",
@@ -48,19 +48,20 @@ class Settings(BaseSettings):
     auth: Literal["auto", "keys", "none"] = Field(
         default="auto",
         description=(
-            "Who may ask: keys = who has a key of `lensmodel keys`; none = anybody of this machine; auto = "
-            "keys where others can reach it, or once there is a key."
+            "Who may use it: keys = whoever has a key made by `lensmodel keys`; none = anybody on this "
+            "machine; auto = keys where others can reach it, or once there is a key."
         ),
     )
 
     allowed_hosts: str = Field(
-        default="", description="Names by which others reach it, by commas: behind a proxy, or in a network."
+        default="",
+        description="Names by which others reach it, comma separated: behind a proxy, or in a network.",
     )
 
     max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
     max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
     max_stored_gb: float = Field(
-        default=200.0, gt=0, description="Bytes of photos and results of one owner, in GiB."
+        default=200.0, gt=0, description="Largest total of one owner's photos and results, in GiB."
     )
     keep_photos: Literal["never", "always"] = Field(
         default="always",
@@ -84,7 +85,7 @@ class Settings(BaseSettings):
         default=10,
         ge=0,
         le=19,
-        description="How far photo work gives way to requests, as of nice(1); 0 = not at all.",
+        description="How far photo work gives way to requests, as in nice(1); 0 = not at all.",
     )
     task_user: str = Field(
         default="auto",
@@ -101,7 +102,7 @@ class Settings(BaseSettings):
         ),
     )
     lease_seconds: float = Field(
-        default=20.0, gt=0, description="A worker silent for so long is taken for dead."
+        default=20.0, gt=0, description="A worker silent for this long is taken for dead."
     )
 
     task_seconds: float = Field(
@@ -114,21 +115,21 @@ class Settings(BaseSettings):
         default=0,
         ge=0,
         le=1000,
-        description="Patches that are used of one photo; 0: as many as the estimator needs.",
+        description="Patches used from one photo; 0: as many as the estimator needs.",
     )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
     assume_single_copy: bool = Field(
-        default=False, description="Photos without a serial belong to the one lens of that model."
+        default=False, description="Photos without a serial number belong to the one lens of that model."
     )
 
     metrics_address: str = Field(
-        default="", description="Where a worker has /metrics of its own, as 127.0.0.1:9000; empty: nowhere."
+        default="", description="Where a worker serves its /metrics, such as 127.0.0.1:9000; empty: nowhere."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="Least that is logged."
+        default="info", description="Lowest level that is logged."
     )
     log_format: Literal["text", "json"] = Field(
-        default="text", description="Lines for people, or one JSON object a line for collectors."
+        default="text", description="text: lines for people; json: one JSON object a line, for collectors."
     )
 
     @model_validator(mode="before")

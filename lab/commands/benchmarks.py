@@ -60,13 +60,15 @@ def blind(
     methods: Annotated[
         str, typer.Option(help="Estimators, comma separated; also cho-lee, sun, xu-jia and zhang.")
     ] = ESTIMATORS,
-    cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
+    cases: Annotated[int | None, typer.Option(help="Largest number of cases.")] = None,
     scenes: Annotated[
         int | None,
-        typer.Option(min=1, help="So many windows of the photographs in turn. Default: one of each."),
+        typer.Option(min=1, help="Number of windows, from the photographs in turn. Default: one of each."),
     ] = None,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
-    judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
+    judge: Annotated[
+        str, typer.Option(help="Prior of the deblurring for ER: hyper-laplacian or epll.")
+    ] = "hyper-laplacian",
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
         Path,

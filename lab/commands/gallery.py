@@ -36,13 +36,15 @@ def gallery(
     ] = Path("gallery-output"),
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", metavar="NAME", help="Only pictures whose name holds this; may be repeated."),
+        typer.Option(
+            "--only", metavar="NAME", help="Only pictures whose name contains this; may be repeated."
+        ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes and threads.")] = 2,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """A page to look at: each picture calibrated from itself, corrected by default, beside its original.
+    """A page to look at: each picture calibrated from itself and corrected, beside its original.
 
     Real photos of the test data and simulated frames, with crops at 3:1 and figures. Results are kept by the
     content of the photo and the version of the code: the same command again goes on where it was, and writes

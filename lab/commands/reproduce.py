@@ -51,7 +51,7 @@ def reproduce(
         bool,
         typer.Option(
             "--compare",
-            help="Also the paper's own way, a general profile, a printed target and a blind rival: hours.",
+            help="Also the paper's own method, a general profile, a printed target and a blind rival: hours.",
         ),
     ] = False,
     assert_bars: Annotated[

@@ -41,8 +41,8 @@ def calibrate(
         choice(
             "--model",
             tuple(PRESETS),
-            "paper: learn the paper's own way, kernels by Michaeli and Irani and nothing but their "
-            "regression, and correct by Richardson-Lucy; to compare with. Kept from then on.",
+            "paper: the paper's method alone, for comparison: kernels by Michaeli and Irani, their "
+            "regression, and correction by Richardson-Lucy. A profile keeps its model.",
         ),
     ] = None,
     estimator: Annotated[
@@ -65,7 +65,9 @@ def calibrate(
         typer.Option(metavar="ADDRESS", help="Address of a Dask cluster that estimates the photos."),
     ] = None,
     any_lens: AnyLens = False,
-    force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Discard what the profile holds; begin anew.")
+    ] = False,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,

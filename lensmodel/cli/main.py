@@ -98,7 +98,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str | None]]] = {
     ),
     "keys": (
         "app.commands.keys:keys",
-        "Make, list and end the keys of a service that others can reach.",
+        "Make, list and revoke the keys of a service that others can reach.",
         ADMINISTRATION,
     ),
 }

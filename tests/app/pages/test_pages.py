@@ -704,7 +704,7 @@ def test_a_page_does_not_go_while_somebody_is_asked(page: Page, learned: dict[st
 def test_the_focus_stays_where_a_button_was(page: Page, service: Service, tmp_path: Path) -> None:
     photo = service.calibrated(write_photo(tmp_path / "focus.dng", 63, serial="F-1", shape=SMALL))
     page.goto(f"/photos/{photo['id']}")
-    page.get_by_role("button", name="Leave it out of the lens").click()
+    page.get_by_role("button", name="Do not use it for the lens").click()
 
     expect(page.get_by_role("button", name="Use it again")).to_be_focused()
 

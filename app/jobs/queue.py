@@ -23,6 +23,7 @@ from dbos import DBOS, DBOSConfig, EnqueueOptions
 from dbos import Serializer as DBOSSerializer
 from sqlalchemy import make_url
 
+from app.store.database import SERVER_DEADLINES
 from app.store.jobs import Job, Kind
 
 log = logging.getLogger(__name__)
@@ -82,6 +83,8 @@ class DbosEngine:
             "log_level": "WARNING",
             "enable_otlp": False,
         }
+        if not self._url.startswith("sqlite"):
+            config["db_engine_kwargs"] = {"connect_args": dict(SERVER_DEADLINES)}
         DBOS(config=config)
         for kind, handler in handlers.items():
             DBOS.workflow(name=kind)(handler)

@@ -37,6 +37,9 @@ SERVER_DEADLINES: Final = {
     "keepalives_idle": 10,
     "keepalives_interval": 5,
     "keepalives_count": 3,
+    # the server's end, too: else what a transaction has locked stays locked for hours
+    "options": "-c tcp_user_timeout=15000 -c tcp_keepalives_idle=10 -c tcp_keepalives_interval=5 "
+    "-c tcp_keepalives_count=3",
 }
 
 

@@ -18,17 +18,19 @@ from typing import Any
 
 import httpx2
 import pytest
-from deadline import stretched
+from deadline import Deadline, stretched
 from quick_tasks import CELLS
 from servers import missing, moto, postgres
-from sqlalchemy import select
+from sqlalchemy import select, text
 from torture import in_environment
 
 from app.blobs.storage import Storage
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.database import Database
 from app.store.migrate import upgrade
+from app.store.owners import ensure_owner
 from app.store.tables import PhotoRow, SampleRow
 
 HERE = Path(__file__).parents[1]
@@ -248,3 +250,38 @@ def test_two_hosts_share_the_patches_of_a_photo_and_one_may_be_cut_off_and_retur
     ]
     report = examine(installed.settings, installed.store, installed.storage)
     assert report.findings == ()
+
+
+# Holds a row of the first owner in a transaction without end
+HOLDS = """
+import sys, time
+from pathlib import Path
+from sqlalchemy import text
+from app.store.database import Database
+
+with Database(sys.argv[1]).writing() as session:
+    session.execute(text("UPDATE owner SET name = name"))
+    Path(sys.argv[2]).touch()
+    time.sleep(600)
+"""
+
+
+def test_what_a_host_has_locked_is_free_again_once_it_was_cut_off(hosts: list[Host], tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(HERE.parents[1]))}
+    with postgres(",".join(["127.0.0.1", *(host.gateway for host in hosts)])) as server:
+        database = Database(server.url("app"))
+        upgrade(database)
+        with database.writing() as session:
+            ensure_owner(session, "local")
+        held = tmp_path / "held"
+        hosts[0].run(["-c", HOLDS, server.url("app", hosts[0].gateway), str(held)], environment)
+        deadline = Deadline(PATIENCE_S)
+        while not held.exists():
+            assert not deadline.passed(), hosts[0].log.read_text()
+            time.sleep(0.1)
+
+        hosts[0].cut_off()
+        with database.writing() as session:
+            session.execute(text(f"SET LOCAL lock_timeout = '{stretched(PATIENCE_S):.0f}s'"))
+            assert session.connection().execute(text("UPDATE owner SET name = name")).rowcount == 1
+        database.close()

@@ -20,6 +20,7 @@ from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import CorrectionIn, Id, PhotoOut, Region
+from app.store.database import new_id
 from app.store.tables import PhotoRow
 from lensmodel.workflow.correcting import SEEN_DB
 
@@ -111,7 +112,8 @@ def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
             "output": {"format": "png8", "color_space": "srgb"},
         }
     )
-    correction = correction_routes.create_correction(request, call)
+    # not shared: who asks deletes it, while the next page may be asking for the same already
+    correction = correction_routes.begin(request, call, look=new_id())
     return {"id": correction.id}
 
 

@@ -159,6 +159,18 @@ def test_a_photo_of_another_lens_is_refused_until_its_owner_insists(client: Test
     assert post(client, photo_id=photo.public_id, lens_id=lens_id, any_lens=True).status_code == 202
 
 
+def test_a_preview_is_its_pages_own_which_deletes_it_while_another_asks(
+    client: TestClient, steps: Steps
+) -> None:
+    address = f"/ui/photos/{steps.counted().public_id}/preview"
+    left, opened = (
+        client.post(address, json={"x": 0, "y": 0, "width": 9, "height": 9}).json()["id"] for _ in range(2)
+    )
+
+    assert client.delete(f"/v1/corrections/{left}").status_code == 204
+    assert client.get(f"/v1/jobs/{opened}").status_code == 200
+
+
 def test_a_photo_without_a_lens_must_be_told_one(client: TestClient, steps: Steps) -> None:
     photo = steps.receive(calibrate=False)
     steps.inspect(photo, serial=None)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
@@ -14,13 +12,13 @@ from sqlalchemy import Connection, text
 
 import migrations
 from app.store.database import Database
+from app.store.tables import Base
 from lensmodel.core.errors import InvalidInputError
 
 _LOCK = 0x1E45  # any number that only this program uses
 
 
-def alembic_config(connection: Connection | None = None) -> Config:
-    """Return Alembic's configuration for the steps in `migrations/`."""
+def _config(connection: Connection | None = None) -> Config:
     alembic = Config()
     alembic.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
     alembic.attributes["connection"] = connection
@@ -29,7 +27,7 @@ def alembic_config(connection: Connection | None = None) -> Config:
 
 def head() -> str | None:
     """Return the newest revision that this program knows."""
-    return ScriptDirectory.from_config(alembic_config()).get_current_head()
+    return ScriptDirectory.from_config(_config()).get_current_head()
 
 
 def current(database: Database) -> str | None:
@@ -43,13 +41,18 @@ def upgrade(database: Database) -> bool:
     before = current(database)
     if before == head():
         return False
-    known = {step.revision for step in ScriptDirectory.from_config(alembic_config()).walk_revisions()}
+    known = {step.revision for step in ScriptDirectory.from_config(_config()).walk_revisions()}
     if before is not None and before not in known:
         raise InvalidInputError(
             f"the database was made by a newer program, schema {before}; update lensmodel, or use other data"
         )
-    with _alone(database) as connection:
-        command.upgrade(alembic_config(connection), "head")
+    with database.writer.connect() as connection, connection.begin():
+        if not database.is_sqlite:  # on SQLite BEGIN IMMEDIATE shuts the others out
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        if MigrationContext.configure(connection).get_current_revision() is None:
+            Base.metadata.create_all(connection)
+            command.stamp(_config(connection), "head")
+        command.upgrade(_config(connection), "head")
     return True
 
 
@@ -61,17 +64,3 @@ def check(database: Database) -> None:
             f"{database.url.render_as_string()} has schema {present}, this program needs {wanted}: "
             "start the service of this version on it once"
         )
-
-
-def downgrade(database: Database, revision: str) -> None:
-    """Undo steps down to `revision` ("base" = all)."""
-    with _alone(database) as connection:
-        command.downgrade(alembic_config(connection), revision)
-
-
-@contextmanager
-def _alone(database: Database) -> Iterator[Connection]:
-    with database.writer.connect() as connection, connection.begin():
-        if not database.is_sqlite:  # on SQLite BEGIN IMMEDIATE shuts the others out
-            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
-        yield connection

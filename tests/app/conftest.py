@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Engine, create_engine
+from sqlalchemy import Engine, MetaData, create_engine
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
@@ -24,7 +24,7 @@ from app.sandbox.outcome import Outcome
 from app.sandbox.runner import Budget
 from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.database import Database, new_id
-from app.store.migrate import downgrade, upgrade
+from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import PROFILE_FILE, CorrectionRow, PhotoRow
 from lensmodel.core.errors import LensModelError
@@ -190,12 +190,19 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "app.db"
 
 
+def emptied_of_tables(opened: Database) -> Database:
+    """Drop all tables that are there."""
+    there = MetaData()
+    there.reflect(opened.writer)
+    there.drop_all(opened.writer)
+    return opened
+
+
 @pytest.fixture
 def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
     settings.data_dir.mkdir(parents=True)
     if SERVER:
-        emptied = Database(SERVER)
-        downgrade(emptied, "base")
+        emptied = emptied_of_tables(Database(SERVER))
         upgrade(emptied)
         emptied.close()
     else:

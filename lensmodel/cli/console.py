@@ -23,12 +23,12 @@ import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     ProgressColumn,
     SpinnerColumn,
     Task,
     TaskID,
+    TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
 )
@@ -101,13 +101,13 @@ class Display:
         typer.echo(f"lensmodel: {text}", err=True)
 
     @contextmanager
-    def progress(self) -> Iterator[Progress]:
-        """Bars with counts and the time left; plain lines now and then where no terminal can show them."""
+    def progress(self) -> Iterator[PacedProgress]:
+        """One bar with share and time left; plain lines now and then where no terminal can show it."""
         terminal = sys.stderr.isatty()
         bars = PacedProgress(
             TextColumn("{task.description}"),
             BarColumn(),
-            MofNCompleteColumn(),
+            TaskProgressColumn(),
             TimeElapsedColumn(),
             TimeLeft(),
             say=None if self.quiet or terminal else _to_standard_error,
@@ -180,7 +180,7 @@ class Pace:
 
 
 class PacedProgress(Progress):
-    """Bars that know the time left; where no terminal can show bars, a plain line now and then."""
+    """A bar that never goes back and knows the time left; without a terminal, a plain line now and then."""
 
     def __init__(
         self,
@@ -194,12 +194,19 @@ class PacedProgress(Progress):
         self._began = self._last = time.monotonic()
         self._paces: dict[TaskID, Pace] = {}
 
-    def update(self, task_id: TaskID, **changes: Any) -> None:  # noqa: ANN401 - as there
-        """Change a task as `Progress.update` does; tell it if it is time."""
-        super().update(task_id, **changes)
+    def update(self, task_id: TaskID, *, more: bool = False, **changes: Any) -> None:  # noqa: ANN401 - as there
+        """Change a task as `Progress.update` does; tell it if it is time.
+
+        What was done of a photo that is then passed over stays done. While there is `more` work of another
+        kind ahead, whose pace nobody knows, no time left is told.
+        """
         now, task = time.monotonic(), self._tasks[task_id]
-        pace = self._paces.setdefault(task_id, Pace())
-        pace.mark(now, task.completed, task.total)
+        if "completed" in changes:
+            changes["completed"] = max(changes["completed"], task.completed)
+        super().update(task_id, **changes)
+        pace = self._paces[task_id] = Pace() if more else self._paces.get(task_id, Pace())
+        if not more:
+            pace.mark(now, task.completed, task.total)
         left = pace.left(now)
         task.fields["left"] = "" if left is None else f"ETA {clock(left)}"
         if self._say is not None and now - self._last >= self._every_s:
@@ -229,9 +236,11 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def show_share(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+def show_share(
+    bars: PacedProgress, task: TaskID, number: int, done: int, total: int, *, more: bool = False
+) -> None:
     """Show that photo `number` is done as far as `done` of `total`."""
-    bars.update(task, completed=number + done / max(total, 1))
+    bars.update(task, completed=number + done / max(total, 1), more=more)
 
 
 def _to_standard_error(text: str) -> None:

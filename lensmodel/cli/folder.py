@@ -16,10 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from lensmodel.cli import calibrate, files, outputs
-from lensmodel.cli.console import Display, aligned, gain_words, show_share
+from lensmodel.cli.console import Display, PacedProgress, aligned, gain_words, show_share
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
 from lensmodel.core.files import atomic
 from lensmodel.core.names import camera_name, name_key, serial_key
@@ -76,10 +76,12 @@ class Folder:
                 results.append({"photo": str(path), "output": None, **files.failed(error)})
                 self._display.error(f"{path}: {files.reason(error)}")
         lens_groups, unread = groups(shots), len(results)
+        most = [min(self._most, group.scenes) for group in lens_groups]
         with self._display.progress() as bars:
-            self._learn_all(lens_groups, bars)
+            task = bars.add_task("learning", total=sum(most) + len(shots))
+            self._learn_all(lens_groups, most, bars, task)
             by_path = {path: target for target, path in targets.items()}
-            rows = self._correct_all(lens_groups, by_path, bars, results, as_json=as_json)
+            rows = self._correct_all(lens_groups, by_path, bars, task, sum(most), results, as_json=as_json)
         if not as_json:
             self._display.result(_table(rows))
             self._say_more(rows, unread, {target.parent for target in targets})
@@ -102,10 +104,10 @@ class Folder:
     def _profile_of(self, group: PhotoGroup) -> Path:
         return self._profiles / f"{group.name}{ENDING}"
 
-    def _learn_all(self, lens_groups: Sequence[PhotoGroup], bars: Progress) -> None:
-        """Learn the lenses of all groups from their usable photos, at most as many as were asked for."""
-        most = [min(self._most, group.scenes) for group in lens_groups]
-        task = bars.add_task("", total=sum(most))
+    def _learn_all(
+        self, lens_groups: Sequence[PhotoGroup], most: Sequence[int], bars: PacedProgress, task: TaskID
+    ) -> None:
+        """Learn the lenses of all groups from their usable photos, `most` of each."""
         for number, group in enumerate(lens_groups):
             target = self._profile_of(group)
             if target not in self._calibrations:
@@ -115,14 +117,13 @@ class Folder:
                     any_lens=self._options.any_lens,
                 )
             self._learn(group, self._calibrations[target], most[number], bars, task, sum(most[:number]))
-        bars.remove_task(task)
 
     def _learn(
         self,
         group: PhotoGroup,
         calibration: calibrating.Calibration,
         most: int,
-        bars: Progress,
+        bars: PacedProgress,
         task: TaskID,
         before: int,
     ) -> None:
@@ -132,7 +133,7 @@ class Folder:
                 break
             on_event = partial(_learning, bars, task, before + counted)
             counted += self._learns(calibration, shot, group, on_event)
-        bars.update(task, completed=before + most)
+        bars.update(task, completed=before + most, more=True)
         refused = [self._refused.get(shot.path) for shot in group.shots]
         if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
             reasons = set(map(str, refused))
@@ -173,14 +174,15 @@ class Folder:
         self,
         lens_groups: Sequence[PhotoGroup],
         targets: Mapping[Path, Path],
-        bars: Progress,
+        bars: PacedProgress,
+        task: TaskID,
+        before: int,
         results: list[dict[str, Any]],
         *,
         as_json: bool,
     ) -> list[dict[str, Any]]:
         """Correct the photos that gain from it, leave the others, and return a row for each group."""
-        task = bars.add_task("", total=sum(len(group.shots) for group in lens_groups))
-        rows, number = [], 0
+        rows, number = [], before
         for group in lens_groups:
             profile = self._profile_of(group)
             lens = Lens(files.profile_at(profile)) if profile.exists() else None
@@ -188,10 +190,11 @@ class Folder:
             left: Counter[str] = Counter()
             gains: list[float] = []
             for shot in group.shots:
-                bars.update(task, description=f"2 of 2, correcting {shot.path.name}")
+                more = group is not lens_groups[-1]  # of other photos, which may be left or take longer
+                bars.update(task, description=f"correcting {shot.path.name}", more=more)
                 target = targets[shot.path]
                 result = self._correct_shot(
-                    shot, group, target, lens, partial(show_share, bars, task, number)
+                    shot, group, target, lens, partial(show_share, bars, task, number, more=more)
                 )
                 states[result["state"]] += 1
                 if result["state"] == "corrected":
@@ -204,7 +207,7 @@ class Folder:
                 outputs.say(shot.path, target, result, self._display, tell)
                 results.append({"photo": str(shot.path), "output": str(target), **result})
                 number += 1
-                bars.update(task, completed=number)
+                bars.update(task, completed=number, more=more)
             rows.append(
                 {
                     "camera": group.camera,
@@ -220,7 +223,6 @@ class Folder:
                     "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
                 }
             )
-        bars.remove_task(task)
         return rows
 
     def _correct_shot(
@@ -269,10 +271,13 @@ def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
     return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
 
 
-def _learning(bars: Progress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
+def _learning(bars: PacedProgress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
     share = event.done / event.total if event.total else 0.0
     bars.update(
-        task, description=f"1 of 2, learning from {event.photo.name}: {event.stage}", completed=number + share
+        task,
+        description=f"learning from {event.photo.name}: {event.stage}",
+        completed=number + share,
+        more=True,
     )
 
 

@@ -710,7 +710,7 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -
     )
 
     assert said.startswith("| method |")
-    assert "3/3" in seen
+    assert "100%" in seen
 
 
 def test_a_question_to_the_lens_says_that_it_is_being_answered(on_a_terminal: Seen) -> None:

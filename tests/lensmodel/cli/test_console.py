@@ -41,16 +41,24 @@ def test_without_a_terminal_progress_is_told_in_lines() -> None:
     assert said == ["[0:00]  25 % learning from a.dng"]
 
 
-def test_time_left_is_told_by_the_pace_of_the_stage_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_left_is_told_by_the_pace_of_the_last_kind_of_work_and_no_share_falls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     said: list[str] = []
-    clock_s = iter((0.0, 60.0, 61.0, 64.0, 67.0))
+    clock_s = iter((0.0, 60.0, 120.0, 121.0, 124.0, 127.0))
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock_s))
     lines = PacedProgress(say=said.append, every_s=0.0, disable=True)
-    task = lines.add_task("estimating", total=8)
-    for done in (8, 0, 1, 2):  # a minute of one stage, then a photo each three seconds
-        lines.update(task, completed=done)
+    task = lines.add_task("photos", total=10)
+    for done, more in ((1.8, True), (1, True), (2, False), (3, False), (4, False)):  # one passed over
+        lines.update(task, completed=done, more=more)
 
-    assert said[-1] == "[1:07]  25 % estimating, about 0:18 left"
+    assert said == [
+        "[1:00]  18 % photos",
+        "[2:00]  18 % photos",
+        "[2:01]  20 % photos",
+        "[2:04]  30 % photos",
+        "[2:07]  40 % photos, about 0:18 left",
+    ]
 
 
 PACES = {

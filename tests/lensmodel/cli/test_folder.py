@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import shutil
 from dataclasses import replace
 from datetime import datetime, timedelta
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from running import SMALL, write_photo
 
+from lensmodel.cli.console import PacedProgress
 from lensmodel.cli.folder import Shot, groups
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -117,6 +121,22 @@ def test_quiet_says_nothing_but_errors_and_verbose_tells_of_each_photo(journey: 
     assert quiet.stdout == ""
     assert len(quiet.stderr.splitlines()) == 1
     assert "a-corrected.tif is there already" in verbose.stderr
+
+
+def test_one_progress_goes_from_the_first_photo_learned_to_the_last_corrected_and_never_back(
+    card: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(card / "holiday", tmp_path / "holiday", ignore=shutil.ignore_patterns("corrected"))
+    shutil.copytree(card / "lenses", tmp_path / "lenses")
+    monkeypatch.setitem(PacedProgress.__init__.__kwdefaults__, "every_s", 0.0)
+
+    lines = re.findall(r"\] +(\d+) % (\w+)(.*)", lensmodel(*AUTO, cwd=tmp_path).stderr)
+
+    shares = [int(share) for share, _, _ in lines]
+    assert shares == sorted(shares)
+    assert shares[-1] == 100
+    assert [verb for verb, _ in groupby(verb for _, verb, _ in lines)] == ["learning", "correcting"]
+    assert not [rest for _, verb, rest in lines if verb == "learning" and " left" in rest]
 
 
 def test_a_profile_and_auto_exclude_each_other(card: Path) -> None:

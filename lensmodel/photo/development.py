@@ -14,7 +14,9 @@ import rawpy
 
 from lensmodel.core.errors import (
     LensModelError,
+    MetadataMissingError,
     NotAnImageError,
+    TruncatedImageError,
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
@@ -75,6 +77,10 @@ def info_of(path: Path, header: Header, limits: Limits, raw: rawpy.RawPy | None 
         check_size(width, height, path.stat().st_size, limits)
     if header.kind == "jpeg" and header.channels == 4:
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
+    if not header.whole:
+        raise TruncatedImageError(
+            f"the {header.kind.upper()} ends before its picture does; the upload was cut off"
+        )
     if min(width, height) < MIN_SIDE:
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
@@ -180,20 +186,27 @@ def develop(
     with opened_header(path, limits) as header:
         if header.kind in {"raw", "dng"}:
             with opened_raw(path) as raw:
-                info = _accepted(info_of(path, header, limits, raw), on_info)
+                info = _accepted(info_of(path, header, limits, raw), on_info, lambda: Mosaic.of(raw))
                 others = suspects_of_siblings(path, info.metadata, siblings, limits)
                 developed = _develop_raw(raw, header, info, others)
         else:
-            info = _accepted(info_of(path, header, limits), on_info)
+            info = _accepted(info_of(path, header, limits), on_info, lambda: read_pixels(path, header))
             developed = _develop_raster(path, header, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)
     return developed
 
 
-def _accepted(info: PhotoInfo, on_info: Callable[[PhotoInfo], None] | None) -> PhotoInfo:
-    if on_info is not None:
-        on_info(info)
+def _accepted(
+    info: PhotoInfo, on_info: Callable[[PhotoInfo], None] | None, decode: Callable[[], object]
+) -> PhotoInfo:
+    """Ask the caller; nobody shall look up what a photo does not say that is damaged."""
+    try:
+        if on_info is not None:
+            on_info(info)
+    except MetadataMissingError:
+        decode()
+        raise
     return info
 
 

@@ -17,7 +17,7 @@ from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_de
 _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
 _GREEN: Final = 1  # the number of green among the colours of a mosaic
 _BAND: Final = 16
-"""Rows that are judged together by `Mosaic.check`."""
+"""Rows that are judged together by `Mosaic.of`."""
 
 _CLUSTER: Final = 0.005
 """Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
@@ -60,21 +60,23 @@ class Mosaic:
 
     @classmethod
     def of(cls, raw: rawpy.RawPy) -> Mosaic | None:
-        """Take the mosaic of an opened file; `None` where each pixel has all colours already."""
+        """Take the mosaic of an opened file, refuse a damaged one; `None` where pixels have all colours."""
         if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
             return None
         letters = raw.color_desc.decode("ascii", "replace")
         require_known_mosaic(["".join(letters[colour] for colour in row) for row in raw.raw_pattern])
         black = tuple(float(level) for level in raw.black_level_per_channel)
-        return cls(
+        mosaic = cls(
             raw.raw_image_visible,
             raw.raw_colors_visible,
             black,
             int(raw.white_level),
             raw.raw_pattern.shape == (2, 2),
         )
+        mosaic._check()
+        return mosaic
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Refuse numbers that no sensor gives, although the decoder was content."""
         height, width = self.values.shape
         if not self.is_bayer and min(height, width) < _XTRANS_SIDE:

@@ -128,7 +128,6 @@ def develop_raw(
     mosaic = Mosaic.of(raw)
     white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
     if mosaic is not None:
-        mosaic.check()
         white, clip = mosaic.saturation()
     sensor_noise = _sensor_noise(mosaic, white)
     defects = 0 if mosaic is None else mosaic.repair(others)

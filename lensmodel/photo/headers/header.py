@@ -46,6 +46,7 @@ class Header:
     opcodes_3: bytes = b""
     # rows and columns of pixels that share one value of a JPEG's chroma
     chroma_step: tuple[int, int] = (1, 1)
+    whole: bool = True  # false where the file ends before its picture does
 
 
 def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None:

@@ -28,7 +28,7 @@ _NO_FRAMES: Final = {0xC4, 0xC8, 0xCC}
 def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
     """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation."""
     header, icc_parts = Header("jpeg"), dict[int, bytes]()
-    for code, body in _segments(buffer):
+    for at, code, body in _segments(buffer):
         if 0xC0 <= code <= 0xCF and code not in _NO_FRAMES:
             if len(body) < 6:
                 raise TruncatedImageError("the JPEG's frame header is cut off")
@@ -41,6 +41,8 @@ def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
                 bits=bits,
                 chroma_step=_chroma_step(body[6:]),
             )
+        elif code == _START_OF_SCAN:  # in which a zero follows a byte of 0xFF
+            header = replace(header, whole=buffer.find(bytes((0xFF, _END_OF_IMAGE)), at) >= 0)
         elif code == _TABLES:
             header = replace(header, coarseness=_coarseness(body) or header.coarseness)
         elif body.startswith(b"Exif\0") and (reader := TiffReader.open(body, 6)):
@@ -80,8 +82,8 @@ def _coarseness(tables: bytes) -> float:
     return 0.0
 
 
-def _segments(buffer: Buffer) -> Iterator[tuple[int, bytes]]:
-    """Yield marker code and content of each segment before the first scan.
+def _segments(buffer: Buffer) -> Iterator[tuple[int, int, bytes]]:
+    """Yield place, marker code and content of each segment up to the first scan, which has none.
 
     Stray bytes between them are passed over, as viewers do (libjpeg, `next_marker`).
     """
@@ -92,10 +94,12 @@ def _segments(buffer: Buffer) -> Iterator[tuple[int, bytes]]:
         if len(marker) < 4:
             raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off")
         code, length = marker[1], struct.unpack(">H", marker[2:])[0]
+        if code == _START_OF_SCAN:
+            yield at, code, b""
         if code in {_START_OF_SCAN, _END_OF_IMAGE}:
             return
         if code in _BARE:
             at += 1
             continue
-        yield code, bytes(buffer[at + 4 : at + 2 + length])
+        yield at, code, bytes(buffer[at + 4 : at + 2 + length])
         at += 2 + length

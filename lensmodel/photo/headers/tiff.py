@@ -54,7 +54,10 @@ def read_tiff(buffer: Buffer, limits: Limits) -> Header:
         header = _sized(replace(header, kind="dng" if _DNG_VERSION in first else "raw"), largest)
         if header.kind == "dng":
             header = replace(
-                header, opcodes_2=_block(largest, 51009) or b"", opcodes_3=_block(largest, 51022) or b""
+                header,
+                opcodes_2=_block(largest, 51009) or b"",
+                opcodes_3=_block(largest, 51022) or b"",
+                whole=_ends_inside(largest, len(buffer)),
             )
         if header.kind == "dng" and header.compression == _LOSSY:
             header = replace(header, coarseness=_coarseness(buffer, largest, limits))
@@ -144,6 +147,13 @@ def _coarseness(buffer: Buffer, directory: Directory, limits: Limits) -> float:
     return 0.0
 
 
+def _ends_inside(directory: Directory, file_bytes: int) -> bool:
+    """Whether no strip or tile that a directory lists goes beyond the file's end."""
+    places = (directory.get(tag) or directory.get(other) for tag, other in ((273, 324), (279, 325)))
+    starts, lengths = (() if place is None else place.integers() for place in places)
+    return all(start + length <= file_bytes for start, length in zip(starts, lengths, strict=False))
+
+
 def _check_strips(directory: Directory, file_bytes: int) -> None:
     """Refuse a picture whose strips or tiles do not lie in the file."""
     width, height = _value(directory, 256, 0), _value(directory, 257, 0)
@@ -158,7 +168,7 @@ def _check_strips(directory: Directory, file_bytes: int) -> None:
     starts, lengths = offsets.integers(), counts.integers()
     if not starts or len(starts) != len(lengths):
         raise TruncatedImageError("the TIFF's strip table lies outside the file; the upload was cut off")
-    if any(a + n > file_bytes for a, n in zip(starts, lengths, strict=True)):
+    if not _ends_inside(directory, file_bytes):
         raise TruncatedImageError("the TIFF's pixel data go beyond the file's end; the upload was cut off")
     stored = width * height * _value(directory, 277, 1) * max(_value(directory, 258, 1), 1) / 8
     if _value(directory, 259, 1) == 1 and _value(directory, 262, 1) != 6 and sum(lengths) < 0.999 * stored:

@@ -20,8 +20,10 @@ from lensmodel.core.errors import (
     DecompressionBombError,
     ImageTooLargeError,
     LensModelError,
+    MetadataMissingError,
     NotAnImageError,
     TruncatedImageError,
+    UnreadablePhotoError,
     UnsupportedFormatError,
 )
 from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
@@ -154,25 +156,41 @@ def test_an_honest_photo_over_the_limit_is_too_large_and_no_bomb(tmp_path: Path)
     assert not isinstance(caught.value, DecompressionBombError)
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+def _whole(kind: str, path: Path) -> bytes:
+    """A photo's bytes; TIFF is told from DNG by what it holds."""
+    if kind != "DNG":
+        return encoded(kind)
+    mosaic = np.random.default_rng(0).integers(600, 9000, (96, 128), dtype=np.uint16)
+    write_bayer_dng(path, mosaic, black=512, white=15000)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "DNG"])
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.95])
-def test_a_file_that_was_cut_off_never_becomes_a_photo(tmp_path: Path, kind: str, share: float) -> None:
-    data = encoded(kind)
+def test_a_file_that_was_cut_off_is_refused_before_it_is_decoded(
+    tmp_path: Path, kind: str, share: float
+) -> None:
     path = tmp_path / "cut"
+    data = _whole(kind, path)
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises((TruncatedImageError, NotAnImageError)):
-        photo.develop(path)
+        photo.inspect(path)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
-def test_a_raw_file_that_was_cut_off_never_becomes_a_photo(tmp_path: Path, share: float) -> None:
-    mosaic = np.random.default_rng(0).integers(600, 9000, (96, 128), dtype=np.uint16)
-    whole = tmp_path / "whole.dng"
-    write_bayer_dng(whole, mosaic, black=512, white=15000)
-    cut = tmp_path / "cut.dng"
-    cut.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
-    with pytest.raises(TruncatedImageError):
-        photo.develop(cut)
+@pytest.mark.parametrize("kind", ["PNG", "DNG"])
+def test_of_a_damaged_photo_the_damage_is_said_and_not_what_else_it_lacks(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "damaged"
+    data = bytearray(_whole(kind, path))
+    middle = len(data) // 3
+    data[middle:-30] = bytes(len(data) - 30 - middle)  # not the end chunk
+    path.write_bytes(data)
+    photo.inspect(path)  # nothing in its header shows it
+
+    def refused(info: photo.PhotoInfo) -> None:
+        raise MetadataMissingError("it does not say its aperture")
+
+    with pytest.raises(UnreadablePhotoError):
+        photo.develop(path, on_info=refused)
 
 
 def test_a_tiff_whose_directories_form_a_loop_is_read_once(tmp_path: Path) -> None:

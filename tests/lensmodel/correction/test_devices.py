@@ -12,14 +12,16 @@ from lensmodel.correction.blur import Drift, UniformBlur
 from lensmodel.correction.devices import VARIABLE, Device, device_of
 from lensmodel.correction.limit import limited
 
-LIBRARIES = ["numpy", "array_api_strict", "torch:cpu"]
+LIBRARIES = ["numpy", "array_api_strict", "torch:cpu", "torch:cuda", "cupy"]
 
 
 @pytest.fixture(params=LIBRARIES)
 def library(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     if name != "numpy":  # NumPy itself keeps to the standard: the paths are always compared
-        pytest.importorskip(name.split(":", maxsplit=1)[0])
+        package = pytest.importorskip(name.split(":", maxsplit=1)[0])
+        if name in {"torch:cuda", "cupy"} and not package.cuda.is_available():
+            pytest.skip("no graphics card here")
     return name
 
 

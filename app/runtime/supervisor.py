@@ -1,7 +1,8 @@
-"""`lensmodel serve`: one API process and one worker process, which end together.
+"""The processes of the service: an API, a worker, and `lensmodel serve`, an API with a worker as its child.
 
-Starting the service again after one of them died is left to whoever started it: systemd or a container engine
-(docs/topics/operating.md). Nothing is lost meanwhile: work goes on where the tables say.
+These two end together. Starting the service again after one of them died is left to whoever started it:
+systemd or a container engine (docs/topics/operating.md). Nothing is lost meanwhile: work goes on where the
+tables say.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ import os
 import socket
 import subprocess
 import sys
-import time
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from app.runtime import server
+import uvicorn
+
+from app.runtime import logs
 from app.runtime.processes import PARENT
 from app.runtime.settings import PREFIX, Settings
 from app.sandbox import confine
@@ -33,13 +36,13 @@ from lensmodel.core.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-# How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`, and less
-# than a command that was interrupted may take (`lensmodel.cli.ending`)
+# Connections at once; more get 503 (chosen): fewer than the files that a process may have open
+MAX_CONNECTIONS: Final = 1000
+# How long open requests may take after the order to stop (chosen), and then the worker (chosen): less than a
+# command that was interrupted may take (`lensmodel.cli.ending`)
+GRACE_S: Final = 5
 STOP_S: Final = 8.0
-POLL_S: Final = 0.2  # seconds between two looks at the members (chosen): two calls of waitpid
-# Modules of the members; tests replace the worker
-WORKER, API = "app.runtime.worker_main", "app.runtime.server"
-ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+WORKER = "app.runtime.worker_main"  # module of the worker; tests replace it
 
 
 def serve(settings: Settings) -> int:
@@ -47,32 +50,83 @@ def serve(settings: Settings) -> int:
     confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     require_sandbox(settings)
-    with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
+    file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
+    with alone(settings.data_dir), contextlib.closing(listen(settings.host, settings.port)) as listener:
         _prepare(settings)
-        return _run(settings, listener)
+        host, port = listener.getsockname()[:2]
+        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        worker = subprocess.Popen(  # noqa: S603 - our own interpreter, our own module
+            [sys.executable, "-m", WORKER],
+            env=os.environ | environment(settings) | {PARENT: str(os.getpid())},
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # a Ctrl-C reaches this process alone, which stops it
+        )
+        try:
+            text = json.dumps({"url": url, "pid": os.getpid(), "worker_pid": worker.pid}, indent=2)
+            write_atomically(file, (text + "\n").encode())
+            # it answers once the API is up: connections wait in the socket until then
+            print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
+            run(settings, listener, until=worker)
+            if worker.returncode is not None:
+                log.error("the worker ended with status %d, and with it the service", worker.returncode)
+        except InterruptedByUser:
+            return 0
+        finally:
+            worker.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.wait(STOP_S)
+            worker.kill()
+            worker.wait()
+            file.unlink(missing_ok=True)
+    return 1
 
 
 def run_api(settings: Settings) -> None:
     """Run one API process in this process."""
-    confine.keep_private()
     _prepare(settings)
-    with contextlib.closing(_listener(settings)) as listener, contextlib.suppress(InterruptedByUser):
-        server.run(settings, listener)
+    listener = listen(settings.host, settings.port)
+    with contextlib.closing(listener), contextlib.suppress(InterruptedByUser):
+        run(settings, listener)
 
 
 def run_worker(settings: Settings) -> None:
     """Replace this process by a worker."""
     # A new program rather than a call: children import the main module of their parent again, and that of a
     # worker is small for this reason
-    confine.keep_private()
     require_sandbox(settings)
     _prepare(settings, asks_for_keys=False)
-    os.environ.update(ONE_THREAD | environment(settings))
-    os.execv(sys.executable, [sys.executable, "-m", "app.runtime.worker_main"])  # noqa: S606 - no shell is wanted
+    os.environ.update(environment(settings))
+    os.execv(sys.executable, [sys.executable, "-m", WORKER])  # noqa: S606 - no shell is wanted
+
+
+def run(settings: Settings, listener: socket.socket, until: subprocess.Popen[bytes] | None = None) -> None:
+    """Serve until SIGTERM, or until another process ends; log as a service does."""
+    logs.begin("api", settings.log_level, settings.log_format)
+    from app.main import create_app  # noqa: PLC0415 - a worker need not load the application
+
+    config = uvicorn.Config(
+        create_app(settings),
+        log_level=settings.log_level,
+        log_config=None,  # its records go to our handlers
+        access_log=False,  # the application writes its own, without serials
+        timeout_graceful_shutdown=GRACE_S,
+        limit_concurrency=MAX_CONNECTIONS,
+    )
+    server = uvicorn.Server(config)
+
+    def watch() -> None:
+        assert until is not None
+        until.wait()
+        server.should_exit = True
+
+    if until is not None:
+        threading.Thread(target=watch, daemon=True).start()
+    server.run(sockets=[listener])
 
 
 def _prepare(settings: Settings, *, asks_for_keys: bool = True) -> None:
     """Bring the schema up to date, and check that there is a key if one is needed."""
+    confine.keep_private()
     with contextlib.closing(Database(settings.database)) as database:
         migrate.upgrade(database)  # one of several simultaneous processes does it
         if not (asks_for_keys and settings.needs_keys) or Accounts(database).has_valid_key():
@@ -84,6 +138,14 @@ def _prepare(settings: Settings, *, asks_for_keys: bool = True) -> None:
     )
 
 
+_REMEDIES: Final = {
+    "account": "no account to change to: start as root, or with the capabilities SETUID, SETGID, KILL, and "
+    "make an account lens-task that can read the program (the container image has one)",
+    "files": "no Landlock: use Linux 5.13 or newer with it switched on (lsm=landlock,...), and a container "
+    "engine that allows its system calls",
+}
+
+
 def require_sandbox(settings: Settings) -> None:
     """Refuse to start where children must be kept from other files, and something for that is missing."""
     if not settings.needs_sandbox:
@@ -92,18 +154,9 @@ def require_sandbox(settings: Settings) -> None:
     missing = [remedy for name, remedy in _REMEDIES.items() if not in_force[name]]
     if missing:
         raise UsageError(
-            "nothing would keep a hostile photo from the photos of others: "
-            + "; ".join(missing)
-            + "; or accept that by LENS_SANDBOX=try"
+            f"nothing would keep a hostile photo from the photos of others: {'; '.join(missing)}; or accept "
+            "that by LENS_SANDBOX=try"
         )
-
-
-_REMEDIES: Final = {
-    "account": "no account to change to: start as root, or with the capabilities SETUID, SETGID, KILL, and "
-    "make an account lens-task that can read the program (the container image has one)",
-    "files": "no Landlock: use Linux 5.13 or newer with it switched on (lsm=landlock,...), and a container "
-    "engine that allows its system calls",
-}
 
 
 def environment(settings: Settings) -> dict[str, str]:
@@ -113,19 +166,21 @@ def environment(settings: Settings) -> dict[str, str]:
     return {f"{PREFIX}{name.upper()}": str(value) for name, value in values.items()}
 
 
-def _listener(settings: Settings) -> socket.socket:
+def listen(host: str, port: int) -> socket.socket:
+    """Open a listening socket; port 0 takes a free one."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return server.listen(settings.host, settings.port)
+        return socket.create_server((host, port), family=family, backlog=2048)
     except OSError as error:
         raise InvalidInputError(
-            f"cannot listen on {settings.host}:{settings.port}: {error.strerror or error}; "
+            f"cannot listen on {host}:{port}: {error.strerror or error}; "
             "give another --port (0 takes any free one) or --host"
         ) from error
 
 
 @contextmanager
 def alone(data_dir: Path) -> Iterator[None]:
-    """Make sure that only one supervisor works on this folder; the lock ends with the process."""
+    """Make sure that only one service works on this folder; the lock ends with the process."""
     with (data_dir / "service.lock").open("w", encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -134,56 +189,3 @@ def alone(data_dir: Path) -> Iterator[None]:
                 f"another service already works on {data_dir}: stop it, or give another folder by --data"
             ) from error
         yield
-
-
-def _run(settings: Settings, listener: socket.socket) -> int:
-    """Run both processes until one of them ends, or the service is told to stop; return the exit status."""
-    members: dict[str, subprocess.Popen[bytes]] = {}
-    file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
-    host, port = listener.getsockname()[:2]
-    url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-    try:
-        for name, module in (("worker", WORKER), ("api", API)):
-            members[name] = _start(settings, listener, module)
-        pids = {f"{name}_pid": process.pid for name, process in members.items()}
-        text = json.dumps({"url": url, "pid": os.getpid(), **pids}, indent=2)
-        write_atomically(file, (text + "\n").encode())
-        # it answers once the API is up: connections wait in the socket until then
-        print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
-        ended: list[str] = []
-        while not ended:
-            time.sleep(POLL_S)
-            ended = [name for name, process in members.items() if process.poll() is not None]
-        for name in ended:
-            status = members[name].returncode
-            log.error("the %s process ended with status %d, and with it the service", name, status)
-    except InterruptedByUser:
-        return 0
-    finally:
-        _end(list(members.values()))
-        file.unlink(missing_ok=True)
-    return 1
-
-
-def _start(settings: Settings, listener: socket.socket, module: str) -> subprocess.Popen[bytes]:
-    inherited = {server.SOCKET: str(listener.fileno()), PARENT: str(os.getpid())}
-    return subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
-        [sys.executable, "-m", module],
-        env=os.environ | environment(settings) | ONE_THREAD | inherited,
-        pass_fds=(listener.fileno(),),
-        stdin=subprocess.DEVNULL,
-        start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which stops them
-    )
-
-
-def _end(members: list[subprocess.Popen[bytes]]) -> None:
-    """Terminate all members; kill those that do not stop in time."""
-    for process in members:
-        process.terminate()
-    end = time.monotonic() + STOP_S
-    for process in members:
-        try:
-            process.wait(max(end - time.monotonic(), 0.1))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()

@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import multiprocessing
 import os
 import shutil
@@ -24,7 +23,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
@@ -38,10 +36,10 @@ from lensmodel.core.types import ignore_step
 
 # Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not
 MAX_MESSAGE: Final = 64 * 1024
-MAX_NUMBER: Final = 2**31 - 1
+MAX_NUMBER: Final = 2**31 - 1  # of an INTEGER column
 
 TASKS_MODULE = "app.jobs.tasks"  # default module of the tasks; tests of the workers replace it
-# Bytes of the standard error of a task that are logged at most (chosen): an honest one says a few lines
+# Bytes of what a task printed that are logged at most (chosen): an honest one says a few lines
 MAX_SAID: Final = 64 * 1024
 log = logging.getLogger(__name__)
 
@@ -63,69 +61,30 @@ class Budget:
     def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
         """Wait for a slot and memory; yield False if the task is no longer wanted."""
         # A task that needs more memory than the whole budget runs alone
-        memory = min(memory_mb, self.memory_mb)
-        ticket = object()
-        entered = self._enter(ticket, memory, wanted)
-        try:
-            yield entered
-        finally:
-            if entered:
-                with self._changed:
-                    self._slots += 1
-                    self._memory += memory
-                    self._changed.notify_all()
+        memory, ticket, entered = min(memory_mb, self.memory_mb), object(), False
 
-    def _enter(self, ticket: object, memory: int, wanted: Callable[[], bool]) -> bool:
+        def is_next() -> bool:
+            return self._queue[0] is ticket and self._slots > 0 and self._memory >= memory
+
         with self._changed:
             self._queue.append(ticket)
-        entered = False
         try:
-            while not entered and wanted():
+            while not entered and wanted():  # without the lock: it reads a row
                 with self._changed:
-                    if self._queue[0] is ticket and self._slots > 0 and self._memory >= memory:
-                        self._slots -= 1
-                        self._memory -= memory
-                        entered = True
-                    else:
-                        self._changed.wait(POLL_S)
+                    entered = self._changed.wait_for(is_next, POLL_S)
+                    self._slots -= entered
+                    self._memory -= memory * entered
         finally:
             with self._changed:
                 self._queue.remove(ticket)
                 self._changed.notify_all()
-        return entered
-
-
-@dataclass(slots=True)
-class _Watched:
-    """One running child: its process, the connections to it, where it writes, its deadline, its last word."""
-
-    process: ForkServerProcess
-    line: Connection
-    said: Connection
-    folder: Path
-    deadline: float
-    ended: dict[str, Any] | None = None
-    text: bytes = b""
-    logged: int = 0
-
-    def listen(self, on_progress: child.ProgressHook) -> bool:
-        """Take the next message; False at the end of the connection, or if it is invalid."""
-        message = _read(self.line)
-        if message is not None and "end" in message:
-            self.ended = message
-        elif message is not None:
-            on_progress(_number(message.get("done")), _number(message.get("total")))
-        return message is not None
-
-    def receive(self) -> bool:
-        """Log what the task printed, whole lines of it; False once it has closed its end."""
-        data = os.read(self.said.fileno(), MAX_SAID)
-        self.logged += len(data)
-        self.text += data if self.logged <= MAX_SAID else b""
-        *lines, self.text = [*self.text.split(b"\n")] if data else [self.text, b""]
-        for said in filter(None, lines):  # the formatter lets no line look like a record of ours
-            log.info("%s: %s", self.process.name, said.decode("utf-8", "backslashreplace"))
-        return bool(data)
+        try:
+            yield entered
+        finally:
+            with self._changed:
+                self._slots += entered
+                self._memory += memory * entered
+                self._changed.notify_all()
 
 
 class Sandbox:
@@ -204,88 +163,72 @@ class Sandbox:
         with self.budget.share(limits.memory_mb, wanted) as entered:
             if not entered:
                 return ended("cancelled")
+            reads = [*reads, *([] if self.cache is None else [self.cache])]
+            if self.account is not None:
+                self.account.may_change(folder)
+                for path in reads:
+                    self.account.may_read(path)
+            order = child.Order(
+                self._module,
+                task,
+                json.dumps(dict(arguments)),
+                folder.resolve(),
+                limits,
+                self._niceness,
+                tuple(path.resolve() for path in reads) if self._confined else None,
+                self.account,
+            )
             line, far_end = self._context.Pipe(duplex=True)
-            said, far_said = self._context.Pipe(duplex=False)
-            with line, said:
-                order = self._order(task, arguments, folder, limits)
-                reads = [*reads, *([] if self.cache is None else [self.cache])]
-                order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
-                self._open_to_child(folder, reads)
-                process = self._start(order, far_end, far_said)
+            process = self._context.Process(target=child.main, args=(order, far_end), daemon=True)
+            self._serve()
+            with line:
+                with far_end, self._alone:
+                    process.start()
                 try:
-                    watched = _Watched(process, line, said, folder, time.monotonic() + limits.wall_s)
-                    cut = self._watch(watched, limits, wanted, on_progress)
-                    status = 0 if cut else self._exit_status(process)
+                    outcome = self._watched(process, line, folder, limits, wanted, on_progress)
                 finally:
                     self._end(process)
-                while said.poll() and watched.receive():  # not until all ends are closed: one may live on
-                    pass
-                _leave_plain_files(folder)
-                return cut or outcome_of(watched.ended, status, folder, limits)
+            _leave_plain_files(folder)
+            _log_printed(task, folder / child.PRINTED)
+            return outcome
 
-    def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
-        if self.account is not None:
-            self.account.may_change(folder)
-            for path in reads:
-                self.account.may_read(path)
-
-    def _order(
-        self, task: str, arguments: Mapping[str, Any], folder: Path, limits: TaskLimits
-    ) -> dict[str, Any]:
-        numbers = asdict(limits)
-        numbers["cpu_s"] = limits.cpu_s or math.ceil(limits.wall_s * 1.25) + 5
-        return {
-            "module": self._module,
-            "task": task,
-            "arguments": json.dumps(dict(arguments)),
-            "folder": str(folder.resolve()),
-            "limits": numbers,
-            "niceness": self._niceness,
-            "account": [self.account.uid, self.account.gid] if self.account else None,
-        }
-
-    def _start(self, order: dict[str, Any], *far_ends: Connection) -> ForkServerProcess:
-        process = self._context.Process(
-            target=child.main, args=(order, *far_ends), name=f"task {order['task']}", daemon=True
-        )
-        self._serve()
-        with far_ends[0], far_ends[1], self._alone:
-            process.start()
-        return process
-
-    def _watch(
+    def _watched(
         self,
-        watched: _Watched,
+        process: ForkServerProcess,
+        line: Connection,
+        folder: Path,
         limits: TaskLimits,
         wanted: Callable[[], bool],
         on_progress: child.ProgressHook,
-    ) -> Outcome | None:
-        """Read messages until the child has ended; or return the outcome if it must be killed."""
-        last_check = 0.0
-        waiting: list[Any] = [watched.line, watched.said, watched.process.sentinel]
+    ) -> Outcome:
+        """Read messages until the child has ended, or must be killed."""
+        last: dict[str, Any] = {}
+        waiting: list[Any] = [line, process.sentinel]
+        deadline, next_look = time.monotonic() + limits.wall_s, 0.0
         while True:
             ready = wait(waiting, timeout=POLL_S)
-            if watched.line in ready and not watched.listen(on_progress):
-                waiting.remove(watched.line)
-            if watched.said in ready and not watched.receive():
-                waiting.remove(watched.said)
-            if ready == [watched.process.sentinel]:  # and all messages are read
-                return None
-            if time.monotonic() - last_check > POLL_S:
-                last_check = time.monotonic()
+            if line in ready:
+                message = _read(line)
+                if message is None:
+                    waiting.remove(line)
+                elif "end" in message:
+                    last = message
+                else:
+                    on_progress(_number(message.get("done")), _number(message.get("total")))
+            elif ready:  # it has ended, and all messages are read
+                with self._alone:
+                    process.join()
+                    return outcome_of(last, process.exitcode or 0, folder, limits)
+            if time.monotonic() > next_look:
+                next_look = time.monotonic() + POLL_S
                 if not wanted():
                     return ended("cancelled")
-                if _overflows(watched.folder, limits):
+                if _overflows(folder, limits):
                     text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
                     return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
-            if time.monotonic() > watched.deadline:
+            if time.monotonic() > deadline:
                 text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
                 return ended("time_limit", text)
-
-    def _exit_status(self, process: ForkServerProcess) -> int:
-        with self._alone:
-            process.join()
-            return process.exitcode or 0
 
     def _end(self, process: ForkServerProcess) -> None:
         """Kill the child and all processes that it started, if they still run."""
@@ -300,7 +243,7 @@ class Sandbox:
 
 
 def _number(value: object) -> int:
-    """Return a number of a progress message as an INTEGER column can hold it."""
+    """Return a number of a progress message as a column can hold it."""
     return min(max(value, 0), MAX_NUMBER) if isinstance(value, int) else 0
 
 
@@ -328,6 +271,16 @@ def _leave_plain_files(folder: Path) -> None:
                 continue
             if not stat.S_ISDIR(status.st_mode):
                 path.unlink()
+
+
+def _log_printed(task: str, path: Path) -> None:
+    """Log what a task printed line by line: the formatter lets no line look like a record of ours."""
+    with contextlib.suppress(OSError):  # it died before it could print
+        with path.open("rb") as file:
+            text = file.read(MAX_SAID).decode("utf-8", "backslashreplace")
+        for said in filter(None, text.split("\n")):
+            log.info("task %s: %s", task, said)
+        path.unlink()
 
 
 def _lives(pid: int) -> bool:

@@ -19,45 +19,37 @@ from typing import Final
 
 # linux/prctl.h, linux/seccomp.h, linux/sched.h
 _PR_SET_SECCOMP, _MODE_FILTER = 22, 2
-_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
+_ALLOW, _KILL = 0x7FFF0000, 0x80000000
+_NO, _UNKNOWN = 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
 _CLONE_THREAD: Final = 0x00010000
 # __X32_SYSCALL_BIT of asm/unistd.h: marks calls of the x32 interface, which nothing uses
 _X32: Final = 0x40000000
+_TMPFILE: Final = 0o20000000  # __O_TMPFILE of asm-generic/fcntl.h, the same on both processors
 # linux/bpf_common.h
 _LOAD, _EQUAL, _AT_LEAST, _ANY_OF, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 # Offsets of the fields of `struct seccomp_data`, which is little-endian on both processors
 _NUMBER, _PROCESSOR, _FIRST_ARGUMENT = 0, 4, 16
-# Calls that a task does not need; all fail with "not permitted"
-REFUSED: Final = (
-    *("socket", "socketpair", "connect", "bind", "listen", "accept", "accept4", "sendto", "recvfrom"),
-    *("execve", "execveat", "fork", "vfork"),
-    *("ptrace", "process_vm_readv", "process_vm_writev", "pidfd_open", "pidfd_getfd", "kcmp"),
-    *("unshare", "setns", "mount", "umount2", "pivot_root", "chroot", "open_tree", "move_mount", "fsopen"),
-    *("bpf", "perf_event_open", "userfaultfd", "io_uring_setup", "io_uring_enter", "io_uring_register"),
-    *("keyctl", "add_key", "request_key", "open_by_handle_at", "name_to_handle_at"),
-    *("init_module", "finit_module", "delete_module", "kexec_load", "kexec_file_load", "reboot"),
-    *("swapon", "swapoff", "settimeofday", "clock_settime", "sethostname", "setdomainname", "acct"),
-    *("fanotify_init", "shmget", "msgget", "semget", "mq_open", "personality", "syslog"),
-    *("tkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo", "pidfd_send_signal", "memfd_create"),
-)
-# Calls by which a file that is open loses its name, and `openat2`, whose flags no filter can read
-REMOVING: Final = ("unlink", "unlinkat", "rename", "renameat", "renameat2", "openat2")
-# Calls that open files without a name, with the position of the argument that says so
-_UNNAMED: Final = {"open": 1, "openat": 2}
-_TMPFILE: Final = 0o20000000  # __O_TMPFILE of asm-generic/fcntl.h, the same on both processors
-# Calls that name a process, which must be the task itself: it may abort, and lower its own limits
-OWN: Final = ("kill", "tgkill", "prlimit64")
-
-
-@dataclass(frozen=True, slots=True)
-class _Processor:
-    audit: int
-    clone: int
-    numbers: dict[str, int]
 
 
 def _table(text: str) -> dict[str, int]:
     return {name: int(number) for name, number in (entry.split("=") for entry in text.split())}
+
+
+@dataclass(frozen=True, slots=True)
+class _Processor:
+    """Numbers of system calls, from a processor's unistd.h.
+
+    `refused`: what a task does not need, all "not permitted"; also calls by which an open file loses its
+    name, so that whoever counts the folder of a task sees every file. `own`: calls that name a process, which
+    must be the task itself. `opening`: calls that open files, by the position of their flags.
+    """
+
+    audit: int
+    clone: int
+    prlimit: int
+    own: tuple[int, ...]  # kill, tgkill
+    opening: dict[int, int]  # open, openat
+    refused: dict[str, int]
 
 
 _CLONE3: Final = 435  # the same on both processors
@@ -65,12 +57,14 @@ _COMMON: Final = _table(
     "pidfd_open=434 pidfd_getfd=438 io_uring_setup=425 io_uring_enter=426 io_uring_register=427 "
     "open_tree=428 move_mount=429 fsopen=430 pidfd_send_signal=424 openat2=437"
 )
-# Numbers of the calls, from each processor's unistd.h; those that a processor has not are left out
-_PROCESSORS: Final = {
+PROCESSORS: Final = {
     "x86_64": _Processor(
         0xC000003E,
-        56,
-        _COMMON
+        clone=56,
+        prlimit=302,
+        own=(62, 234),
+        opening={2: 1, 257: 2},
+        refused=_COMMON
         | _table(
             "socket=41 connect=42 accept=43 sendto=44 recvfrom=45 bind=49 listen=50 socketpair=53 "
             "accept4=288 fork=57 vfork=58 execve=59 execveat=322 ptrace=101 process_vm_readv=310 "
@@ -79,15 +73,18 @@ _PROCESSORS: Final = {
             "request_key=249 open_by_handle_at=304 name_to_handle_at=303 init_module=175 "
             "finit_module=313 delete_module=176 kexec_load=246 kexec_file_load=320 reboot=169 swapon=167 "
             "swapoff=168 settimeofday=164 clock_settime=227 sethostname=170 setdomainname=171 acct=163 "
-            "fanotify_init=300 shmget=29 msgget=68 semget=64 mq_open=240 personality=135 syslog=103 kill=62 "
-            "tkill=200 tgkill=234 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 prlimit64=302 memfd_create=319 "
-            "unlink=87 unlinkat=263 rename=82 renameat=264 renameat2=316 open=2 openat=257"
+            "fanotify_init=300 shmget=29 msgget=68 semget=64 mq_open=240 personality=135 syslog=103 "
+            "tkill=200 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 memfd_create=319 "
+            "unlink=87 unlinkat=263 rename=82 renameat=264 renameat2=316"
         ),
     ),
     "aarch64": _Processor(
         0xC00000B7,
-        220,
-        _COMMON
+        clone=220,
+        prlimit=261,
+        own=(129, 131),
+        opening={56: 2},
+        refused=_COMMON
         | _table(
             "socket=198 socketpair=199 bind=200 listen=201 accept=202 connect=203 sendto=206 recvfrom=207 "
             "accept4=242 execve=221 execveat=281 ptrace=117 process_vm_readv=270 process_vm_writev=271 "
@@ -97,8 +94,8 @@ _PROCESSORS: Final = {
             "delete_module=106 kexec_load=104 kexec_file_load=294 reboot=142 swapon=224 swapoff=225 "
             "settimeofday=170 clock_settime=112 sethostname=161 setdomainname=162 acct=89 "
             "fanotify_init=262 shmget=194 msgget=186 semget=190 mq_open=180 personality=92 syslog=116 "
-            "kill=129 tkill=130 tgkill=131 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 prlimit64=261 "
-            "memfd_create=279 unlinkat=35 renameat=38 renameat2=276 openat=56"
+            "tkill=130 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 memfd_create=279 "
+            "unlinkat=35 renameat=38 renameat2=276"
         ),
     ),
 }
@@ -119,8 +116,7 @@ class _Program(ctypes.Structure):
 
 def refuse() -> None:
     """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set."""
-    # Every file that a task makes keeps its name, so that whoever counts its folder sees it
-    processor = _PROCESSORS.get(platform.machine())
+    processor = PROCESSORS.get(platform.machine())
     if processor is None:
         raise OSError(errno.ENOSYS, f"no filter was written for {platform.machine()}")
     steps = _steps(processor)
@@ -134,43 +130,31 @@ def refuse() -> None:
 
 def _steps(processor: _Processor) -> list[tuple[int, int, int, int]]:
     """Return the filter: `(code, jump if so, jump if not, value)`."""
-    no, gone = _REFUSE | errno.EPERM, _REFUSE | errno.ENOSYS
     steps = [
         (_LOAD, 0, 0, _PROCESSOR),
         (_EQUAL, 1, 0, processor.audit),
         (_RETURN, 0, 0, _KILL),  # calls of another processor's interface have other numbers
         (_LOAD, 0, 0, _NUMBER),
         (_AT_LEAST, 0, 1, _X32),
-        (_RETURN, 0, 0, no),
+        (_RETURN, 0, 0, _NO),
         (_EQUAL, 0, 1, _CLONE3),
-        (_RETURN, 0, 0, gone),  # the C library then falls back to clone, whose flags can be read
+        (_RETURN, 0, 0, _UNKNOWN),  # the C library then falls back to clone, whose flags can be read
     ]
-    for name in (*REFUSED, *REMOVING):
-        if name in processor.numbers:
-            steps += [(_EQUAL, 0, 1, processor.numbers[name]), (_RETURN, 0, 0, no)]
-    for name, position in _UNNAMED.items():
-        if name in processor.numbers:
-            steps += [
-                (_EQUAL, 0, 4, processor.numbers[name]),
-                (_LOAD, 0, 0, _FIRST_ARGUMENT + 8 * position),
-                (_ANY_OF, 0, 1, _TMPFILE),
-                (_RETURN, 0, 0, no),
-                (_RETURN, 0, 0, _ALLOW),
-            ]
-    for name in OWN:
-        itself = 0 if name == "prlimit64" else os.getpid()
+    for number in processor.refused.values():
+        steps += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, _NO)]
+    # call, position of the argument to look at, comparison with a value, answer if so, else
+    rules = [
+        *((call, 0, _EQUAL, os.getpid(), _ALLOW, _NO) for call in processor.own),
+        (processor.prlimit, 0, _EQUAL, 0, _ALLOW, _NO),
+        *((call, flags, _ANY_OF, _TMPFILE, _NO, _ALLOW) for call, flags in processor.opening.items()),
+        (processor.clone, 0, _ANY_OF, _CLONE_THREAD, _ALLOW, _NO),  # threads yes, processes no
+    ]
+    for call, position, comparison, value, if_so, if_not in rules:
         steps += [
-            (_EQUAL, 0, 4, processor.numbers[name]),
-            (_LOAD, 0, 0, _FIRST_ARGUMENT),
-            (_EQUAL, 0, 1, itself),
-            (_RETURN, 0, 0, _ALLOW),
-            (_RETURN, 0, 0, no),
+            (_EQUAL, 0, 4, call),
+            (_LOAD, 0, 0, _FIRST_ARGUMENT + 8 * position),
+            (comparison, 0, 1, value),
+            (_RETURN, 0, 0, if_so),
+            (_RETURN, 0, 0, if_not),
         ]
-    return [
-        *steps,
-        (_EQUAL, 0, 3, processor.clone),  # threads yes, processes no
-        (_LOAD, 0, 0, _FIRST_ARGUMENT),
-        (_ANY_OF, 1, 0, _CLONE_THREAD),
-        (_RETURN, 0, 0, no),
-        (_RETURN, 0, 0, _ALLOW),
-    ]
+    return [*steps, (_RETURN, 0, 0, _ALLOW)]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from app.main import create_app
-from app.runtime import server
+from app.runtime import supervisor
 from app.runtime.settings import Settings
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
@@ -161,7 +161,7 @@ def running(data: Path, program: Sequence[str] = PROGRAM, **settings: str) -> It
 @contextmanager
 def served(settings: Settings) -> Iterator[int]:
     """Serve on a real port, in a thread: slow clients need a real connection."""
-    listener = server.listen("127.0.0.1", 0)
+    listener = supervisor.listen("127.0.0.1", 0)
     config = uvicorn.Config(create_app(settings), access_log=False, log_config=None)
     running = uvicorn.Server(config)
     thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})

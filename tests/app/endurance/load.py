@@ -120,10 +120,10 @@ class Load:
 
     def kill(self) -> None:
         """Kill the API or the worker, which ends the service, and start it again as systemd does."""
-        name = self.rng.choice(["api_pid", "worker_pid"])
+        name = self.rng.choice(["pid", "worker_pid"])
         with contextlib.suppress(OSError, ValueError, TypeError):  # between two lives
             os.kill(self.service.info()[name], signal.SIGKILL)
-            self.answers[f"killed {name.removesuffix('_pid')}"] += 1
+            self.answers[f"killed {'worker' if name == 'worker_pid' else 'api'}"] += 1
         assert self.service.process is not None
         self.service.process.wait()
         self.service.start()

@@ -59,7 +59,7 @@ def main() -> None:
 
         for number in range(50):  # the first fits the model
             ask(number)
-        api = service.info()["api_pid"]
+        api = service.info()["pid"]
         before = processor_s(api)
         millis = sorted(ask(number) for number in range(wishes.requests))
         used = 1000.0 * (processor_s(api) - before) / wishes.requests

@@ -12,7 +12,7 @@ SERVES = """
 import contextlib, sys, types
 from pathlib import Path
 from lensmodel.cli import ending
-from app.runtime import server
+from app.runtime import supervisor
 from app.runtime.settings import Settings
 
 async def application(scope, receive, send):
@@ -26,7 +26,7 @@ async def application(scope, receive, send):
 sys.modules["app.main"] = types.SimpleNamespace(create_app=lambda settings: application)
 ending.install()
 with contextlib.suppress(ending.InterruptedByUser):
-    server.run(Settings(data_dir=Path(sys.argv[1])), server.listen("127.0.0.1", 0))
+    supervisor.run(Settings(data_dir=Path(sys.argv[1])), supervisor.listen("127.0.0.1", 0))
 print("stopped", flush=True)
 """
 

@@ -100,7 +100,7 @@ def config(
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
-    from app.runtime.settings import PREFIX  # noqa: PLC0415 - only these commands need the service
+    from app.runtime.settings import PREFIX, described  # noqa: PLC0415 - only these commands need the service
 
     settings = settings_from(data)
     # up to the last @: a password may hold any sign, and need not be quoted everywhere
@@ -112,8 +112,7 @@ def config(
         typer.echo(json.dumps({f"{PREFIX}{name.upper()}": value for name, value in shown.items()}, indent=2))
         return
     for name, value in shown.items():
-        typer.echo(f"# {type(settings).model_fields[name].description}")
-        typer.echo(f"{PREFIX}{name.upper()}={value}")
+        typer.echo(f"# {described()[name]}\n{PREFIX}{name.upper()}={value}")
     from app.sandbox import confine  # noqa: PLC0415 - only this command asks
 
     for name, in_force in confine.available(settings.task_user, settings.data_dir).items():

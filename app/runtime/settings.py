@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.sandbox import account
@@ -28,109 +28,69 @@ class Settings(BaseSettings):
 
     # Unknown names in the environment that begin with `LENS_` are an error: most likely a mistyped setting
     # that the operator believes to be in force
-
-    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True)
-
-    data_dir: Path = Field(default=Path("lensmodel-data"), description="Folder of everything that is kept.")
-    database_url: str = Field(
-        default="", description="SQLAlchemy address; empty = SQLite file in the data folder."
-    )
-    storage_url: str = Field(
-        default="",
-        description="file:// or s3:// address of the blobs, for all machines; empty = in the data folder.",
-    )
-    storage_seconds: float = Field(
-        default=20.0, gt=0, description="Longest that one request to an object store may take."
+    model_config = SettingsConfigDict(
+        env_prefix=PREFIX, extra="forbid", frozen=True, use_attribute_docstrings=True
     )
 
-    host: str = Field(default="127.0.0.1", description="Address to listen on.")
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
-    auth: Literal["auto", "keys", "none"] = Field(
-        default="auto",
-        description=(
-            "Who may use it: keys = whoever has a key made by `lensmodel keys`; none = anybody on this "
-            "machine; auto = keys where others can reach it, or once there is a key."
-        ),
-    )
-
-    allowed_hosts: str = Field(
-        default="",
-        description="Names by which others reach it, comma separated: behind a proxy, or in a network.",
-    )
-
-    max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
-    max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
-    max_stored_gb: float = Field(
-        default=200.0, gt=0, description="Largest total of one owner's photos and results, in GiB."
-    )
-    keep_photos: Literal["never", "always"] = Field(
-        default="always",
-        description="How long the files of photos stay: never = until their work is done; always = until "
-        "they are deleted.",
-    )
-    keep_results_days: float = Field(
-        default=30.0, gt=0, description="How long corrections and their files stay after their end."
-    )
-    min_free_mb: int = Field(
-        default=256, ge=0, description="Free disk below which uploads are refused, in MiB."
-    )
-
-    worker_slots: int = Field(
-        default_factory=lambda: os.cpu_count() or 1, ge=1, description="CPU jobs at once."
-    )
-    worker_memory_mb: int = Field(
-        default=4096, ge=256, description="Memory of all children of a worker, in MiB."
-    )
-    task_niceness: int = Field(
-        default=10,
-        ge=0,
-        le=19,
-        description="How far photo work gives way to requests, as in nice(1); 0 = not at all.",
-    )
-    task_user: str = Field(
-        default="auto",
-        description=(
-            "Account of the processes that decode photos, where a worker may change to it: a name; auto = "
-            "lens-task if there is one, else nobody; none = that of the worker."
-        ),
-    )
-    sandbox: Literal["auto", "require", "try"] = Field(
-        default="auto",
-        description=(
-            "Whether workers refuse to start where nothing keeps a hostile photo from other files: require; "
-            "try = they take what there is; auto = require where keys are asked for."
-        ),
-    )
-    lease_seconds: float = Field(
-        default=20.0, gt=0, description="A worker silent for this long is taken for dead."
-    )
-
-    task_seconds: float = Field(
-        default=3600.0,
-        gt=0,
-        description="Longest that correcting a photo may take; reading its header a 90th of it, developing "
-        "a 20th, estimating in one cell a 6th.",
-    )
-    patches: int = Field(
-        default=0,
-        ge=0,
-        le=1000,
-        description="Patches used from one photo; 0: as many as the estimator needs.",
-    )
-    estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
-    assume_single_copy: bool = Field(
-        default=False, description="Photos without a serial number belong to the one lens of that model."
-    )
-
-    metrics_address: str = Field(
-        default="", description="Where a worker serves its /metrics, such as 127.0.0.1:9000; empty: nowhere."
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="Lowest level that is logged."
-    )
-    log_format: Literal["text", "json"] = Field(
-        default="text", description="text: lines for people; json: one JSON object a line, for collectors."
-    )
+    data_dir: Path = Path("lensmodel-data")
+    """Folder of everything that is kept."""
+    database_url: str = ""
+    """SQLAlchemy address; empty = SQLite file in the data folder."""
+    storage_url: str = ""
+    """file:// or s3:// address of the blobs, for all machines; empty = in the data folder."""
+    storage_seconds: PositiveFloat = 20.0
+    """Longest that one request to an object store may take."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = Field(default=8000, ge=0, le=65535)
+    """Port to listen on; 0 takes any free one."""
+    auth: Literal["auto", "keys", "none"] = "auto"
+    """Who may use it: keys = whoever has a key made by `lensmodel keys`; none = anybody on this machine;
+    auto = keys where others can reach it, or once there is a key."""
+    allowed_hosts: str = ""
+    """Names by which others reach it, comma separated: behind a proxy, or in a network."""
+    max_upload_mb: PositiveInt = 512
+    """Largest photo file, in MiB."""
+    max_megapixels: PositiveFloat = 160.0
+    """Largest photo, in millions of pixels."""
+    max_stored_gb: PositiveFloat = 200.0
+    """Largest total of one owner's photos and results, in GiB."""
+    keep_photos: Literal["never", "always"] = "always"
+    """How long the files of photos stay: never = until their work is done; always = until they are
+    deleted."""
+    keep_results_days: PositiveFloat = 30.0
+    """How long corrections and their files stay after their end."""
+    min_free_mb: NonNegativeInt = 256
+    """Free disk below which uploads are refused, in MiB."""
+    worker_slots: PositiveInt = Field(default_factory=lambda: os.cpu_count() or 1)
+    """CPU jobs at once."""
+    worker_memory_mb: int = Field(default=4096, ge=256)
+    """Memory of all children of a worker, in MiB."""
+    task_niceness: int = Field(default=10, ge=0, le=19)
+    """How far photo work gives way to requests, as in nice(1); 0 = not at all."""
+    task_user: str = "auto"
+    """Account of the processes that decode photos, where a worker may change to it: a name; auto = lens-task
+    if there is one, else nobody; none = that of the worker."""
+    sandbox: Literal["auto", "require", "try"] = "auto"
+    """Whether workers refuse to start where nothing keeps a hostile photo from other files: require; try =
+    they take what there is; auto = require where keys are asked for."""
+    lease_seconds: PositiveFloat = 20.0
+    """A worker silent for this long is taken for dead."""
+    task_seconds: PositiveFloat = 3600.0
+    """Longest that correcting a photo may take; reading its header a 90th of it, developing a 20th,
+    estimating in one cell a 6th."""
+    patches: int = Field(default=0, ge=0, le=1000)
+    """Patches used from one photo; 0: as many as the estimator needs."""
+    estimator: str = "default"
+    """Name in the registry of blind estimators."""
+    assume_single_copy: bool = False
+    """Photos without a serial number belong to the one lens of that model."""
+    metrics_address: str = ""
+    """Where a worker serves its /metrics, such as 127.0.0.1:9000; empty: nowhere."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """Lowest level that is logged."""
+    log_format: Literal["text", "json"] = "text"
+    """text: lines for people; json: one JSON object a line, for collectors."""
 
     @model_validator(mode="before")
     @classmethod
@@ -144,7 +104,8 @@ class Settings(BaseSettings):
         return values
 
     @model_validator(mode="after")
-    def _known_estimator(self) -> Settings:
+    def _fit_together(self) -> Settings:
+        account.find(self.task_user)
         if self.estimator != "default":
             # not at the top: heavy, and most processes never ask for another one
             from lensmodel.blind import estimators  # noqa: PLC0415
@@ -153,24 +114,11 @@ class Settings(BaseSettings):
                 estimators.create(self.estimator)
             except UnknownMethodError as error:
                 raise ValueError(str(error)) from error
-        return self
-
-    @model_validator(mode="after")
-    def _known_account(self) -> Settings:
-        account.find(self.task_user)
-        return self
-
-    @model_validator(mode="after")
-    def _one_machine_or_many(self) -> Settings:
         if not self.database.startswith("sqlite") and not self.storage_url:
             raise ValueError(
                 "a database server means several machines, which cannot see the data folder of this one: set "
                 "LENS_STORAGE_URL to s3://..., or to file://... of a folder that all of them see"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _open_only_on_loopback(self) -> Settings:
         if self.auth == "none" and self.is_open_to_others:
             raise ValueError(
                 f"others can reach it (host {self.host}, LENS_ALLOWED_HOSTS={self.allowed_hosts}) and "
@@ -236,12 +184,20 @@ class Settings(BaseSettings):
         return self.max_upload_mb * MIB
 
 
+def described() -> dict[str, str]:
+    """Return what each setting is for, by its name."""
+    return {
+        name: " ".join((field.description or "").split()) for name, field in Settings.model_fields.items()
+    }
+
+
 def table() -> str:
     """Return all settings as the table of docs/service.md: `python -m app.runtime.settings` prints it."""
     rows = ["| setting | default | |", "|---|---|---|"]
-    for name, field in Settings.model_fields.items():
+    for name, text in described().items():
+        field = Settings.model_fields[name]
         default = "cores of the machine" if field.default_factory else str(field.default).lower() or "none"
-        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {field.description} |")
+        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {text} |")
     return "\n".join(rows)
 
 

@@ -8,7 +8,7 @@ from string import Template
 from typing import Final
 
 from lensmodel.report.lens_report import LensReport
-from lensmodel.report.plots import Chart, charts, overview
+from lensmodel.report.plots import EXPLAINED, Chart, charts, overview
 from lensmodel.report.tables import place_table
 
 _PAGE: Final = Template("""<!doctype html>
@@ -35,6 +35,7 @@ th, td { padding: .2rem .8rem .2rem 0; text-align: left; border-bottom: 1px soli
 <p>$verdict</p>
 <p>$centring</p>
 <div class="charts">$overview</div>
+<p class="notes">$explained</p>
 <p>$advice</p>
 $apertures
 <h2>MTF50 by place</h2>
@@ -60,6 +61,7 @@ def to_html(report: LensReport) -> bytes:
         verdict=escape(report.verdict),
         centring=escape(f"{centring[:1].upper()}{centring[1:]}."),
         advice=escape(report.advice),
+        explained=escape(EXPLAINED),
         overview=_images(overview(report)),
         apertures="\n".join(parts),
         head="".join(f"<th scope='col'>{escape(name)}</th>" for name in head),

@@ -8,6 +8,7 @@ may be is what the model expects of the kernel at its place (`predicted_error`).
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -259,12 +260,13 @@ class LensReport:
     name: str  # of the lens
     verdict: str  # for photographers
     photos: int  # that it rests on
-    samples: int
+    places: int  # at which these show the blur, each counted once for all colours
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
     lateral: LateralColourCurve | None  # None where no photo showed it
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
+    size_px: tuple[int, int] | None = None  # width and height of its photos, where they are known
 
     def at(self, aperture: float | None, channel: Channel = "g") -> ApertureReport:
         """Return what was found at an aperture that was tested; the widest for None or another one."""
@@ -279,11 +281,11 @@ class LensReport:
     @property
     def facts(self) -> str:
         """What it rests on, in words."""
-        parts = ["1 photo" if self.photos == 1 else f"{self.photos} photos", f"{self.samples} blur samples"]
+        parts = [_counted(self.photos, "photo"), f"blur measured at {_counted(self.places, 'place')}"]
         if (pitch := self.sensor.pixel_pitch_um) is not None:
             parts.append(f"pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm")
-        if self.sensor.height_px is not None:
-            parts.append(f"{self.sensor.height_px} pixels high")
+        if self.size_px is not None:
+            parts.append(f"photos of {self.size_px[0]} x {self.size_px[1]} pixels")
         return ", ".join(parts)
 
     @property
@@ -301,10 +303,10 @@ class LensReport:
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
         if least.predicted_error < _WELL_KNOWN:
             return "The lens is well known by now; another photo would add little."
-        at = f", at {tested.at}" if tested.at else ""
+        at = f", taken at {tested.at}," if tested.at else ""
         return (
-            f"A photo with fine detail at {least.place}{at} would help most: the blur there is expected to "
-            f"be wrong by {least.predicted_error:.0%}, more than elsewhere."
+            f"A photo with fine detail at {least.place}{at} would help most: what is known of the blur there "
+            f"is expected to be wrong by {least.predicted_error:.0%}, more than elsewhere."
         )
 
     @property
@@ -316,6 +318,10 @@ class LensReport:
             share = sum(first.unknown) / len(first.unknown)
             lines.append(f"Too little is known of {share:.0%} of the picture; those figures are guesses.")
         return (*lines, self.advice)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
@@ -359,7 +365,7 @@ def lens_report(
     aspect : float, optional
         Width over height of its photos; by default that of common sensors which its samples fill best.
     height_px : int, optional
-        Height of its photos in pixels; by default what the samples say.
+        Height of its photos in pixels; by default what the samples and the aspect come to.
     lateral : sequence of LateralColour
         What its photos show of lateral colour.
     channels : sequence of {"r", "g", "b"}
@@ -396,11 +402,12 @@ def lens_report(
         name=name,
         verdict=verdict(first, _best(tested)),
         photos=len({s.photo for s in model.samples}),
-        samples=len(model.samples),
+        places=max(Counter(s.settings.channel for s in model.samples).values(), default=0),
         sensor=SensorGeometry(pitch, height_px or _height(model, aspect)),
         tested=tuple(tested),
         lateral=_lateral(lateral),
         details=dict(details or {}),
+        size_px=None if height_px is None else (round(height_px * aspect), height_px),
     )
 
 

@@ -57,11 +57,15 @@ _UNITS: Final[dict[Unit, str]] = {
 _CHART: Final = (7.0, 3.7)  # inches of a single chart (chosen: two side by side on a wide screen)
 _LETTERS: Final = 34  # of a legend beside each other (chosen: they fit in what a phone shows of a chart)
 _PAGE: Final = (8.27, 11.69)  # inches: A4
+_LEFT: Final = 0.07  # of the width of a page: where its lines begin (chosen)
+_LETTERS_OF_A_LINE: Final = 1020.0  # over the size in points: of DejaVu Sans, narrower than the page (chosen)
 _A_PAGE: Final = 4  # panels below each other on a page (chosen: as wide as single charts)
 _IN_CELL: Final[dict[str, Any]] = {"ha": "center", "va": "center", "fontsize": 7.0}  # figures on a map
 _HATCHED: Final[dict[str, Any]] = {"facecolor": "#f4f4f2", "edgecolor": "#a8a8a2", "hatch": "////", "lw": 0}
 _LUMA: Final = (0.2126, 0.7152, 0.0722)  # of red, green and blue (ITU-R BT.709)
 _PALE: Final = 0.45  # luma from which on dark figures are read best (chosen)
+_SEEN: Final = 0.01  # of the brightest pixel of a point: darker ones look black (chosen)
+_LEAST_HALF: Final = 5  # pixels shown around a point on each side, at least (chosen)
 _DOTS: Final = 160  # a inch of a PNG (chosen: a page is as wide as a screen)
 _STYLE: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",
@@ -93,6 +97,13 @@ class Chart:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg).decode("ascii")
 
 
+# What the signs on the first page mean (Nyquist's frequency is .5)
+EXPLAINED: Final = (
+    "MTF50: how fine lines may be until only half of their contrast is left, in pairs of lines per pixel "
+    "(cycles/pixel); more is sharper, and a sensor shows nothing finer than .5. S: lines along the radius, "
+    "which runs from the centre of the picture outwards. T: lines across it. Where S and T differ, detail is "
+    "softer in one direction. In brackets: the range in which the true figure should lie."
+)
 Place = Figure | SubFigure
 Panel = tuple[str, Callable[[Place], None]]  # Title of a drawing, and what draws it
 
@@ -132,10 +143,11 @@ def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     drawn = [_photographer(report)]
     for number in report.apertures:
-        panels = _panels(report, report.at(number), "c/px")
+        found = report.at(number)
+        panels = _panels(report, found, "c/px")
         for first in range(0, len(panels), _A_PAGE):
-            figure = _page(report.name, "")
-            _placed(figure, panels[first : first + _A_PAGE])
+            figure, top = _page(report.name, "")
+            _placed(figure, top, panels[first : first + _A_PAGE])
             drawn.append(figure)
     return drawn
 
@@ -144,8 +156,8 @@ def comparison_page(comparison: Comparison) -> Figure:
     """Draw a comparison on one page."""
     sides = (comparison.first, comparison.second)
     facts = [f"{side.name}: {side.facts}" for side in sides if side.facts]
-    figure = _page(" and ".join(side.name for side in sides), "\n".join([comparison.verdict, *facts]))
-    _placed(figure, _compared(comparison))
+    figure, top = _page(" and ".join(side.name for side in sides), "\n".join([comparison.verdict, *facts]))
+    _placed(figure, top, _compared(comparison))
     return figure
 
 
@@ -153,8 +165,11 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
     at = f", {found.at}" if found.at else ""
     panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
     panels += [
-        (f"MTF50, give or take %{at}", _on(error_map, found)),
-        (f"Contrast over the picture{at}: sagittal solid, tangential dashed", _on(contrast, found)),
+        (f"How far off MTF50 may be, in percent{at}", _on(error_map, found)),
+        (
+            f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
+            _on(contrast, found),
+        ),
         (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(side_softer, found)),
     ]
@@ -196,18 +211,25 @@ def _titled(place: Place, panel: Panel) -> None:
     draw(place)
 
 
-def _page(title: str, words: str) -> Figure:
+def _page(title: str, words: str, size: float = 8.5, ink: str = "#55585d") -> tuple[Figure, float]:
+    """Begin a page; returns the height of the end of its words too."""
     figure = Figure(figsize=_PAGE)
-    figure.text(0.08, 0.965, title, fontsize=15, weight="bold", va="top")
-    text = "\n".join(textwrap.fill(line, 110) for line in words.split("\n"))
-    figure.text(0.08, 0.935, text, fontsize=8.5, va="top", color="#55585d")
-    return figure
+    top = _written(figure, 0.97, title, 15.0, "#191a1c", "bold")
+    return figure, _written(figure, top - 0.008, words, size, ink)
 
 
-def _placed(figure: Figure, panels: Sequence[Panel]) -> None:
+def _written(figure: Figure, top: float, words: str, size: float, ink: str, weight: str = "normal") -> float:
+    """Write lines from a height on down, as wide as a page; return the height of their end."""
+    wide = round(_LETTERS_OF_A_LINE / size)
+    lines = [part for line in words.split("\n") for part in textwrap.wrap(line, wide) or [""]]
+    figure.text(_LEFT, top, "\n".join(lines), fontsize=size, color=ink, weight=weight, va="top")
+    return top - len(lines) * 1.25 * size / 72.0 / _PAGE[1]
+
+
+def _placed(figure: Figure, top: float, panels: Sequence[Panel]) -> None:
     """Draw panels below each other, as many to a page whatever their number."""
     with mpl.rc_context(_STYLE):
-        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, 0.86))
+        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, top - 0.03))
         places: Any = figure.subfigures(_A_PAGE, 1)
         for place, panel in zip(places, panels, strict=False):
             _titled(place, panel)
@@ -262,6 +284,7 @@ def _map(
     """Draw a value at each place of a report as a cell with its figure."""
     ax.grid(visible=False)
     ax.set(xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
     image = ax.imshow(
         np.asarray(values).reshape(found.rows, found.cols), cmap=colours, vmin=ends[0], vmax=ends[1],
         extent=(0.0, found.aspect, 0.0, 1.0),
@@ -319,7 +342,9 @@ def side_softer(ax: Axes, found: ApertureReport) -> None:
         x, y = (scale * softer.amount * f(softer.direction) for f in (math.cos, math.sin))
         ax.add_patch(Circle((x, y), 2.0 * scale * softer.error, color=_INKS[0], alpha=0.2))
         ax.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": _INKS[1], "lw": 2.0})
-        ax.set_xlabel("arrow: the softer side; circle: two standard errors; sure if the cross lies outside")
+        ax.set_xlabel(
+            "arrow: to the softer side; circle: two standard errors; certain where the cross lies outside it"
+        )
     else:
         ax.set_xlabel("too little is known to say")
 
@@ -388,7 +413,7 @@ def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Uni
     factor = sensor.factor(unit) or 1.0
     axes = place.subplots(1, 2)
     for ax, name, values in zip(
-        axes, ("tangential", "sagittal"), (found.tangential, found.sagittal), strict=True
+        axes, ("tangential (T)", "sagittal (S)"), (found.tangential, found.sagittal), strict=True
     ):
         image = sharpness_map(ax, found, values, factor=factor)
         ax.set_xlabel(name)
@@ -402,13 +427,15 @@ def _overview(ax: Axes, found: ApertureReport) -> None:
     """Mean MTF50 over the picture, with a scale in words."""
     image = sharpness_map(ax, found, found.mean)
     scale = ax.figure.colorbar(image, ax=ax, location="bottom", fraction=0.05, aspect=50)
-    scale.set_ticks([0.02, 0.25, 0.45], labels=["soft", ".25", "no sensor shows more"])
+    scale.set_ticks([0.02, 0.25, 0.43], labels=["soft", ".25", "as sharp as a sensor can show"])
 
 
 def _points(place: Place, found: ApertureReport) -> None:
     """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
-    for ax, spot in zip(place.subplots(1, len(found.spots)), found.spots, strict=True):
-        ax.imshow(np.array(spot.kernel), cmap="gray", vmin=0.0)
+    kernels = [np.array(spot.kernel) for spot in found.spots]
+    cut = min(_dark_rim(kernel) for kernel in kernels)
+    for ax, spot, kernel in zip(place.subplots(1, len(kernels)), found.spots, kernels, strict=True):
+        ax.imshow(kernel[cut : len(kernel) - cut, cut : len(kernel) - cut], cmap="gray", vmin=0.0)
         weight = "bold" if spot is found.worst else "normal"
         name = spot.side.removeprefix("the ") + (" (not known)" if spot.unknown else "")
         ax.set_title(name, fontsize=8.5, weight=weight, loc="center")
@@ -417,25 +444,33 @@ def _points(place: Place, found: ApertureReport) -> None:
         ax.grid(visible=False)
 
 
+def _dark_rim(kernel: NDArray[np.float64]) -> int:
+    """Pixels around a kernel that are too dark to be seen; a few are always left in the middle."""
+    rows, cols = np.nonzero(kernel > _SEEN * kernel.max())
+    middle = len(kernel) // 2
+    return middle - max(_LEAST_HALF, *np.abs(rows - middle), *np.abs(cols - middle))
+
+
 def _simple(report: LensReport) -> list[Panel]:
     """What a photographer is shown."""
     found = report.tested[0]
     words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
+    hatched = " (hatched: not known)" if any(found.unknown) else ""
     return [
-        (f"{words} (MTF50, cycles/pixel; hatched: not known)", _on(_overview, found)),
-        ("What becomes of a point, each to its own brightest pixel", lambda on: _points(on, found)),
+        (f"{words}: MTF50, mean of T and S{hatched}", _on(_overview, found)),
+        ("What becomes of a point of light in the centre and the corners", lambda on: _points(on, found)),
     ]
 
 
 def _photographer(report: LensReport) -> Figure:
     """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
     with mpl.rc_context(_STYLE):
-        figure = _page(report.name, report.verdict)
-        figure.set_layout_engine("constrained", rect=(0.06, 0.22, 0.88, 0.66))
-        places: Any = figure.subfigures(2, 1, height_ratios=(3.2, 1.0))
+        figure, top = _page(report.name, report.verdict, size=11.0, ink="#191a1c")
+        below = _written(figure, 0.25, EXPLAINED, 9.0, "#191a1c")
+        below = _written(figure, below - 0.012, report.advice, 11.0, "#191a1c")
+        _written(figure, below - 0.012, "\n".join(report.notes), 8.5, "#55585d")
+        figure.set_layout_engine("constrained", rect=(0.06, 0.26, 0.88, top - 0.28), h_pad=0.08)
+        places: Any = figure.subfigures(2, 1, height_ratios=(2.6, 1.0))
         for place, panel in zip(places, _simple(report), strict=True):
             _titled(place, panel)
-        figure.text(0.08, 0.19, textwrap.fill(report.advice, 95), fontsize=10, va="top")
-        wrapped = "\n".join(textwrap.fill(line, 120) for line in report.notes)
-        figure.text(0.08, 0.14, wrapped, fontsize=8, color="#55585d", va="top")
     return figure

@@ -61,7 +61,7 @@ def run(*words: str) -> str:
 def test_the_report_speaks_of_sharpness_centring_aperture_and_the_next_photo(folder: Path) -> None:
     text = run("report", NAME)
 
-    assert text.startswith("my-24mm: 3 photos, 60 blur samples; f/2\n")
+    assert text.startswith("my-24mm: 3 photos, blur measured at 60 places; f/2\n")
     for words in (
         "MTF50",
         "centred",
@@ -102,8 +102,8 @@ def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone
     for words in (
         "<h1>my-24mm</h1>",
         "would help most",
-        "MTF50, give or take",
-        "60 blur samples",
+        "How far off MTF50 may be",
+        "blur measured at 60 places",
     ):
         assert words in page
     assert set(re.findall(r"(?:src|href)=.(\w+:)", page)) == {"data:"}  # nothing is loaded from elsewhere

@@ -35,7 +35,7 @@ from lensmodel.report import (
 from lensmodel.report.html import to_html
 from lensmodel.report.lens_report import UNKNOWN
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
-from lensmodel.report.plots import charts, comparison_page, overview, pages, to_pdf, to_png
+from lensmodel.report.plots import EXPLAINED, charts, comparison_page, overview, pages, to_pdf, to_png
 from lensmodel.report.tables import place_table, to_csv
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
@@ -103,6 +103,14 @@ def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() ->
     assert sensor.words(1.0) == "at least .500"
     assert SensorGeometry().units == ("c/px",)
     assert SensorGeometry().words(0.2, "lp/mm") == "unknown"
+
+
+def test_facts_count_each_place_once_and_name_a_size_only_where_it_is_known(soft: LensReport) -> None:
+    assert soft.facts.startswith("3 photos, blur measured at 72 places, ")  # in three colours
+    assert soft.facts.endswith(", photos of 6000 x 4000 pixels")
+    one = lens_report(LensModel.fit(samples(1), QUICK), "", rows=1, size=SIZE, channels=("g",))
+    assert one.facts.startswith("1 photo, blur measured at 24 places")
+    assert "photos of" not in one.facts
 
 
 @pytest.mark.parametrize(
@@ -259,6 +267,7 @@ def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensRepor
     assert first == second  # no time of day in it
     page = to_html(soft).decode()
     assert f"<p>{soft.verdict}</p>" in page
+    assert EXPLAINED in page  # what T, S and MTF50 mean
     assert page.count("<img ") == 7  # two for photographers, five for testers
     assert "MTF50 by place" in page
     with Image.open(io.BytesIO(to_png(pages(soft)[0]))) as picture:
@@ -270,7 +279,7 @@ def test_the_error_stands_beside_the_maps_and_the_worst_corner_among_the_points(
     maps, errors = charts(soft, None)[:2]
 
     assert soft.tested[0].worst.side.removeprefix("the ") in points
-    assert errors.title == "MTF50, give or take %, f/2.8"
+    assert errors.title == "How far off MTF50 may be, in percent, f/2.8"
     figures = [float(text) for text in ET.fromstring(errors.svg).itertext() if text.strip().isdigit()]
     assert figures == [round(100.0 * share) for share in soft.tested[0].give_or_take]
     assert "tangential" in " ".join(ET.fromstring(maps.svg).itertext())
@@ -420,7 +429,7 @@ def test_the_corner_that_no_photo_shows_is_asked_for_at_its_aperture(phi: float,
     seen = [s for s in samples() if s.position.r < 0.6 or math.cos(s.position.phi - phi) < 0.5]
     found = lens_report(LensModel.fit(seen, QUICK), "A lens", rows=2, size=SIZE, channels=("g",))
 
-    assert f"{corner}, at f/2.8" in found.advice
+    assert f"{corner}, taken at f/2.8," in found.advice
     assert found.advice in found.summary
 
 

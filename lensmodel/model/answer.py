@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
+from lensmodel.model.variables import Support
 
 DEFAULT: Final = "default"
 PAPER: Final = "paper"
@@ -85,7 +86,7 @@ class PsfAnswer:
     photos : int
         Photos of these samples.
     nearest : float
-        Distance to the nearest sample, see `lensmodel.model.support`.
+        Distance to the nearest sample, see `lensmodel.model.variables.Support`.
     beyond : tuple of str
         Variables in which the question lies far from all samples.
     answered_by : {"network", "regression", "network and regression", "paper"}
@@ -110,3 +111,15 @@ class PsfAnswer:
     def extrapolated(self) -> bool:
         """Whether no sample is near."""
         return bool(self.beyond)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """What one way of answering says: the network or the regression."""
+
+    kernel: Kernel
+    error: float  # expected relative L2
+    weights: NDArray[np.float64]  # (n,), of the samples in the answer, of sum 1
+    photos: NDArray[np.object_]  # (n,), of these samples
+    support: Support
+    ring_error: NDArray[np.float64] | None = None

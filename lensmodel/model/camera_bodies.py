@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfSample, as_kernel
+from lensmodel.core.psf import PsfSample, as_kernel, resized
 from lensmodel.core.types import FieldPosition, Kernel
 
 SAME = 0.005  # of the pitch: what rounding in metadata changes
@@ -46,15 +46,15 @@ def circle_mm(samples: Sequence[PsfSample]) -> float | None:
 def on_one_circle(samples: Sequence[PsfSample]) -> tuple[PsfSample, ...]:
     """Count the places of all samples in the largest of their half diagonals; unknown ones stay."""
     circle = circle_mm(samples)
-    return tuple(sample if circle is None else _on(sample, circle) for sample in samples)
 
+    def on_it(sample: PsfSample) -> PsfSample:
+        own, pixels = half_diagonal_mm(sample), sample.half_diagonal_px
+        if circle is None or own is None or pixels is None or own > (1.0 - ALIKE) * circle:
+            return sample
+        place = FieldPosition(sample.position.r * own / circle, sample.position.phi)
+        return replace(sample, position=place, half_diagonal_px=pixels * circle / own)
 
-def _on(sample: PsfSample, circle: float) -> PsfSample:
-    own, pixels = half_diagonal_mm(sample), sample.half_diagonal_px
-    if own is None or pixels is None or own > (1.0 - ALIKE) * circle:
-        return sample
-    place = FieldPosition(sample.position.r * own / circle, sample.position.phi)
-    return replace(sample, position=place, half_diagonal_px=pixels * circle / own)
+    return tuple(on_it(sample) for sample in samples)
 
 
 def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
@@ -66,39 +66,34 @@ def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
     return float(values[counts.argmax()])
 
 
-def alike(a: float | None, b: float | None) -> bool:
-    """Whether two pixels are one; an unknown one is the same as any other."""
-    return a is None or b is None or abs(a / b - 1.0) <= SAME
-
-
-def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> tuple[PsfSample, ...]:
+def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> list[PsfSample]:
     """Samples as a body of another pitch would have seen them; those of that pitch stay themselves."""
-    return tuple(_seen_with(s, pitch_um) for s in samples)
+    return [_seen_with(s, pitch_um) for s in samples]
 
 
 def _seen_with(sample: PsfSample, pitch_um: float | None) -> PsfSample:
-    own, half = sample.pixel_pitch_um, sample.half_diagonal_px
+    own, half, side = sample.pixel_pitch_um, sample.half_diagonal_px, sample.kernel.shape[0]
     if own is None or pitch_um is None or alike(own, pitch_um):
         return sample
+    wanted = min(2 * math.ceil(side / 2 * own / pitch_um) + 1, 2 * side + 1)
     return replace(
         sample,
-        kernel=rescaled(sample.kernel, own, pitch_um, side_at(sample, pitch_um)),
+        kernel=rescaled(sample.kernel, own, pitch_um, wanted),
         encoded=None,  # its statistics are of the other pixels
         pixel_pitch_um=pitch_um,
         half_diagonal_px=None if half is None else half * own / pitch_um,
     )
 
 
-def side_at(sample: PsfSample, pitch_um: float | None) -> int:
-    """Odd side that a kernel needs with other pixels, at most twice its own."""
-    own, side = sample.pixel_pitch_um, sample.kernel.shape[0]
-    if own is None or pitch_um is None or alike(own, pitch_um):
-        return side
-    return min(2 * math.ceil(side / 2 * own / pitch_um) + 1, 2 * side + 1)
+def alike(a: float, b: float) -> bool:
+    """Whether two pixels are one."""
+    return abs(a / b - 1.0) <= SAME
 
 
-def rescaled(kernel: Kernel, own: float, wanted: float, size: int) -> Kernel:
-    """Kernel of a pixel pitch as one of another."""
+def rescaled(kernel: Kernel, own: float | None, wanted: float | None, size: int) -> Kernel:
+    """Kernel of a pixel pitch as one of another and of side `size`; an unknown pitch is that of any other."""
+    if own is None or wanted is None or alike(own, wanted):
+        return resized(kernel, size)
     ratio = wanted / own
     side = kernel.shape[0]
     reach = max(size * ratio, side)
@@ -110,13 +105,12 @@ def rescaled(kernel: Kernel, own: float, wanted: float, size: int) -> Kernel:
     period = _PADDED * (2 * math.ceil(reach / 2) + 1)
     frequency = np.fft.fftfreq(period)
     pixel = np.sinc(ratio * frequency) / np.sinc(frequency)
-    into = _wave(frequency, side, -1.0) / period
-    out = _wave(frequency, size, ratio)
-    along = (out.T * pixel) @ into  # what is done on one axis; the spectrum itself may be huge
+
+    def waves(count: int, step: float) -> NDArray[np.complex128]:
+        t = np.arange(count) - count // 2
+        return np.asarray(np.exp(2j * np.pi * step * np.outer(frequency, t)))
+
+    # what is done on one axis; the spectrum itself may be huge
+    along = (waves(size, ratio).T * pixel) @ (waves(side, -1.0) / period)
     resampled = (along @ kernel @ along.T).real
     return as_kernel(np.maximum(resampled, 0.0))
-
-
-def _wave(frequency: NDArray[np.floating], size: int, step: float) -> NDArray[np.complex128]:
-    t = np.arange(size) - size // 2
-    return np.asarray(np.exp(2j * np.pi * step * np.outer(frequency, t)))

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import PsfSample, as_kernel
-from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
-from lensmodel.model import camera_bodies, support
+from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.model import camera_bodies
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
+from lensmodel.model.variables import VARIABLES
 
 _LEAST_ERROR: Final = 0.01
 """Relative L2 below which no part of an answer is believed (chosen): it would silence the others."""
@@ -74,36 +75,27 @@ class LensModel:
         NoSamplesError
             If there are none, or all photos are excluded.
         """
-        settings, kept = settings or ModelSettings(), _distinct((), camera_bodies.on_one_circle(samples))
-        if not kept:
-            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        encoded, kernels = _parted(kept, settings)
-        if not (encoded or kernels):
-            raise NoSamplesError(f"all photos of the {len(kept)} samples are excluded; include one again")
-        return cls(
-            kept,
-            settings,
-            LearnedField.of(encoded) if encoded else None,
-            Regression.of(kernels, settings) if kernels else None,
-        )
+        return cls._of(_distinct(camera_bodies.on_one_circle(samples)), settings or ModelSettings())
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples; a regression is fitted anew where these are of its kind."""
         placed = camera_bodies.on_one_circle((*self.samples, *samples))
-        known = placed[: len(self.samples)]
-        new = _distinct(known, placed[len(known) :])
-        if not new:
-            return self
-        every = (*known, *new)
-        if any(sample is not before for sample, before in zip(known, self.samples, strict=True)):
-            return LensModel.fit(every, self.settings)  # a larger frame: all places are counted anew
-        encoded, kernels = _parted(new, self.settings)
-        attention, regression = self._attention, self._regression
-        if encoded:
-            attention = LearnedField.of(encoded) if attention is None else attention.added(encoded)
-        if kernels:
-            regression = Regression.of(_parted(every, self.settings)[1], self.settings)
-        return LensModel(every, self.settings, attention, regression)
+        every = _distinct(placed, known=len(self.samples))
+        return self if len(every) == len(self.samples) else self._of(every, self.settings, self._regression)
+
+    @classmethod
+    def _of(
+        cls, samples: tuple[PsfSample, ...], settings: ModelSettings, before: Regression | None = None
+    ) -> LensModel:
+        if not samples:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        encoded, kernels = _parted(samples, settings)
+        if not (encoded or kernels):
+            raise NoSamplesError(f"all photos of the {len(samples)} samples are excluded; include one again")
+        attention = LearnedField(encoded) if encoded else None
+        if before is not None and before.samples == kernels:
+            return cls(samples, settings, attention, before)
+        return cls(samples, settings, attention, Regression.of(kernels, settings) if kernels else None)
 
     # --- asking ---------------------------------------------------------------------------------
 
@@ -133,8 +125,8 @@ class LensModel:
             If the size is even or not positive, or the pitch is not positive.
         """
         pitch_um = self._asked(size, pitch_um)
-        parts = self._parts(position, settings, size, pitch_um)
-        precision = np.array([part.error**-2 for part in parts])
+        parts = [part.ask(position, settings, size, pitch_um) for part in self._answering]
+        precision = np.array([max(part.error, _LEAST_ERROR) ** -2 for part in parts])
         shares = precision / precision.sum()
         kernel = parts[0].kernel
         if len(parts) > 1:
@@ -142,50 +134,22 @@ class LensModel:
         weights = np.concatenate([s * part.weights for s, part in zip(shares, parts, strict=True)])
         photos = np.concatenate([part.photos for part in parts])
         names, number = np.unique(photos.astype(str), return_inverse=True)
-        nearest = min(parts, key=lambda part: part.support.nearest).support
         beyond = set.intersection(*(set(part.support.beyond) for part in parts))
         return PsfAnswer(
             kernel=kernel,
             predicted_error=min(float(precision.sum() ** -0.5), 1.0),
             effective_samples=1.0 / float(weights @ weights),
             photos=int(np.count_nonzero(np.bincount(number, weights, len(names)) > _LISTED)),
-            nearest=nearest.nearest,
-            beyond=tuple(name for name in support.VARIABLES if name in beyond),
+            nearest=min(part.support.nearest for part in parts),
+            beyond=tuple(name for name in VARIABLES if name in beyond),
             answered_by=self._answered_by,
             weights=self.weights,
             ring_error=parts[0].ring_error,
         )
 
-    def _parts(
-        self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None
-    ) -> list[_Part]:
-        parts = []
-        if self._attention is not None:
-            found = self._attention.ask(position, settings.with_channel("g"), pitch_um)
-            parts.append(
-                _Part(
-                    found.kernel(settings.channel, size, pitch_um),
-                    max(found.error(settings.channel), _LEAST_ERROR),
-                    np.asarray(found.answer.weights, dtype=np.float64),
-                    self._attention.patches.photos[found.rows],
-                    found.support,
-                    np.asarray(found.answer.ring_error[CHANNELS.index(settings.channel)], dtype=np.float64),
-                )
-            )
-        if self._regression is not None:
-            regression = self._regression
-            near = regression.near([position], settings)
-            around = support.support(regression.where[near.rows], support.point(position, settings))
-            parts.append(
-                _Part(
-                    regression.kernels(near, [position], settings, size, pitch_um)[0],
-                    max(regression.error(near, around), _LEAST_ERROR),
-                    near.weights,
-                    regression.photos[near.rows],
-                    around,
-                )
-            )
-        return parts
+    @property
+    def _answering(self) -> list[LearnedField | Regression]:
+        return [part for part in (self._attention, self._regression) if part is not None]
 
     def kernels(
         self,
@@ -203,8 +167,7 @@ class LensModel:
         if not positions:
             return np.empty((0, size, size))
         if self._attention is None and self._regression is not None:
-            near = self._regression.near(positions, settings)
-            return self._regression.kernels(near, positions, settings, size, pitch_um)
+            return self._regression.kernels(positions, settings, size, pitch_um)
         return np.stack([self.query(place, settings, size, pitch_um=pitch_um).kernel for place in positions])
 
     def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
@@ -258,24 +221,17 @@ class LensModel:
         """Mean error that green answers expect of themselves in each zone, at the commonest settings."""
         kinds = [s.settings.with_channel("g") for s in self.samples if s.photo not in self.settings.excluded]
         settings = max(dict.fromkeys(kinds), key=kinds.count)
-        return {
-            zone: float(
-                np.mean(
-                    [
-                        self.query(FieldPosition(r, float(phi)), settings, 15).predicted_error
-                        for r in radii
-                        for phi in _ZONE_ANGLES
-                    ]
-                )
-            )
-            for zone, radii in _ZONE_RADII.items()
-        }
+
+        def expected(r: float) -> list[float]:
+            places = [FieldPosition(r, float(phi)) for phi in _ZONE_ANGLES]
+            return [self.query(place, settings, 15).predicted_error for place in places]
+
+        return {zone: float(np.mean([expected(r) for r in radii])) for zone, radii in _ZONE_RADII.items()}
 
     @property
     def nbytes(self) -> int:
         """Bytes kept, the kernels of the samples included."""
-        parts = (part.nbytes for part in (self._attention, self._regression) if part is not None)
-        return sum(parts) + sum(s.kernel.nbytes for s in self.samples)
+        return sum(p.nbytes for p in self._answering) + sum(s.kernel.nbytes for s in self.samples)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -304,18 +260,6 @@ class ModelField:
         return self.model.query(position, settings, size, pitch_um=self.pitch_um)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """What one way of answering says."""
-
-    kernel: Kernel
-    error: float
-    weights: NDArray[np.float64]
-    photos: NDArray[np.object_]
-    support: support.Support
-    ring_error: NDArray[np.float64] | None = None
-
-
 def _parted(samples: Sequence[PsfSample], settings: ModelSettings) -> tuple[list[PsfSample], list[PsfSample]]:
     """One sample of each encoded patch, and those whose kernels are averaged; no excluded photos."""
     counted = [s for s in samples if s.photo not in settings.excluded]
@@ -332,18 +276,20 @@ def _place_of(sample: PsfSample) -> Hashable:
     return sample.photo, sample.position, sample.settings.with_channel("g")
 
 
-def _distinct(known: Sequence[PsfSample], samples: Sequence[PsfSample]) -> tuple[PsfSample, ...]:
-    """Samples that are new: no encoded ones of a known photo, none of one place and estimator twice."""
-    photos = {s.photo for s in known if s.encoded is not None}
-    seen = {_key_of(s) for s in known}
-    new = []
-    for sample in samples:
+def _distinct(samples: Sequence[PsfSample], known: int = 0) -> tuple[PsfSample, ...]:
+    """The first `known` samples and those that are new beside them.
+
+    No encoded ones of a known photo, none of one place and estimator twice.
+    """
+    photos = {s.photo for s in samples[:known] if s.encoded is not None}
+    kept, keys = list(samples[:known]), {_key_of(s) for s in samples[:known]}
+    for sample in samples[known:]:
         key = _key_of(sample)
-        repeated = key in seen or (sample.encoded is not None and sample.photo in photos)
-        if not sample.photo or not repeated:
-            new.append(sample)
-        seen.add(key)
-    return tuple(new)
+        repeated = key in keys or (sample.encoded is not None and sample.photo in photos)
+        if not (sample.photo and repeated):
+            kept.append(sample)
+        keys.add(key)
+    return tuple(kept)
 
 
 def _key_of(sample: PsfSample) -> Hashable:

@@ -33,7 +33,7 @@ FORMAT = 2  # raised when samples of before mean nothing to the model any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
 _MAX_SAMPLES = 200_000  # some 700 photos of 96 patches in three colours (chosen: memory)
 _MAX_SIDE = 255  # pixels: several times the widest kernels; larger files would fill the memory (chosen)
-_ENCODED = "encoded.npy"
+_KERNELS, _ENCODED = "kernels.npy", "encoded.npy"
 
 _UNREADABLE = (
     OSError,
@@ -90,13 +90,16 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "lens": profile.lens,
         "photos": profile.photos,
-        "cameras": [_named(asdict(camera)) for camera in profile.cameras],
+        "cameras": [
+            {key: text for key, text in asdict(camera).items() if text is not None}
+            for camera in profile.cameras
+        ],
         "model": asdict(profile.model.settings),
         "samples": packed.entries,
     }
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
-        archive.writestr("kernels.npy", _saved(packed.kernels))
+        archive.writestr(_KERNELS, _saved(packed.kernels))
         archive.writestr(_ENCODED, _saved(packed.encoded))
         if _unpacked(archive) > _MAX_BYTES:
             raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
@@ -106,10 +109,6 @@ def _saved(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
-
-
-def _opened(archive: zipfile.ZipFile, part: str) -> NDArray[Any]:
-    return np.asarray(np.load(io.BytesIO(archive.read(part)), allow_pickle=False))
 
 
 def _within_limits(count: int, side: int) -> bool:
@@ -122,15 +121,11 @@ def _unpacked(archive: zipfile.ZipFile) -> int:
 
 def load_profile(path: Path | str) -> LensProfile:
     """Open a profile."""
-    return _read(path, Path(path).name)
+    return read_profile(path, Path(path).name)
 
 
-def read_profile(file: IO[bytes], name: str) -> LensProfile:
-    """Open a profile that lies in an open file."""
-    return _read(file, name)
-
-
-def _read(source: Path | str | IO[bytes], name: str) -> LensProfile:
+def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
+    """Open a profile by its path or as an open file; errors call it `name`."""
     try:
         with zipfile.ZipFile(source) as archive:
             if _unpacked(archive) > _MAX_BYTES:
@@ -139,7 +134,10 @@ def _read(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 )
             document = json.loads(archive.read("profile.json"))
             if document["format"] == FORMAT:
-                stack, encoded = _opened(archive, "kernels.npy"), _opened(archive, _ENCODED)
+                stack, encoded = (
+                    np.asarray(np.load(io.BytesIO(archive.read(part)), allow_pickle=False))
+                    for part in (_KERNELS, _ENCODED)
+                )
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
@@ -153,11 +151,7 @@ def _read(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 "are not those of this program; calibrate again with the photos of the lens"
             )
         entries = document["samples"]
-        fits = (
-            stack.ndim == 3
-            and len(entries) == stack.shape[0]
-            and _within_limits(len(entries), stack.shape[1])
-        )
+        fits = stack.ndim == 3 and len(entries) == len(stack) and _within_limits(*stack.shape[:2])
         if not fits or stack.dtype != np.float32:
             raise InvalidInputError(
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
@@ -165,20 +159,17 @@ def _read(source: Path | str | IO[bytes], name: str) -> LensProfile:
             )
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
         model = LensModel.fit(samples, ModelSettings(**document["model"]))
-        cameras = tuple(_camera(_texts(camera)) for camera in document.get("cameras", []))
-        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
+        cameras = (_texts(camera) for camera in document.get("cameras", []))
+        return LensProfile(
+            model,
+            _texts(document["lens"]),
+            _texts(document["photos"]),
+            tuple(Camera(known.get("maker"), known.get("model"), known.get("serial")) for known in cameras),
+        )
     except LensModelError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InvalidInputError(f"{name} is damaged: {error}") from error
-
-
-def _named(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if value is not None}
-
-
-def _camera(texts: dict[str, str]) -> Camera:
-    return Camera(texts.get("maker"), texts.get("model"), texts.get("serial"))
 
 
 def _texts(values: dict[str, Any]) -> dict[str, str]:

@@ -3,49 +3,102 @@
 The weight of a sample factorises into one of place and settings, common to all its pixels, and one of (u, v).
 So the sum over all pixels of all samples is one of kernels::
 
-    f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i
+    f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i,     W_i = q_i exp(-d_i^2 / 2)
 
-with C_i the sample's kernel in its own radial frame. Departures from the paper: n in eq. (8) counts PSFs, not
-pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of pixels would widen the PSF;
-unless the mode is "paper", kernels are scaled to the width of the place before averaging (`widths`).
+with C_i the sample's kernel in its own radial frame, d_i its distance in bandwidths (`variables`), q_i its
+weight. The samples near a question are found in a kd-tree (paper, section 6.3). Departures from the paper:
+n in eq. (8) counts PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of
+pixels would widen the PSF; unless the mode is "paper", kernels are scaled to the width of the place before
+averaging (`widths`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+import scipy  # `spatial` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import camera_bodies, support
+from lensmodel.model import camera_bodies
 from lensmodel.model import variables as va
-from lensmodel.model.answer import PAPER, ModelSettings
-from lensmodel.model.bandwidths import CrossValidation, bandwidth, by_rule, cross_validate
-from lensmodel.model.local_frame import LocalKernels
-from lensmodel.model.neighbours import Answers, Neighbourhood
+from lensmodel.model.answer import PAPER, ModelSettings, Part
+from lensmodel.model.bandwidths import CrossValidation, bandwidths, cross_validate
+from lensmodel.model.local_frame import Answers, LocalKernels
 from lensmodel.model.widths import WidthField
 
-_DRIFT: Final = 0.15
-"""Relative L2 error for each unit of `support` beyond the first to the nearest sample (chosen)."""
+_REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
+_DROPPED: Final = 3e-5
+"""Samples that together weigh less are left out (chosen: below what a kernel in single precision holds)."""
+_FEW: Final = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
+_MANY: Final = 4096  # fewer samples are looked through as fast as a tree (chosen)
 
+_DRIFT: Final = 0.15
+"""Relative L2 error for each unit of `Support` beyond the first to the nearest sample (chosen)."""
 _WIDEST: Final = 255
 """Pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbourhood:
+    """Samples by their points and weights, in kd-trees that are built when they are first asked."""
+
+    points: NDArray[np.float64]  # (n, 7), of `variables`; NaN = unknown
+    weights: NDArray[np.float64]  # (n,), samples of weight 0 take no part
+    scale: NDArray[np.float64]  # (7,), bandwidths
+    _trees: dict[tuple[int, ...], scipy.spatial.cKDTree] = field(default_factory=dict)
+
+    def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
+        """Weigh the samples near each of some places."""
+        chosen = [self._weighed(va.point(position, settings)) for position in positions]
+        return Answers(
+            np.concatenate([rows for rows, _ in chosen]),
+            np.concatenate([weights for _, weights in chosen]),
+            np.array([len(rows) for rows, _ in chosen]),
+        )
+
+    def _weighed(self, asked: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Rows and weights of sum 1 for one question, the least first (eq. 4 and 7)."""
+        rows = np.arange(len(self.points)) if len(self.points) <= _MANY else self.within(asked, _REACH)
+        squared = va.squared_distances(self.points[rows], asked, self.scale)
+        near = np.flatnonzero((squared <= _REACH**2) & (self.weights[rows] > 0.0))
+        if len(near) < _FEW:  # the nearest few, however far
+            rows = np.arange(len(self.points))
+            squared = va.squared_distances(self.points, asked, self.scale)
+            squared[self.weights <= 0.0] = np.inf
+            near = np.argsort(squared, kind="stable")[: min(_FEW, np.count_nonzero(self.weights > 0.0))]
+        rows, squared = rows[near], squared[near]
+        weight = self.weights[rows] * np.exp(-0.5 * (squared - squared.min()))
+        order = np.argsort(weight, kind="stable")
+        kept = order[np.cumsum(weight[order]) > _DROPPED * weight.sum()]
+        return rows[kept], weight[kept] / weight[kept].sum()
+
+    def within(self, asked: NDArray[np.float64], reach: float) -> NDArray[np.intp]:
+        """Rows within `reach` bandwidths of a point, and some beyond that do not know all its variables."""
+        # a sample that does not know a variable is near in it: the tree leaves that one out
+        known = tuple(np.flatnonzero(~np.isnan(asked) & ~np.isnan(self.points).any(axis=0)).tolist())
+        scale = self.scale[list(known)]
+        if known not in self._trees:
+            self._trees[known] = scipy.spatial.cKDTree(self.points[:, known] / scale)
+        inside = self._trees[known].query_ball_point(asked[list(known)] / scale, reach)
+        return np.sort(np.asarray(inside, dtype=np.intp))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
     """Kernels of samples, prepared for questions."""
 
+    samples: Sequence[PsfSample]
     pitch_um: float | None  # pixel pitch that all kernels are brought to; None where none is known
     widths: WidthField
     local: LocalKernels
-    where: NDArray[np.float64]  # (n, 5), points of the samples in units of `support`
+    where: NDArray[np.float64]  # (n, 5), places and settings of the samples in units of `Support`
     validation: CrossValidation
     # (n,), errors that the estimators expect of their samples; 0 where they expect nothing
     expected: NDArray[np.float64]
@@ -66,17 +119,18 @@ class Regression:
         widths = WidthField.fit(common, base) if normalised else WidthField()
         local = LocalKernels.of(common, points, widths)
         validation = cross_validate(common, settings, local, points, base)
-        if normalised and validation.spoilt:
+        if validation.spoilt:
             # a spoilt photo has bent the widths too: fit them again without it
             widths = WidthField.fit(common, validation.weights)
             local = local.rescaled(points, widths)
             validation = cross_validate(common, settings, local, points, base)
-        used = bandwidth(by_rule(points), settings, validation.choice)
+        used = bandwidths(points, settings, validation.factors)
         return cls(
+            samples,
             pitch_um,
             widths,
             local,
-            support.points(common),
+            va.all_in_units(common),
             validation,
             expected=np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples]),
             photos=np.array([s.photo for s in samples], dtype=object),
@@ -84,11 +138,27 @@ class Regression:
             neighbourhood=Neighbourhood(points, validation.weights, va.scales(used)),
         )
 
-    def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
-        """Return the neighbours of some places and their weights."""
-        return self.neighbourhood.near(positions, settings)
+    def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
+        """Answer at a place, in pixels of some pitch."""
+        near = self.neighbourhood.near([position], settings)
+        support = va.Support.of(self.where[near.rows], va.in_units(position, settings))
+        return Part(
+            self._kernels(near, [position], settings, size, pitch_um)[0],
+            self._error(near, support),
+            near.weights,
+            self.photos[near.rows],
+            support,
+        )
 
     def kernels(
+        self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
+    ) -> NDArray[np.float64]:
+        """Return the kernels of many places, shape (q, size, size)."""
+        return self._kernels(
+            self.neighbourhood.near(positions, settings), positions, settings, size, pitch_um
+        )
+
+    def _kernels(
         self,
         near: Answers,
         positions: Sequence[FieldPosition],
@@ -96,7 +166,6 @@ class Regression:
         size: int,
         pitch_um: float | None,
     ) -> NDArray[np.float64]:
-        """Return the kernels that neighbours make, in pixels of some pitch, shape (q, size, size)."""
         widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
         own = self.pitch_um
@@ -106,7 +175,7 @@ class Regression:
         kernels = self.local.kernels(near, angles, widths, inside)
         return np.stack([camera_bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
-    def error(self, near: Answers, found: support.Support) -> float:
+    def _error(self, near: Answers, support: va.Support) -> float:
         """Expected relative L2 error of one answer.
 
         With held-out errors h, of which the scatter s of neighbours is a part, m independent photos, and what
@@ -127,10 +196,10 @@ class Regression:
         if len(self.where) == 1 and expected > 0.0:
             own = 0.0  # no other sample foretells it
         shared = max(expected - scatter, expected / 4.0)
-        drift = _DRIFT * max(found.nearest - 1.0, 0.0)
+        drift = _DRIFT * max(support.nearest - 1.0, 0.0)
         return min(math.sqrt(own + shared + drift * drift), 1.0)
 
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
-        return self.local.nbytes
+        return self.local.splines.nbytes

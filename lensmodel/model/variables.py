@@ -1,16 +1,26 @@
-"""The variables that a PSF depends on besides (u, v), and distances between their values.
+"""The variables that a PSF depends on besides (u, v), and two distances between their values.
+
+By the one the regression weighs samples (paper, eq. 7), in bandwidths::
 
     d^2 = ((r - r_i) / h_r)^2 + |c(phi) - c(phi_i)|^2 / h_phi^2 + sum over the settings
 
 with c on the unit circle, so that pi and -pi are neighbours: |c - c_i| is the chord 2 sin(d/2).
-Near the centre of the image all angles are neighbours, so the circle shrinks with r there. A
-setting that is unknown, in the question or in the sample, drops out of the sum.
+Near the centre of the image all angles are neighbours, so the circle shrinks with r there.
+
+The other, `Support`, says how far a question lies from all samples, in units in which a PSF changes by about
+as much. They do not shrink as samples come, as bandwidths do: what is near stays near::
+
+    d^2 = |p - p_i|^2 / 0.2^2 + (stops apart)^2 + (octaves of focal length apart / 0.5)^2
+          + (dioptres of focus distance apart / 0.5)^2,        p = r (cos phi, sin phi)
+
+A setting that is unknown, in the question or in the sample, drops out of both sums.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,29 +32,36 @@ from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 COLUMNS: Final = ("r", "phi", "phi", "aperture_stops", "wavelength_nm", "focal_octaves", "focus_dioptres")
 """The variable that each column of a point belongs to; phi takes two, cosine and sine."""
 
+VARIABLES: Final = ("place", "aperture_stops", "focal_octaves", "focus_dioptres")
+"""In which a question can lie beyond the samples."""
+UNITS: Final = np.array([0.2, 0.2, 1.0, 0.5, 0.5])
+"""Of x, y, stops, octaves and dioptres (chosen: kernels of usual lenses differ by 0.1 to 0.2 over each)."""
+FAR: Final = 2.5  # units: a Gaussian has fallen to 0.04 there (chosen)
+
 _CENTER_R = 0.25  # half-diagonals: inside, directions fade, since at the centre there is none (chosen)
+
+
+def _numbers(settings: LensSettings) -> tuple[float, float, float]:
+    """Stops, octaves of focal length and dioptres; NaN = unknown."""
+    stops, focal, focus = settings.stops, settings.focal_mm, settings.focus_m
+    return (
+        math.nan if stops is None else stops,
+        math.nan if focal is None else math.log2(focal),
+        math.nan if focus is None else 1.0 / focus,
+    )
 
 
 def point(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
     """Coordinates of a place and settings, shape (7,), in the order of `COLUMNS`; NaN = unknown."""
     share = min(position.r / _CENTER_R, 1.0)
-    stops, focal, focus = settings.stops, settings.focal_mm, settings.focus_m
-    return np.array(
-        [
-            position.r,
-            share * math.cos(position.phi),
-            share * math.sin(position.phi),
-            math.nan if stops is None else stops,
-            WAVELENGTH_NM[settings.channel],
-            math.nan if focal is None else math.log2(focal),
-            math.nan if focus is None else 1.0 / focus,
-        ]
-    )
+    stops, octaves, dioptres = _numbers(settings)
+    turned = share * math.cos(position.phi), share * math.sin(position.phi)
+    return np.array([position.r, *turned, stops, WAVELENGTH_NM[settings.channel], octaves, dioptres])
 
 
 def points(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
     """Coordinates of samples, shape (n, 7)."""
-    return np.array([point(s.position, s.settings) for s in samples]).reshape(len(samples), len(COLUMNS))
+    return np.array([point(s.position, s.settings) for s in samples])
 
 
 def vectors(where: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -65,3 +82,34 @@ def squared_distances(
     gap = (where - asked) / scale
     gap[np.isnan(gap)] = 0.0
     return np.asarray((gap * gap).sum(axis=-1))
+
+
+def in_units(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
+    """Place and settings in `UNITS`, shape (5,): x, y, stops, octaves, dioptres; NaN = unknown."""
+    return np.array([*position.xy, *_numbers(settings)]) / UNITS
+
+
+def all_in_units(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+    """Places and settings of samples in `UNITS`, shape (n, 5)."""
+    return np.array([in_units(s.position, s.settings) for s in samples])
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """Distance to the nearest sample in units, and in which of `VARIABLES` all samples are far."""
+
+    nearest: float
+    beyond: tuple[str, ...]
+
+    @classmethod
+    def of(cls, where: NDArray[np.float64], asked: NDArray[np.float64]) -> Support:
+        """Measure how far a point `(5,)` lies from others `(n, 5)`."""
+        gaps = np.abs(where - asked)
+        gaps[np.isnan(gaps)] = 0.0
+        each = np.concatenate([np.hypot(gaps[:, :1], gaps[:, 1:2]), gaps[:, 2:]], axis=1)
+        distance = np.sqrt((each**2).sum(axis=1))
+        nearest = int(distance.argmin())
+        beyond = [name for name, least in zip(VARIABLES, each.min(axis=0), strict=True) if least > FAR]
+        if not beyond and distance[nearest] > FAR:
+            beyond = [VARIABLES[int(each[nearest].argmax())]]
+        return cls(float(distance[nearest]), tuple(beyond))

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
@@ -44,11 +43,6 @@ class WidthField:
     reference: float = 0.0  # logarithm of the width that counts as 1
     stops: float = 0.0  # origins of the settings, where terms of them are zero
     focal: float = 0.0
-    wavelength: float = WAVELENGTH_NM["g"]
-
-    def __post_init__(self) -> None:
-        if not np.isfinite((self.reference, self.stops, self.focal, self.wavelength)).all():
-            raise InvalidInputError(f"the origins of a width field must be finite, got {self}")
 
     def over(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
         """Widths along u and v at points `(n, 7)` of `variables`, over the reference width, shape (n, 2)."""
@@ -63,19 +57,18 @@ class WidthField:
         x, y = va.vectors(where).T
         stops, focal = where[:, 3] - self.stops, where[:, 5] - self.focal
         stops[np.isnan(stops)] = focal[np.isnan(focal)] = 0.0
-        wave = (where[:, 4] - self.wavelength) / 100.0
+        wave = (where[:, 4] - WAVELENGTH_NM["g"]) / 100.0
         place = [np.ones_like(r2), r2, r2 * r2, x, y, x * r2, y * r2, x * x - y * y, x * y]
         return np.stack(
             [*place, stops, stops * stops, stops * r2, focal, focal * r2, wave, wave * wave], axis=1
         )
 
     @classmethod
-    def fit(cls, samples: Sequence[PsfSample], weights: NDArray[np.float64] | None = None) -> WidthField:
-        """Fit the widths of samples robustly; one width everywhere below six samples.
+    def fit(cls, samples: Sequence[PsfSample], weights: NDArray[np.float64]) -> WidthField:
+        """Fit the widths of weighted samples robustly; one width everywhere below six samples.
 
         Huber's weights by iteration: a width that is wrong by a factor counts less, not nothing.
         """
-        weights = np.array([s.weight for s in samples]) if weights is None else weights
         rows = np.flatnonzero(weights > 0)
         if len(rows) < _MIN_SAMPLES:
             return cls()
@@ -83,11 +76,9 @@ class WidthField:
             rows = rows[np.linspace(0, len(rows) - 1, _MOST).round().astype(np.intp)]
         samples = [samples[int(i)] for i in rows]
         where = va.points(samples)
-        stops, focal = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
-        origin = cls(
-            stops=float(np.median(stops)) if stops.size else 0.0,
-            focal=float(np.median(focal)) if focal.size else 0.0,
-        )
+        known = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
+        stops, focal = (float(np.median(column)) if column.size else 0.0 for column in known)
+        origin = cls(stops=stops, focal=focal)
         design = origin._features(where)
         target = np.array([_log_widths(s) for s in samples])
         weight = np.maximum(weights[rows], 1e-3)
@@ -102,7 +93,7 @@ class WidthField:
             trust = np.minimum(1.0, _HUBER / np.maximum(miss, 1e-12))
         seen = design @ slopes
         reference = float((seen.min() + seen.max()) / 2.0)  # as far from the narrowest as from the widest
-        return cls(slopes, reference, origin.stops, origin.focal, origin.wavelength)
+        return cls(slopes, reference, stops, focal)
 
 
 def _log_widths(sample: PsfSample) -> tuple[float, float]:

@@ -178,12 +178,12 @@ def test_the_samples_that_are_attended_to_are_near_and_of_all_photos(network: Sm
     model = LensModel.fit([s for k in range(8) for s in photo(f"p{k}", k, count=96)])
     assert model._attention is not None
 
-    found = model._attention.ask(FieldPosition(0.8, 0.5), F2, None)
+    found = model._attention.ask(FieldPosition(0.8, 0.5), F2, 31, None)
+    rows = model._attention._answer(FieldPosition(0.8, 0.5), F2, None)[1]
 
-    rows = found.rows
     assert len(rows) == NEAREST
-    assert set(model._attention.patches.photos[rows]) == {f"p{k}" for k in range(8)}
-    apart = np.linalg.norm(model._attention.patches.xy - FieldPosition(0.8, 0.5).xy, axis=1)
+    assert set(found.photos) == {f"p{k}" for k in range(8)}
+    apart = np.linalg.norm(model._attention._xy - FieldPosition(0.8, 0.5).xy, axis=1)
     assert np.median(apart[rows]) < 0.6 * np.median(apart)
 
 

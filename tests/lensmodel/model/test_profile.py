@@ -1,10 +1,14 @@
-"""Samples as JSON and arrays."""
+"""Samples as JSON and arrays, and the profile that holds them."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import zipfile
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
 
-finite = {"allow_nan": False, "allow_infinity": False}
+SIZE = 21
+GREEN = LensSettings(aperture=2.0)
 
 
 @st.composite
@@ -117,3 +123,92 @@ def test_values_out_of_range_are_refused() -> None:
 
     with pytest.raises(InvalidInputError, match="weight"):
         unpack_samples(replace(packed, entries=[{**packed.entries[0], "weight": 2.0}]))
+
+
+@cache
+def profile(count: int = 48) -> LensProfile:
+    rng = np.random.default_rng(0)
+    taken = [
+        PsfSample(
+            gaussian(SIZE, np.diag(rng.uniform(1.0, 4.0, 2))),
+            FieldPosition(math.sqrt(rng.uniform(0.0, 0.9)), float(rng.uniform(-3.1, 3.1))),
+            GREEN,
+            photo=f"p{i % 3}",
+        )
+        for i in range(count)
+    ]
+    model = LensModel.fit(taken, ModelSettings(excluded=("p1",), phi=0.4))
+    return LensProfile(model, {"serial": "1"}, {"p0": "a.dng"})
+
+
+def test_profile_comes_back_with_the_same_answers(tmp_path: Path) -> None:
+    before = profile()
+    save_profile(tmp_path / "a.lensprofile", before)
+    after = load_profile(tmp_path / "a.lensprofile")
+
+    assert after.lens == before.lens
+    assert after.photos == before.photos
+    assert after.model.settings == before.model.settings
+    for where in (FieldPosition(0.0, 0.0), FieldPosition(0.5, 2.0), FieldPosition(0.9, -1.0)):
+        a, b = before.model.query(where, GREEN, SIZE), after.model.query(where, GREEN, SIZE)
+        assert np.abs(a.kernel - b.kernel).max() <= 1e-6
+        assert a.predicted_error == pytest.approx(b.predicted_error, rel=1e-4)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04pickle"])
+def test_other_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.lensprofile").write_bytes(content)
+
+    with pytest.raises(InvalidInputError, match="no lens profile"):
+        load_profile(tmp_path / "a.lensprofile")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": 1, "samples": []}, "calibrate again"),
+        ({"model": {"mode": "magic"}}, "no mode"),
+        ({"model": {"unknown": 1}}, "damaged"),
+        ({"samples": []}, "one is needed"),
+        ({"lens": 7}, "damaged"),
+        ({"samples": [{"r": "far"}] * 48}, "damaged"),
+        ({"samples": [{"r": 10**400}] * 48}, "damaged"),
+    ],
+)
+def test_tampered_document_is_refused(change: dict[str, object], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.lensprofile"
+    save_profile(path, profile())
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    parts["profile.json"] = json.dumps({**json.loads(parts["profile.json"]), **change}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+
+    with pytest.raises(InvalidInputError, match=said):
+        load_profile(path)
+
+
+def test_what_could_not_be_opened_is_not_written(tmp_path: Path) -> None:
+    kernel = np.zeros((257, 257))
+    kernel[128, 128] = 1.0
+    model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
+
+    with pytest.raises(InvalidInputError, match="side 255"):
+        save_profile(tmp_path / "a.lensprofile", LensProfile(model))
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_truncation_and_flipped_byte_is_refused_or_harmless(tmp_path: Path) -> None:
+    path = tmp_path / "a.lensprofile"
+    save_profile(path, profile(3))
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    damaged = [whole[: int(n)] for n in rng.integers(0, len(whole), 10)]
+    for at in rng.integers(0, len(whole), 30):
+        changed = bytearray(whole)
+        changed[at] ^= 0xFF
+        damaged.append(bytes(changed))
+    for data in damaged:
+        path.write_bytes(data)
+        with contextlib.suppress(InvalidInputError):  # anything else fails the test
+            assert len(load_profile(path).model.samples) == 3

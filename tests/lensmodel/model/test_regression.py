@@ -1,0 +1,440 @@
+"""The regression on families of kernels whose truth is known in closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import chain
+
+import numpy as np
+import pytest
+
+from lab.model.exact import PaperModel, all_pairs, factorised
+from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
+from lensmodel.core.psf import PsfSample, centroid, delta, distance, gaussian, second_moments
+from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
+from lensmodel.model import LensModel, ModelSettings, local_frame, loops, regression
+from lensmodel.model import variables as va
+from lensmodel.model.answer import MODES
+from lensmodel.model.local_frame import Answers, LocalKernels
+from lensmodel.model.regression import Neighbourhood
+from lensmodel.model.widths import WidthField
+
+SIZE = 21
+GREEN = LensSettings(aperture=2.0)
+WIDTHS = {
+    "r": 0.1,
+    "phi": 0.5,
+    "aperture_stops": 0.5,
+    "wavelength_nm": 20.0,
+    "focal_octaves": 0.25,
+    "focus_dioptres": 0.5,
+}
+
+
+@cache
+def truth(position: FieldPosition, turn: float = 0.0) -> Kernel:
+    """Gaussian, wide along v and growing outwards, as seen from a place `turn` further on its ring."""
+    c, s = math.cos(position.phi + turn), math.sin(position.phi + turn)
+    u, v = np.array([-s, c]), np.array([-c, -s])  # (row, col)
+    along, across = 0.8 + 1.2 * position.r**2, 1.0 + 2.0 * position.r**2
+    return gaussian(SIZE, along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+
+
+def places(count: int, seed: int) -> list[FieldPosition]:
+    rng = np.random.default_rng(seed)
+    r = np.sqrt(rng.uniform(0.0, 0.9, count))
+    angles = rng.uniform(-math.pi, math.pi, count)
+    return [FieldPosition(float(a), float(p)) for a, p in zip(r, angles, strict=True)]
+
+
+@cache
+def photo(
+    name: str, seed: int, *, noise: float = 0.0, blur: float = 0.0, count: int = 24
+) -> tuple[PsfSample, ...]:
+    """Samples of one photo; `blur` adds variance along the rows, `noise` is relative at the peak."""
+    rng = np.random.default_rng([seed, 1])
+    found = []
+    for where in places(count, seed):
+        kernel = np.array(truth(where))
+        if blur:
+            shake = np.array(gaussian(SIZE, [[blur, 0.0], [0.0, 1e-3]]))
+            kernel = np.fft.ifft2(np.fft.fft2(kernel) * np.fft.fft2(np.fft.ifftshift(shake))).real
+        kernel = np.maximum(kernel, 0.0)
+        # noise that leaves the empty surroundings empty: clipped there, it would be a bias, not noise
+        kernel = np.maximum(
+            kernel + rng.normal(0.0, noise, kernel.shape) * np.sqrt(kernel * kernel.max()), 0.0
+        )
+        found.append(PsfSample(kernel, where, GREEN, photo=name))
+    return tuple(found)
+
+
+def photos(count: int, *, noise: float = 0.0, samples: int = 24) -> list[PsfSample]:
+    return list(chain.from_iterable(photo(f"p{i}", i, noise=noise, count=samples) for i in range(count)))
+
+
+def fit(samples: Sequence[PsfSample], mode: str = "default", **wishes: float) -> LensModel:
+    return LensModel.fit(samples, ModelSettings(mode=mode, **wishes))  # type: ignore[arg-type] # bandwidths
+
+
+def kernel_at(model: LensModel, r: float, phi: float, size: int = SIZE) -> Kernel:
+    return model.query(FieldPosition(r, phi), GREEN, size).kernel
+
+
+def difference(a: Kernel, b: Kernel) -> float:
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def error(model: LensModel, seed: int = 99) -> float:
+    return float(
+        np.mean([distance(model.query(p, GREEN, SIZE).kernel, truth(p)).rel_l2 for p in places(12, seed)])
+    )
+
+
+# ---- what every mode keeps
+
+
+@pytest.mark.parametrize("mode", MODES)
+class TestEveryMode:
+    def test_answers_a_centred_kernel_of_sum_one(self, mode: str) -> None:
+        kernel = kernel_at(fit(photos(1), mode), 0.6, 1.0, 33)
+
+        assert kernel.shape == (33, 33)
+        assert kernel.min() >= 0.0
+        assert kernel.sum() == pytest.approx(1.0)
+        assert np.hypot(*centroid(kernel)) < 2e-3
+
+    def test_returns_the_one_psf_of_a_constant_round_family(self, mode: str) -> None:
+        same = gaussian(SIZE, np.eye(2) * 1.5)
+        model = fit([replace(sample, kernel=same) for sample in photo("a", 3)], mode)
+
+        assert difference(kernel_at(model, 0.5, -2.0), same) < 5e-3
+
+    def test_does_not_depend_on_the_order_of_samples(self, mode: str) -> None:
+        forward, backward = fit(photos(2), mode), fit(photos(2)[::-1], mode)
+
+        assert difference(kernel_at(forward, 0.7, 0.4), kernel_at(backward, 0.7, 0.4)) < 1e-5
+
+    def test_answers_many_places_at_once_as_one_by_one(self, mode: str) -> None:
+        model, asked = fit(photos(6), mode), places(9, 5)
+
+        together = model.kernels(asked, GREEN, SIZE)
+
+        for where, kernel in zip(asked, together, strict=True):
+            assert np.abs(kernel - model.query(where, GREEN, SIZE).kernel).max() < 1e-9
+
+
+# ---- the local frame and its splines
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, math.pi / 4])
+@pytest.mark.parametrize(("kernel", "most"), [(delta(31), 0.12), (gaussian(31, np.eye(2) * 0.25), 0.06)])
+def test_narrow_kernels_nearly_keep_their_shape_when_they_turn(
+    kernel: Kernel, most: float, turn: float
+) -> None:
+    where = FieldPosition(0.5, 0.5)
+    local = LocalKernels.of([PsfSample(kernel, where, GREEN)], va.point(where, GREEN)[None], WidthField())
+    only = Answers(np.zeros(1, dtype=np.intp), np.ones(1), np.ones(1, dtype=np.intp))
+
+    found = local.kernels(only, np.array([0.5 + turn]), np.ones((1, 2)), 31)[0]
+
+    assert difference(found, kernel) < (most if turn else 1e-6)
+    assert found[15, 15] > 0.88 * kernel[15, 15]
+
+
+def test_long_axis_turns_with_the_place() -> None:
+    model = fit(photos(3), phi=10.0)
+    for phi in (-2.5, -0.7, 0.3, 1.9):
+        row, col = np.linalg.eigh(second_moments(kernel_at(model, 0.8, phi)))[1][:, 1]
+        # v at phi points to (row, col) = (-cos phi, -sin phi)
+        aligned = abs(-row * math.cos(phi) - col * math.sin(phi))
+        assert math.degrees(math.acos(min(aligned, 1.0))) < 2.0
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_spline_goes_through_the_pixels(finer: int) -> None:
+    kernel = np.random.default_rng(2).random((11, 11))
+    stored = local_frame.coefficients(kernel, finer).astype(np.float32).reshape(1, -1)
+    row, whole, at = np.zeros(1, dtype=np.intp), np.array([0, 1]), np.eye(2)[None] * finer
+    read = np.zeros((1, 11, 11))
+
+    loops.sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
+
+    assert np.abs(read[0] - kernel).max() < 1e-6
+
+
+def test_values_without_negatives_keep_their_sum_and_those_without_any_stay() -> None:
+    ripples = np.random.default_rng(9).normal(0.3, 1.0, (4, 81))
+    ripples[1] = np.abs(ripples[1])
+    after = ripples.copy()
+
+    loops.without_negatives(after)
+
+    assert after.min() == 0.0
+    assert after.sum(axis=1) == pytest.approx(ripples.sum(axis=1))
+    assert np.array_equal(after[1], ripples[1])
+    lowered = (ripples - after)[0][after[0] > 0.0]  # the nearest such values are lower by one amount
+    assert lowered == pytest.approx(np.full(len(lowered), lowered[0]))
+
+
+# ---- the sum of eq. (4), its neighbours, its bandwidths
+
+
+def test_answer_is_the_sum_over_all_kernels_turned_by_formula() -> None:
+    narrow = fit(photos(20), "paper", r=0.05, phi=0.2)  # kernels reach no farther than the samples beside
+    points, scale = va.points(narrow.samples), va.scales(narrow.bandwidth)
+    for where in places(6, 3):
+        squared = va.squared_distances(points, va.point(where, GREEN), scale)
+        weight = np.exp(-0.5 * (squared - squared.min()))
+        turned = [truth(s.position, where.phi - s.position.phi) for s in narrow.samples]
+        brute = np.tensordot(weight / weight.sum(), np.array(turned), axes=1)
+        fast = narrow.query(where, GREEN, SIZE).kernel
+
+        assert np.abs(fast - brute).max() < 2e-3 * brute.max()
+
+
+def test_trees_and_a_look_at_every_sample_give_the_same_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    colours = [GREEN.with_channel(CHANNELS[i % 3]) for i in range(300)]
+    where = np.array([va.point(p, s) for p, s in zip(places(300, 3), colours, strict=True)])
+    where[::5, 3] = np.nan  # some do not know their aperture
+    weights = np.where(rng.random(300) < 0.2, 0.0, rng.random(300))
+    around = Neighbourhood(where, weights, np.array([0.03, 0.2, 0.2, 0.5, 20.0, 0.25, 0.5]))
+    asked = [FieldPosition(0.0, 0.0), *places(7, 4)]
+
+    every = around.near(asked, GREEN)
+    monkeypatch.setattr(regression, "_MANY", 0)
+    by_tree = around.near(asked, GREEN)
+
+    assert min(every.counts) > 1
+    assert np.array_equal(by_tree.counts, every.counts)
+    assert np.array_equal(by_tree.rows, every.rows)
+    assert by_tree.weights == pytest.approx(every.weights, rel=1e-12)
+    assert len(around.within(va.point(asked[1], GREEN), 1.5)) < 300
+
+
+def test_factorised_sum_equals_the_sum_over_all_pairs() -> None:
+    rng = np.random.default_rng(0)
+    samples = [
+        PsfSample(rng.random((9, 9)), p, GREEN, weight=float(w))
+        for p, w in zip(places(5, 4), rng.random(5), strict=True)
+    ]
+    for where in places(3, 8):
+        flat = all_pairs(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
+        fast = factorised(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
+        assert np.abs(flat - fast).max() <= 1e-12 * flat.max()
+
+
+def test_answer_is_within_eight_hundredths_of_the_exact_sum() -> None:
+    model = fit(photo("a", 0, count=16), "paper", r=0.1, phi=0.5, stops=0.5)
+    for where in places(4, 5):
+        exact = factorised(model.samples, where, GREEN, SIZE, pixel=0.3, widths=WIDTHS)
+        exact /= exact.sum()
+        fast = model.query(where, GREEN, SIZE).kernel
+        # the exact sum smooths by h_u^2 = 0.09 px^2 and by the pixel grid; the spline does not
+        assert np.abs(fast - exact).max() <= 0.08 * exact.max()
+
+
+def test_bandwidth_of_the_paper_taken_literally_widens_the_psf() -> None:
+    where = FieldPosition(0.5, 0.4)
+    literal = PaperModel.fit(photos(3, samples=16)).kernel_at_settings(where, GREEN, SIZE)
+    ours = kernel_at(LensModel.fit(photos(3, samples=16)), where.r, where.phi)
+
+    assert distance(literal, truth(where)).rel_l2 > 3 * distance(ours, truth(where)).rel_l2
+
+
+def test_bandwidths_are_those_of_green_in_whatever_order_channels_come() -> None:
+    green = photos(3, noise=0.01)
+    blue = [replace(s, settings=s.settings.with_channel("b")) for s in photos(3, noise=0.5)]
+    of_green = fit(green, "paper").bandwidth
+
+    for samples in ([*green, *blue], [*blue, *green]):
+        assert fit(samples, "paper").bandwidth == of_green
+
+
+# ---- families
+
+
+def test_follows_the_ring_family() -> None:
+    assert error(LensModel.fit(photos(3))) < 0.08
+
+
+def test_angles_on_both_sides_of_pi_are_neighbours() -> None:
+    model = LensModel.fit(photos(2))
+    above, below = (kernel_at(model, 0.6, sign * (math.pi - 1e-6)) for sign in (1.0, -1.0))
+
+    assert difference(above, below) < 1e-4
+
+
+def test_widths_are_carried_into_the_corner() -> None:
+    inner = [s for s in photos(4) if s.position.r < 0.85]
+    carried, faded = (
+        distance(kernel_at(fit(inner, mode), 1.0, 0.3), truth(FieldPosition(1.0, 0.3))).rel_l2
+        for mode in ("default", "paper")
+    )
+
+    assert carried < 0.06
+    assert carried < 0.5 * faded
+
+
+def test_width_field_finds_widths_along_both_axes() -> None:
+    field = WidthField.fit(photos(4), np.ones(96))
+    inner, outer = field.over(np.array([va.point(FieldPosition(r, 0.7), GREEN) for r in (0.2, 0.9)]))
+
+    assert outer[0] / inner[0] == pytest.approx((0.8 + 1.2 * 0.81) / (0.8 + 1.2 * 0.04), rel=0.05)
+    assert outer[1] / inner[1] == pytest.approx((1.0 + 2.0 * 0.81) / (1.0 + 2.0 * 0.04), rel=0.05)
+
+
+def test_colours_hardly_mix() -> None:
+    narrow, wide = gaussian(SIZE, np.eye(2) * 0.8), gaussian(SIZE, np.eye(2) * 5.0)
+    samples = [PsfSample(narrow, p, GREEN, photo="a") for p in places(20, 1)]
+    samples += [PsfSample(wide, p, GREEN.with_channel("r"), photo="a") for p in places(20, 2)]
+
+    assert difference(kernel_at(fit(samples, "paper"), 0.5, 0.0), narrow) < 0.05
+
+
+def test_samples_answer_by_their_weight() -> None:
+    where = FieldPosition(0.5, 0.0)
+    loud = PsfSample(gaussian(SIZE, np.eye(2)), where, GREEN, weight=1.0, photo="a")
+    quiet = PsfSample(gaussian(SIZE, np.eye(2) * 4), where, GREEN, weight=0.01, photo="b")
+
+    assert difference(kernel_at(LensModel.fit([loud, quiet]), 0.5, 0.0), loud.kernel) < 0.02
+
+
+# ---- growing
+
+
+def test_samples_added_one_by_one_answer_as_all_at_once() -> None:
+    samples = photos(4)
+    at_once = fit(samples, "paper", r=0.1, phi=0.4)
+    grown = fit(samples[:40], "paper", r=0.1, phi=0.4)
+    for sample in samples[40:]:
+        grown = grown.added([sample])
+
+    for where in places(5, 7):
+        a, b = grown.query(where, GREEN, SIZE), at_once.query(where, GREEN, SIZE)
+        assert difference(a.kernel, b.kernel) < 1e-6
+        assert a.effective_samples == pytest.approx(b.effective_samples, rel=1e-6)
+
+
+def test_older_model_is_untouched_by_samples_added_later() -> None:
+    old = fit(photos(2), "paper")
+    before = kernel_at(old, 0.5, 0.5)
+    left, right = (
+        old.added([PsfSample(kernel, FieldPosition(0.5, 0.5), GREEN, photo="new")])
+        for kernel in (delta(SIZE), gaussian(SIZE, np.eye(2) * 6))
+    )
+
+    assert np.array_equal(kernel_at(old, 0.5, 0.5), before)
+    assert left.samples[-1].photo == "new"
+    assert kernel_at(left, 0.5, 0.5).max() > kernel_at(right, 0.5, 0.5).max()
+
+
+def test_a_sample_takes_25_bytes_a_pixel() -> None:
+    samples = photos(20)
+
+    assert LensModel.fit(samples).nbytes < 25 * SIZE * SIZE * len(samples) + 8 * 800 * SIZE * SIZE
+
+
+# ---- bad photos, and what it says of itself
+
+
+def test_one_bad_photo_moves_the_field_by_less_than_a_tenth_of_a_plain_mean() -> None:
+    clean, bad = photos(9, noise=0.01, samples=16), photo("shaken", 50, blur=16.0, count=16)
+
+    def moved(mode: str) -> float:
+        before, after = (fit(samples, mode, r=0.12, phi=0.5) for samples in (clean, [*clean, *bad]))
+        asked = places(15, 77)
+        gaps = before.kernels(asked, GREEN, SIZE) - after.kernels(asked, GREEN, SIZE)
+        return float(np.linalg.norm(gaps, axis=(1, 2)).mean())
+
+    assert moved("default") < 0.1 * moved("paper")
+
+
+def test_excluded_photo_stays_and_has_no_weight() -> None:
+    without = LensModel.fit(photos(3), ModelSettings(excluded=("p1",)))
+
+    assert without.query(FieldPosition(0.5, 0.5), GREEN, SIZE).photos == 2
+    assert len(without.samples) == len(photos(3))
+
+
+def test_error_falls_with_the_number_of_photos() -> None:
+    assert error(LensModel.fit(photos(10, noise=0.3, samples=16))) < 0.75 * error(
+        LensModel.fit(photos(1, noise=0.3, samples=16))
+    )
+
+
+def test_predicted_error_is_of_the_size_of_the_true_one() -> None:
+    model = LensModel.fit(photos(6, noise=0.2, samples=16))
+    answers = [(where, model.query(where, GREEN, SIZE)) for where in places(20, 31)]
+    ratios = [a.predicted_error / distance(a.kernel, truth(where)).rel_l2 for where, a in answers]
+
+    assert 0.5 < float(np.median(ratios)) < 4.0
+
+
+def test_what_estimators_expect_does_not_fall_with_the_number_of_photos() -> None:
+    few, many = (
+        LensModel.fit([replace(s, error=0.3) for s in photos(n, noise=0.1, samples=16)])
+        .query(FieldPosition(0.5, 0.3), GREEN, SIZE)
+        .predicted_error
+        for n in (2, 8)
+    )
+
+    assert few >= many > 0.2
+
+
+def test_zones_expect_more_where_there_are_no_samples() -> None:
+    errors = LensModel.fit([s for s in photos(3, noise=0.1) if s.position.r < 0.5]).expected_errors()
+
+    assert errors["center"] < errors["mid"] < errors["corner"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("r", "aperture", "beyond"), [(0.3, 2.0, ()), (1.0, 2.0, ("place",)), (0.3, 8.0, ("aperture_stops",))]
+)
+def test_a_question_far_from_every_sample_says_in_what(
+    r: float, aperture: float, beyond: tuple[str, ...]
+) -> None:
+    model = LensModel.fit([s for s in photos(3) if s.position.r < 0.5])
+    answer = model.query(FieldPosition(r, 0.2), LensSettings(aperture=aperture), SIZE)
+
+    assert (answer.beyond, answer.extrapolated) == (beyond, bool(beyond))
+
+
+def test_unknown_aperture_takes_no_part_in_distances() -> None:
+    model, where = (
+        LensModel.fit([replace(s, settings=LensSettings()) for s in photos(2)]),
+        FieldPosition(0.5, 1),
+    )
+    at_two, at_eight = (model.query(where, LensSettings(aperture=n), SIZE) for n in (2.0, 8.0))
+
+    assert np.array_equal(at_two.kernel, at_eight.kernel)
+    assert not at_eight.extrapolated
+
+
+# ---- what is refused
+
+
+def test_no_samples_are_said_as_such() -> None:
+    with pytest.raises(NoSamplesError, match="calibrate"):
+        LensModel.fit([])
+
+
+@pytest.mark.parametrize("bad", [{"r": 0.0}, {"phi": math.nan}, {"mode": "magic"}])
+def test_settings_that_there_are_not_are_refused(bad: dict[str, object]) -> None:
+    with pytest.raises(UnknownMethodError if "mode" in bad else InvalidInputError, match=r"positive|paper"):
+        ModelSettings(**bad)  # type: ignore[arg-type] # wrong on purpose
+
+
+@pytest.mark.parametrize("size", [0, 4, -3])
+def test_even_sizes_are_refused(size: int) -> None:
+    with pytest.raises(InvalidInputError, match="odd"):
+        kernel_at(LensModel.fit(photos(1)), 0.0, 0.0, size)
+
+
+@pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
+def test_impossible_expectations_are_refused(bad: float) -> None:
+    with pytest.raises(InvalidInputError, match="expected error"):
+        replace(photo("a", 0)[0], error=bad)

@@ -1,9 +1,10 @@
-"""What every job uses: the tables, the blobs, the sandbox, and the rules for retries."""
+"""What every job uses: the tables, the blobs, and tasks in the sandbox, with their limits and retries."""
 
 from __future__ import annotations
 
 import errno
 import logging
+import math
 import random
 import shutil
 import threading
@@ -12,10 +13,14 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from app.blobs.storage import Storage
+from app.jobs import answers
+from app.jobs.answers import Answer, JobFailedError, checked
+from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
@@ -25,6 +30,7 @@ from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.tables import PhotoRow
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import ignore_step
 
 log = logging.getLogger(__name__)
@@ -37,25 +43,48 @@ CRASHES: Final = 3
 BACKOFF_S: Final = 0.5
 # Address space in MiB of a task besides its picture (chosen): what libraries reserve, and room to spare
 SPARE_MB: Final = 768
-COMPUTING: Final = frozenset(
-    {"estimate", "correct", "measure", "measure-lens", "profile"}
-)  # by compiled loops
+# Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
+# most of it never touched
+THREAD_MB: Final = 136
+# Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has.
+# Reading takes so many times as much (chosen, by counting): bytes, float32, float64, the model.
+MAX_UNPACKED, COPIES = 256 << 20, 8
 SIBLINGS: Final = 7  # photos that tell of the defects of a sensor (chosen): more tell hardly more
 # Size of the cache at most (chosen: some seventy photos of 24 megapixels as planes of float32), or half of
 # the free disk if that is less
 KEEP_BYTES: Final = 20 << 30
-
-
-class JobFailedError(Exception):
-    """A job cannot be done, and a retry would not help: a fixed code and a sentence for its owner."""
-
-    def __init__(self, code: str, detail: str) -> None:
-        super().__init__(detail)
-        self.code, self.detail = code, detail
+Wanted: TypeAlias = Callable[[], bool]
 
 
 class NotWantedError(Exception):
     """The job was cancelled, or its photo deleted or started anew: stop, and change nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a task needs of the machine, and what it answers."""
+
+    seconds: str  # name of the setting of its time
+    answer: Answer | None = None
+    pixel_bytes: int = 0  # address space for each pixel of its photo (chosen, by counting), beside `spare_mb`
+    spare_mb: int = SPARE_MB
+    compiled: bool = True  # whether it runs compiled loops
+    threads: bool = False  # whether it works in as many threads as the worker has slots
+
+
+# Of a pixel mapped planes alone take 12 bytes; a measurement maps two photos, with a float64 plane of each
+NEEDS: Final[Mapping[str, Needs]] = {
+    "inspect": Needs("inspect_seconds", answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False),
+    "develop": Needs("develop_seconds", pixel_bytes=120, compiled=False),
+    "select": Needs("develop_seconds", answers.SELECTED, pixel_bytes=120, compiled=False),
+    "estimate": Needs("patch_seconds", pixel_bytes=24),
+    "measure-lens": Needs("task_seconds", pixel_bytes=96),
+    "correct": Needs("task_seconds", answers.CORRECTED, pixel_bytes=120, threads=True),
+    "measure": Needs("task_seconds", answers.MEASURED, spare_mb=2 * SPARE_MB),
+    "profile": Needs(
+        "develop_seconds", answers.READ_PROFILE, spare_mb=SPARE_MB + COPIES * (MAX_UNPACKED >> 20)
+    ),
+}
 
 
 @dataclass
@@ -72,6 +101,41 @@ class JobContext:
     def __post_init__(self) -> None:
         self._locks = defaultdict(threading.Lock)
         self.warmed.set()  # unless the worker says that it compiles them
+        self.cache = self.settings.data_dir.resolve() / "developed"  # developed photos, of this machine alone
+
+    def wants(self, photo: PhotoRow) -> Wanted:
+        """Return what tells whether the work on a photo, begun as the row says, is still wanted."""
+        return partial(self.store.photos.is_live, photo.public_id, photo.epoch)
+
+    @contextmanager
+    def task(
+        self,
+        name: str,
+        photo: PhotoRow | None,
+        wanted: Wanted,
+        /,
+        *,
+        reads: Sequence[Path] = (),
+        samples: Sequence[PsfSample] = (),
+        on_progress: ProgressHook = ignore_step,
+        **arguments: Any,  # noqa: ANN401 - JSON of any shape
+    ) -> Iterator[tuple[Any, Path]]:
+        """Run a task in a folder of its own, with `samples`; give its answer, checked, and the folder."""
+        with self.sandbox.folder() as folder:
+            if samples:
+                write_samples(folder, samples)
+            limits = self.limits(name, photo)
+            answer = self.attempt(
+                name,
+                arguments,
+                folder=folder,
+                limits=limits,
+                wanted=wanted,
+                reads=reads,
+                on_progress=on_progress,
+            )
+            kind = NEEDS[name].answer
+            yield answer if kind is None else checked(kind, answer), folder
 
     def attempt(
         self,
@@ -80,7 +144,7 @@ class JobContext:
         *,
         folder: Path,
         limits: TaskLimits,
-        wanted: Callable[[], bool],
+        wanted: Wanted,
         reads: Sequence[Path] = (),
         on_progress: ProgressHook = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
@@ -88,11 +152,10 @@ class JobContext:
         # After a death by signal the task is retried after a pause, after too little memory once with twice
         # as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
         # `JobFailedError`, or `OutageError` where the machine lacks disk space or memory.
-        if task in COMPUTING:
+        if task in NEEDS and NEEDS[task].compiled:
             self.warmed.wait()  # else it would compile the same at the same time
         wanted = _patient(wanted)
-        crashes = 0
-        enlarged = False
+        crashes, enlarged = 0, False
         while True:
             outcome = self.sandbox.run(
                 task,
@@ -115,26 +178,22 @@ class JobContext:
                 enlarged, limits = True, replace(limits, memory_mb=doubled_mb)
             elif outcome.code == "crashed":
                 crashes += 1
-                self._pause_after(outcome, task, crashes, wanted)
+                _pause_after(outcome, task, crashes, wanted)
             else:
                 raise JobFailedError(outcome.code, outcome.detail)
 
-    def _pause_after(self, outcome: Outcome, task: str, crashes: int, wanted: Callable[[], bool]) -> None:
-        log.warning("task %s: %s (%d of %d)", task, outcome.detail, crashes, CRASHES)
-        if crashes == CRASHES:
-            detail = f"{outcome.detail}; tried {crashes} times; please report the file to the developers"
-            raise JobFailedError("crashed_repeatedly", detail)
-        end = time.monotonic() + BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5)  # noqa: S311
-        while time.monotonic() < end:
-            if not wanted():
-                raise NotWantedError
-            time.sleep(0.05)
-
-    def limits(self, photo: PhotoRow, seconds: float, bytes_per_pixel: int) -> TaskLimits:
-        """Return limits that grow with the photo; 12 bytes a pixel are the mapped planes alone."""
-        pixels = (photo.width or 0) * (photo.height or 0)
-        memory = SPARE_MB + bytes_per_pixel * pixels // (1 << 20)
-        return TaskLimits(memory_mb=min(memory, max(self.sandbox.budget.memory_mb, SPARE_MB)), wall_s=seconds)
+    def limits(self, task: str, photo: PhotoRow | None) -> TaskLimits:
+        """Return the limits of a task, which grow with its photo."""
+        needs, seconds = NEEDS[task], float(getattr(self.settings, NEEDS[task].seconds))
+        pixels = 0 if photo is None else (photo.width or 0) * (photo.height or 0)
+        memory = needs.spare_mb + needs.pixel_bytes * pixels // (1 << 20)
+        limits = TaskLimits(min(memory, max(self.sandbox.budget.memory_mb, needs.spare_mb)), seconds)
+        if not needs.threads:
+            return limits
+        slots = self.settings.worker_slots
+        return replace(
+            limits, memory_mb=limits.memory_mb + THREAD_MB * slots, cpu_s=math.ceil(seconds) * slots
+        )
 
     @contextmanager
     def original(self, photo: PhotoRow) -> Iterator[Path]:
@@ -152,51 +211,56 @@ class JobContext:
                 text = f"the file of photo {photo.public_id} is no longer stored; upload it again"
                 raise JobFailedError("unknown_photo", text) from error
 
-    @contextmanager
-    def _siblings(self, photo: PhotoRow) -> Iterator[list[Path]]:
-        """Provide other photos of the same body, which tell of defects of its sensor, if they are here."""
-        found = [] if self.storage.folder is None else self.store.photos.siblings(photo, SIBLINGS)
-        with self.sandbox.folder() as folder, ExitStack() as opened:
-            paths = []
-            for row in found:
-                with suppress(OSError):  # deleted meanwhile
-                    file = self.storage.as_file(row.blob_key, folder, copied=self.sandbox.account is not None)
-                    paths.append(opened.enter_context(file))
-            yield paths
-
-    def developed_folder(self, photo_id: str) -> Path:
-        """Return the folder of the developed photo, in a cache of this machine."""
-        return self.settings.data_dir.resolve() / "developed" / photo_id
-
-    def developed(self, photo: PhotoRow, wanted: Callable[[], bool]) -> Path:
+    def developed(self, photo: PhotoRow, wanted: Wanted) -> Path:
         """Return the folder of the developed photo; develop it if it is not there."""
-        target = self.developed_folder(photo.public_id)
-        with self._locks[photo.public_id]:
+        target = self.cache / photo.public_id
+        with self._locks[photo.public_id], ExitStack() as files:
             if (target / "planes.npy").is_file():
                 (target / "planes.npy").touch()  # the cache drops the least recently used
                 return target
             target.parent.mkdir(parents=True, exist_ok=True)
-            limits = self.limits(photo, self.settings.develop_seconds, 120)
-            with (
-                self.original(photo) as path,
-                self._siblings(photo) as siblings,
-                self.sandbox.folder() as folder,
-            ):
-                arguments = {
-                    "path": str(path),
-                    "siblings": [str(sibling) for sibling in siblings],
-                    "max_megapixels": self.settings.max_megapixels,
-                }
-                reads = [path, *siblings]
-                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=reads)
-                if (folder / SHOWN).is_file():
-                    self.storage.put(f"{photo.folder}{SHOWN}", folder / SHOWN)
-                shutil.rmtree(target, ignore_errors=True)
-                folder.rename(target)  # complete, or absent
+            path = files.enter_context(self.original(photo))
+            siblings = self._siblings(photo, files)
+            done = self.task(
+                "develop",
+                photo,
+                wanted,
+                reads=[path, *siblings],
+                path=str(path),
+                siblings=[str(sibling) for sibling in siblings],
+                max_megapixels=self.settings.max_megapixels,
+            )
+            _, folder = files.enter_context(done)
+            if (folder / SHOWN).is_file():
+                self.storage.put(f"{photo.folder}{SHOWN}", folder / SHOWN)
+            shutil.rmtree(target, ignore_errors=True)
+            folder.rename(target)  # complete, or absent
             return target
 
+    def _siblings(self, photo: PhotoRow, files: ExitStack) -> list[Path]:
+        """Provide other photos of the same body, which tell of defects of its sensor, if they are here."""
+        rows = [] if self.storage.folder is None else self.store.photos.siblings(photo, SIBLINGS)
+        folder, paths = files.enter_context(self.sandbox.folder()), list[Path]()
+        for row in rows:
+            with suppress(OSError):  # deleted meanwhile
+                copied = self.sandbox.account is not None
+                paths.append(files.enter_context(self.storage.as_file(row.blob_key, folder, copied=copied)))
+        return paths
 
-def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
+
+def _pause_after(outcome: Outcome, task: str, crashes: int, wanted: Wanted) -> None:
+    log.warning("task %s: %s (%d of %d)", task, outcome.detail, crashes, CRASHES)
+    if crashes == CRASHES:
+        detail = f"{outcome.detail}; tried {crashes} times; please report the file to the developers"
+        raise JobFailedError("crashed_repeatedly", detail)
+    end = time.monotonic() + BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5)  # noqa: S311
+    while time.monotonic() < end:
+        if not wanted():
+            raise NotWantedError
+        time.sleep(0.05)
+
+
+def _patient(wanted: Wanted) -> Wanted:
     """Treat the job as wanted while the database is away: its restart must not discard hours of work."""
 
     def ask() -> bool:
@@ -214,19 +278,15 @@ def drop_developed(base: Path, existing: Callable[[Iterable[str]], set[str]], id
     """Bound the cache in `base`; developed photos whose photo was deleted are removed first."""
     folders = [path for path in base.iterdir() if path.is_dir()] if base.is_dir() else []
     known = existing(path.name for path in folders)
-    used = sorted((_used(path), path) for path in folders)
+    sizes = {path: sum(file.stat().st_size for file in path.glob("*")) for path in folders}
     free = shutil.disk_usage(base).free if folders else 0
     room = min(KEEP_BYTES, free // 2) if free else 0
-    total = sum(_size(path) for path in folders)
-    for last, path in used:
+    total = sum(sizes.values())
+    for last, path in sorted((_used(path), path) for path in folders):
         idle = time.time() - last > idle_s
         if path.name not in known or (total > room and idle):
-            total -= _size(path)
+            total -= sizes[path]
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.glob("*"))
 
 
 def _used(folder: Path) -> float:

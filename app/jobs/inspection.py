@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from app.jobs.answers import Inspected, checked
-from app.jobs.context import SPARE_MB, JobContext, JobFailedError
+from app.jobs.answers import INSPECTED, JobFailedError, checked
+from app.jobs.context import JobContext, Wanted
 from app.jobs.task_files import CLEANED, PLACE, THUMBNAIL
-from app.sandbox.outcome import TaskLimits
 from app.store import LensName
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
@@ -32,9 +30,19 @@ _COLUMNS: Final = (
 )
 
 
-def inspect(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
+def inspect(context: JobContext, photo: PhotoRow, wanted: Wanted) -> None:
     """Read and record the header of a photo; remove its place, and store a small picture of it."""
-    _record(context, photo, _examined(context, photo, wanted))
+    info = _examined(context, photo, wanted)
+    metadata = info["metadata"]
+    camera = (metadata["camera_maker"], metadata["camera_model"])
+    context.store.photos.record_inspection(
+        photo.public_id,
+        LensName(**metadata["lens"]),
+        width=info["width"],
+        height=info["height"],
+        body_key=body_key(*camera, metadata.get("body_serial")),
+        **{name: metadata[name] for name in _COLUMNS},
+    )
 
 
 def remove_location(context: JobContext, photo: PhotoRow) -> PhotoRow:
@@ -52,11 +60,11 @@ def remove_location(context: JobContext, photo: PhotoRow) -> PhotoRow:
     return photos.get(photo.public_id, ANY_OWNER) or photo
 
 
-def _examined(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) -> dict[str, Any]:
+def _examined(context: JobContext, photo: PhotoRow, wanted: Wanted) -> dict[str, Any]:
     """Have a child read a file; whatever it says of the header, keep what it says of the place."""
-    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
+    limits, most = context.limits("inspect", photo), context.settings.max_megapixels
     with context.original(photo) as path, context.sandbox.folder() as folder:
-        arguments = {"path": str(path), "max_megapixels": context.settings.max_megapixels}
+        arguments = {"path": str(path), "max_megapixels": most}
         try:
             info = context.attempt(
                 "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
@@ -67,20 +75,7 @@ def _examined(context: JobContext, photo: PhotoRow, wanted: Callable[[], bool]) 
         _record_place(context, photo, folder)
         if (folder / THUMBNAIL).is_file():
             context.storage.put(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
-        return checked(Inspected, info)
-
-
-def _record(context: JobContext, photo: PhotoRow, info: dict[str, Any]) -> None:
-    metadata, lens = info["metadata"], info["metadata"]["lens"]
-    camera = (metadata["camera_maker"], metadata["camera_model"])
-    context.store.photos.record_inspection(
-        photo.public_id,
-        LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
-        width=info["width"],
-        height=info["height"],
-        body_key=body_key(*camera, metadata.get("body_serial")),
-        **{name: metadata[name] for name in _COLUMNS},
-    )
+        return checked(INSPECTED, info)
 
 
 def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:
@@ -95,15 +90,13 @@ def _record_place(context: JobContext, photo: PhotoRow, folder: Path) -> None:
     """Record what a child has written of the place; a file without it becomes that of the photo."""
     if photo.location is not None:
         return
-    photos, word, cleaned = context.store.photos, "unknown", folder / CLEANED
+    word, new, cleaned = "unknown", {}, folder / CLEANED
     if (folder / PLACE).is_file() and (folder / PLACE).stat().st_size < MAX_WORD:
-        told = (folder / PLACE).read_text(encoding="ascii", errors="replace")
-        word = told if told in {"none", "removed"} else "unknown"
+        said = (folder / PLACE).read_text(encoding="ascii", errors="replace")
+        word = said if said in {"none", "removed"} else "unknown"
         if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
             with cleaned.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
-            key = f"{photo.folder}cleaned-{digest[:16]}"
-            context.storage.put(key, cleaned)
-            photos.record_location(photo, word, key=key, digest=digest)
-            return
-    photos.record_location(photo, word)
+            new = {"key": f"{photo.folder}cleaned-{digest[:16]}", "digest": digest}
+            context.storage.put(new["key"], cleaned)
+    context.store.photos.record_location(photo, word, **new)

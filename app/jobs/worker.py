@@ -12,20 +12,21 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Final
+from typing import Any, Final
 
 from structlog.contextvars import bound_contextvars
 
 import lensmodel
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
-from app.jobs.context import JobContext, JobFailedError, drop_developed
+from app.jobs.answers import JobFailedError
+from app.jobs.context import JobContext, drop_developed
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
@@ -52,7 +53,7 @@ log = logging.getLogger(__name__)
 EXIT_FENCED: Final = 70
 WARMING = "app.jobs.warming"  # module that compiles what tasks need; tests replace it
 # seconds between two rounds of a duty, all chosen
-SWEEP_S: Final = 0.1  # of the tables for new work, which people wait for: a read of two indexes
+SWEEP_S: Final = 0.5  # of the tables for new work, which takes seconds: an idle worker uses no processor
 RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
 # How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into
@@ -85,44 +86,31 @@ def durable(kind: Kind, handler: Handler, give_up: Callable[[Job, JobFailedError
     def run(*arguments: str | int) -> None:
         job, began, how = Job(kind, arguments), monotonic(), "done"
         with bound_contextvars(job_id=job.id, **{_SUBJECT[kind]: str(arguments[0])}):
-            reason = _tried(handler, job)
-            if reason is not None:
+            try:
+                _insist(partial(handler, *arguments), OUTAGE_S, kind)
+            except Exception as error:  # noqa: BLE001 - whatever it is, it has been logged
+                reason = ending_of(error)
                 how = reason.code
-                _insist(lambda: give_up(job, reason))
+                _insist(partial(give_up, job, reason))
         metrics.JOB_SECONDS.labels(kind, how).observe(monotonic() - began)
 
     return run
 
 
-def _tried(handler: Handler, job: Job) -> JobFailedError | None:
-    """Do a job, if need be several times; return why it is given up."""
-    patience = Patience(OUTAGE_S)
+def _insist(call: Callable[[], object], outage_s: float = math.inf, kind: Kind | None = None) -> None:
+    """Do something again until it succeeds; raise its error after a few bugs, or an outage of that time."""
+    patience = Patience(outage_s)
     while True:
         try:
-            handler(*job.arguments)
+            call()
         except Exception as error:
             outage = is_outage(error)
             log.warning("%s: %s", type(error).__name__, error, exc_info=None if outage else error)
             pause = patience.pause_after(error)
             if pause is None:
-                return ending_of(error)
-            metrics.RETRIES.labels(job.kind, "outage" if outage else "unforeseen").inc()
-            sleep(pause)
-        else:
-            return None
-
-
-def _insist(call: Callable[[], object]) -> None:
-    """Do something that needs the database, and wait for the database as long as it takes."""
-    patience = Patience(math.inf)
-    while True:
-        try:
-            call()
-        except Exception as error:
-            pause = patience.pause_after(error)
-            if pause is None or not is_outage(error):
                 raise
-            log.warning("waiting %.0f s: %s", pause, error)
+            if kind is not None:
+                metrics.RETRIES.labels(kind, "outage" if outage else "unforeseen").inc()
             sleep(pause)
         else:
             return
@@ -154,8 +142,10 @@ class Worker:
             self._sandbox,
         )
         self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
-        self._last_beat = monotonic()
-        self._files = {path: _identity(path) for path in self._database_files()}
+        self._host, self._last_beat = socket.gethostname(), monotonic()
+        database = self._store.database
+        self._file = database.path if database.is_sqlite else Path()
+        self._identity = _identity(self._file)
 
     def _task_account(self, data: Path) -> account.SystemAccount | None:
         """Return the account that children change to, with access to their folders and to nothing else."""
@@ -182,13 +172,12 @@ class Worker:
 
     def _begin(self) -> None:
         log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
-        host = socket.gethostname()
-        began = started_at(os.getpid())
-        _insist(
-            lambda: self._store.jobs.register(
-                self.id, host=host, pid=os.getpid(), pid_started=began, confined=self._confined
-            )
-        )
+        about: dict[str, Any] = {
+            "host": self._host,
+            "pid": os.getpid(),
+            "pid_started": started_at(os.getpid()),
+        }
+        _insist(partial(self._store.jobs.register, self.id, confined=self._confined, **about))
         self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
@@ -204,9 +193,8 @@ class Worker:
         self._context.warmed.clear()
         threading.Thread(target=self._do, args=(self._warm,), daemon=True).start()
         self._engine.start({kind: durable(kind, handler, self._end) for kind, handler in handlers.items()})
-        self._take_over_gone(host)
+        self._start_thread(beat_s, self._take_over_dead)
         self._start_thread(SWEEP_S, self._sweep)
-        self._start_thread(beat_s, self._take_over_silent)
         self._start_thread(RECONCILE_S, self._reconcile, first_s=RECONCILE_S)
         self._start_thread(TIDY_S, self._tidy)
 
@@ -253,9 +241,8 @@ class Worker:
 
     def _keep_lease(self) -> None:
         """Renew the lease; stop at once if this worker was declared dead."""
-        for path, identity in self._files.items():
-            if _identity(path) != identity:
-                self._die(f"{path} was replaced while this worker ran")
+        if _identity(self._file) != self._identity:
+            self._die(f"{self._file} was replaced while this worker ran")
         try:
             alive = self._store.jobs.beat(self.id)
         except Exception as error:
@@ -267,26 +254,18 @@ class Worker:
             self._die("this worker was silent for too long and others took over its work")
         self._last_beat = monotonic()
 
-    def _take_over_silent(self) -> None:
-        """Take over from workers whose lease has expired."""
-        for dead in self._store.jobs.bury_stale(self._settings.lease_seconds):
-            self._take_over(dead)
-
-    def _take_over(self, dead: str) -> None:
-        if dead != self.id and self._store.jobs.forget(
-            dead
-        ):  # should this end here, `_reconcile` does the rest
-            self._engine.take_over(dead)
-            shutil.rmtree(self._scratch / dead, ignore_errors=True)
-            metrics.TAKEN_OVER.inc()
-            log.info("took over the work of worker %s", dead)
-
-    def _take_over_gone(self, host: str) -> None:
-        """Take over at once from workers of this machine whose process is gone."""
-        for row in self._store.jobs.workers():
-            if row.id != self.id and row.host == host and not is_running(row.pid, row.pid_started):
-                self._store.jobs.bury(row.id)
-                self._take_over(row.id)
+    def _take_over_dead(self) -> None:
+        """Take over from workers whose lease has expired, and from those of this machine that are gone."""
+        jobs = self._store.jobs
+        for row in jobs.workers():
+            if row.host == self._host and not is_running(row.pid, row.pid_started):
+                jobs.bury(row.id)
+        for dead in jobs.bury_stale(self._settings.lease_seconds):
+            if dead != self.id and jobs.forget(dead):  # should this end here, `_reconcile` does the rest
+                self._engine.take_over(dead)
+                shutil.rmtree(self._scratch / dead, ignore_errors=True)
+                metrics.TAKEN_OVER.inc()
+                log.info("took over the work of worker %s", dead)
 
     def _reconcile(self) -> None:
         """End jobs that the engine lost or gave up, so that none stays unfinished for ever."""
@@ -309,24 +288,24 @@ class Worker:
         return JobFailedError("internal_error", _OURS) if status == "done" else None
 
     def _tidy(self) -> None:
-        """Delete data that are no longer needed."""
-        for owner_key in self._store.accounts.to_erase():
-            self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
-        for photo_id in self._store.photos.unneeded() if self._settings.keep_photos == "never" else ():
-            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, SHOWN)))
-        for photo_id in self._store.photos.read_profiles():
-            self._do(partial(self._store.photos.delete, photo_id, ANY_OWNER))
-        for photo in self._store.photos.unsearched():
-            self._do(partial(remove_location, self._context, photo))
+        """Delete data that are no longer needed; one failure does not prevent the others."""
+        accounts, photos, jobs = self._store.accounts, self._store.photos, self._store.jobs
         expired = datetime.now(UTC) - timedelta(days=self._settings.keep_results_days)
-        for correction_id in self._store.jobs.ended_before(expired):
-            self._do(partial(self._store.jobs.delete, correction_id, ANY_OWNER))
-        self._do(self._store.accounts.purge)
-        for prefix in self._store.jobs.garbage():
-            self._do(partial(self._delete, prefix))  # one failure does not prevent the others
-        self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
-        developed = self._context.developed_folder("x").parent
-        drop_developed(developed, self._context.store.photos.existing, self._settings.task_seconds)
+        duties: list[tuple[Iterable[Any], Callable[[Any], object]]] = [
+            (accounts.to_erase(), partial(erase, accounts, self._context.storage)),
+            (photos.read_profiles(), lambda key: photos.delete(key, ANY_OWNER)),
+            (photos.unsearched(), partial(remove_location, self._context)),
+            (jobs.ended_before(expired), lambda key: jobs.delete(key, ANY_OWNER)),
+            (jobs.garbage(), self._delete),
+        ]
+        if self._settings.keep_photos == "never":
+            duties.append((photos.unneeded(), lambda key: photos.give_up_file(key, (THUMBNAIL, SHOWN))))
+        for subjects, duty in duties:
+            for subject in subjects:
+                self._do(partial(duty, subject))
+        self._do(accounts.purge)
+        self._do(partial(self._engine.forget, datetime.now(UTC) - KEEP_JOBS))
+        drop_developed(self._context.cache, photos.existing, self._settings.task_seconds)
 
     def _warm(self) -> None:
         """Compile the inner loops for all tasks, unless that was done for this program."""
@@ -353,9 +332,6 @@ class Worker:
         else:
             self._context.storage.remove(prefix)
         self._store.jobs.forget_garbage(prefix)
-
-    def _database_files(self) -> list[Path]:
-        return [self._store.database.path] if self._store.database.is_sqlite else []
 
     def _die(self, why: str) -> None:
         log.error("%s: this worker stops", why)

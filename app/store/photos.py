@@ -247,6 +247,17 @@ class Photos(Patches):
     # --- work -------------------------------------------------------------------------------------
 
     @writes
+    def start(self, session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
+        """Take up a photo, a new one or one that another worker left; None if there is nothing to do."""
+        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+        if photo is None or photo.epoch != epoch or photo.state not in PHOTO_WORKED_ON:
+            return None
+        if photo.state == "received":
+            photo.state, photo.started_at, photo.stage_at = "inspecting", now(), now()
+        photo.attempt += 1
+        return photo
+
+    @writes
     def set_state(
         self,
         session: Session,

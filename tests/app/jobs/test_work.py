@@ -23,7 +23,8 @@ from sqlalchemy import update
 from app.blobs.storage import Storage
 from app.http import views
 from app.jobs import tasks
-from app.jobs.context import JobContext, JobFailedError, NotWantedError
+from app.jobs.answers import JobFailedError
+from app.jobs.context import JobContext, NotWantedError
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork

@@ -13,7 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.jobs import tasks
-from app.jobs.context import JobFailedError
+from app.jobs.answers import JobFailedError
 from app.jobs.photo_work import _measured
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SAMPLES

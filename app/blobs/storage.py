@@ -11,10 +11,10 @@ import errno
 import os
 import shutil
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote, urlsplit
 
 import obstore
@@ -24,7 +24,7 @@ from sqlalchemy.exc import OperationalError, ProgrammingError
 from app.store.database import new_id
 
 if TYPE_CHECKING:
-    from obstore import GetResult
+    from obstore import AsyncWritableFile, GetResult
     from obstore.store import ClientConfig
 
 # Bytes that are read at once (chosen): large enough that calls cost nothing beside the copying
@@ -37,28 +37,16 @@ CONNECT_S: Final = 5.0
 MARK: Final = "lensmodel-blobs"
 
 
-class AsyncBlobWriter(Protocol):
-    """Takes the bytes of a blob, piece by piece."""
-
-    async def write(self, data: bytes) -> object:
-        """Take the next piece."""
-
-
 def _client_options(patience_s: float) -> ClientConfig:
     """Return the deadlines and the AWS_... options of the environment, which these options would override."""
     options: ClientConfig = {
         "connect_timeout": f"{min(CONNECT_S, patience_s):g}s",
         "timeout": f"{patience_s:g}s",
-        "allow_http": _is_on("AWS_ALLOW_HTTP"),
-        "allow_invalid_certificates": _is_on("AWS_ALLOW_INVALID_CERTIFICATES"),
     }
-    if os.environ.get("AWS_PROXY_URL"):
-        options["proxy_url"] = os.environ["AWS_PROXY_URL"]
+    for name in ("allow_http", "allow_invalid_certificates", "proxy_url"):
+        if value := os.environ.get(f"AWS_{name.upper()}"):
+            options[name] = value if name == "proxy_url" else value.lower() in {"1", "true", "yes", "on"}  # type: ignore[literal-required, unused-ignore]
     return options
-
-
-def _is_on(name: str) -> bool:
-    return os.environ.get(name, "").lower() in {"1", "true", "yes", "on"}
 
 
 class Storage:
@@ -66,18 +54,16 @@ class Storage:
 
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
         parts = urlsplit(url)
-        self.folder: Path | None = None
-        if parts.scheme == "file":
-            self.folder = Path(unquote(parts.path))
-            self._opened: ObjectStore | None = None
-            if create:
-                self.create()
-        else:
+        self.folder = Path(unquote(parts.path)) if parts.scheme == "file" else None
+        self._opened: ObjectStore | None = None
+        if self.folder is None:
             self._opened = from_url(
                 url,
                 client_options=_client_options(patience_s),
                 retry_config={"max_retries": 1, "retry_timeout": timedelta(seconds=patience_s)},
             )
+        elif create:
+            self.create()
 
     def create(self) -> None:
         """Create the folder with its mark; an object store is created by its owner."""
@@ -123,12 +109,9 @@ class Storage:
         self._require_folder()
 
     @asynccontextmanager
-    async def writer(self, key: str) -> AsyncIterator[AsyncBlobWriter]:
+    async def writer(self, key: str) -> AsyncIterator[AsyncWritableFile]:
         """Open a blob for writing; an exception inside leaves nothing behind."""
-        opened: AbstractAsyncContextManager[AsyncBlobWriter] = obstore.open_writer_async(
-            self._store, key, buffer_size=8 * CHUNK
-        )
-        async with opened as sink:
+        async with obstore.open_writer_async(self._store, key, buffer_size=8 * CHUNK) as sink:
             yield sink
         self._require_folder()
 
@@ -200,15 +183,6 @@ class Storage:
             for entry in page:
                 if entry["path"] != MARK:
                     yield str(entry["path"]), int(entry["size"])
-
-    def copy_to(self, target: Storage, key: str) -> None:
-        """Copy a blob to another storage, piece by piece; raises as `get`."""
-        pieces = obstore.get(self._store, key).stream(min_chunk_size=8 * CHUNK)
-        with obstore.open_writer(target._store, key, buffer_size=8 * CHUNK) as sink:
-            # a loop, not an iterator as the source: obstore cannot read while it writes
-            for piece in pieces:
-                sink.write(bytes(piece))
-        target._require_folder()
 
     def check_usable(self) -> None:
         """Raise an error if folder or bucket is away, or a folder cannot take more; nothing is written."""

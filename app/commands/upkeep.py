@@ -50,8 +50,7 @@ def doctor(
         migrate.check(store.database)
         report = examination.examine(settings, store, storage, deep=deep)
     if json_output:
-        findings = [asdict(finding) for finding in report.findings]
-        shown.document({"checks": list(report.checks), "findings": findings})
+        shown.document(asdict(report))
     else:
         for finding in report.findings:
             shown.result(f"{finding.check}: {finding.subject}: {finding.says}; {finding.remedy}")

@@ -9,7 +9,7 @@ the folder is a complete backup at every moment, also while the next one is bein
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -62,8 +62,12 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
     for _ in range(TRIES):
         made_at = datetime.now(UTC).isoformat()
         photos, named = _rows(database.path, part)
-        kept = dict(target.listed())
-        _fetch(storage, target, sorted(named - kept.keys()), on_step)
+        wanted = sorted(named - dict(target.listed()).keys())
+        for done, key in enumerate(wanted, start=1):
+            # one that was deleted since: rows taken later do not name it
+            with suppress(FileNotFoundError), storage.as_file(key, folder) as file:
+                target.put(key, file)
+            on_step(done, len(wanted))
         kept = dict(target.listed())
         missing = sorted(named - kept.keys())
         if not missing:
@@ -87,12 +91,3 @@ def _rows(database: Path, part: Path) -> tuple[int, set[str]]:
         named = {str(row[0]) for row in copy.execute(_NAMED)}
         photos = copy.execute("SELECT count(*) FROM photo WHERE deleted_at IS NULL").fetchone()[0]
     return photos, named
-
-
-def _fetch(source: Storage, target: Storage, keys: list[str], on_step: StepHook) -> None:
-    for done, key in enumerate(keys, start=1):
-        try:
-            source.copy_to(target, key)
-        except FileNotFoundError:  # deleted since: rows taken later do not name it
-            continue
-        on_step(done, len(keys))

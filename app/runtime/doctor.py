@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from sqlalchemy import func, select, text
 
@@ -79,79 +80,54 @@ def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
         yield Violation("blobs", where, "the folder of the blobs is missing", "mount its disk, or restore it")
         return
     sizes = dict(storage.listed())
+    kept = {
+        "photos": select(PhotoRow.public_id).where(PhotoRow.deleted_at.is_(None)),
+        "corrections": select(CorrectionRow.public_id),
+        "models": select(LensRow.public_id).where(LensRow.deleted_at.is_(None)),
+    }
+    named = {
+        "photo": select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(*_WITH_FILE),
+        "correction": select(
+            CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes
+        ).where(CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)),
+    }
     with store.database.reading() as session:
-        photos = session.execute(
-            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(*_WITH_FILE)
-        ).all()
-        results = session.execute(
-            select(CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes).where(
-                CorrectionRow.state == "succeeded"
-            )
-        ).all()
-        alive = select(PhotoRow.public_id).where(PhotoRow.deleted_at.is_(None))
-        known = {f"photos/{key}/" for key in session.scalars(alive)}
-        known |= {f"corrections/{key}/" for key in session.scalars(select(CorrectionRow.public_id))}
-        lens_ids = select(LensRow.public_id).where(LensRow.deleted_at.is_(None))
-        known |= {f"models/{key}/" for key in session.scalars(lens_ids)}
+        rows: list[Any] = [(what, *row) for what, query in named.items() for row in session.execute(query)]
+        known = {f"{place}/{key}/" for place, query in kept.items() for key in session.scalars(query)}
         garbage = tuple(session.scalars(select(GarbageRow.prefix)))
-    newer = dict(storage.listed()) if any(key not in sizes for _, key, _ in photos) else sizes
-    for public_id, key, size in photos:
-        if newer.get(key) != size:
-            problem = "missing" if key not in newer else f"{newer[key]} bytes instead of {size}"
-            yield Violation(
-                "blobs", public_id, f"the file of the photo is {problem}", "restore it, or delete the photo"
-            )
-    for correction_id, result, length in results:
-        if result is None or sizes.get(result) == length:
-            continue
-        if dict(storage.listed(f"{result.rpartition('/')[0]}/")).get(result) != length:
-            says = "the result of the correction is missing"
-            yield Violation("blobs", correction_id, says, "delete the correction, and ask for it again")
-    for prefix in sorted({_group(key) for key in sizes}):
+    for what, public_id, key, size in rows:
+        there = sizes.get(key)
+        if there != size:  # it may have come since
+            there = dict(storage.listed(f"{key.rpartition('/')[0]}/")).get(key)
+        if there != size:
+            problem = "missing" if there is None else f"{there} bytes instead of {size}"
+            says = f"the file of the {what} is {problem}"
+            yield Violation("blobs", public_id, says, f"restore it, or delete the {what}")
+    for prefix in sorted({"/".join([*key.split("/")[:2], ""]) for key in sizes}):
         if prefix not in known and not prefix.startswith(garbage):
             yield Violation("blobs", prefix, "no row names these blobs", "delete them by hand")
 
 
-def _group(key: str) -> str:
-    return "/".join([*key.split("/")[:2], ""])
-
-
 def _kernels(store: Store) -> Iterator[Violation]:
-    last = 0
-    while True:
-        with store.database.reading() as session:
-            rows = session.execute(
-                select(SampleRow.id, SampleRow.psf, SampleRow.crc32)
-                .where(SampleRow.id > last)
-                .order_by(SampleRow.id)
-                .limit(1000)
-            ).all()
-        if not rows:
-            return
-        for key, psf, crc32 in rows:
+    samples = select(SampleRow.id, SampleRow.psf, SampleRow.crc32).execution_options(yield_per=1000)
+    with store.database.reading() as session:
+        for key, psf, crc32 in session.execute(samples):
             if zlib.crc32(psf) != crc32:
-                yield Violation(
-                    "kernels", f"sample {key}", "differs from what was written", "restore the database"
-                )
-        last = rows[-1][0]
+                says = "differs from what was written"
+                yield Violation("kernels", f"sample {key}", says, "restore the database")
 
 
 def _photos(store: Store, storage: Storage) -> Iterator[Violation]:
+    digest = func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256)
+    query = select(PhotoRow.public_id, PhotoRow.blob_key, digest, PhotoRow.byte_size).where(*_WITH_FILE)
     with store.database.reading() as session:
-        rows = session.execute(
-            select(
-                PhotoRow.public_id,
-                PhotoRow.blob_key,
-                func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256),
-                PhotoRow.byte_size,
-            ).where(*_WITH_FILE)
-        ).all()
+        rows = session.execute(query).all()
     for public_id, key, sha256, size in rows:
-        digest = hashlib.sha256()
-        try:
+        hashed = hashlib.sha256()
+        with suppress(FileNotFoundError):  # a finding of `_blobs`
             for piece in storage.stream(key, 0, size):
-                digest.update(piece)
-        except FileNotFoundError:
-            continue  # a finding of `_blobs`
-        if digest.hexdigest() != sha256:
-            yield Violation("photos", public_id, "the file differs from what was sent", "restore the blobs")
+                hashed.update(piece)
+            if hashed.hexdigest() != sha256:
+                yield Violation(
+                    "photos", public_id, "the file differs from what was sent", "restore the blobs"
+                )

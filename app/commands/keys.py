@@ -7,18 +7,18 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
-from app.commands.service import Data, settings_from
+from app.commands.service import Data, opened, settings_from
+from app.store import migrate
+from app.store.accounts import Accounts
+from app.store.owners import ANY_OWNER
+from app.store.tables import KeyRow
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from app.store.accounts import Accounts
-    from app.store.tables import KeyRow
 
 keys = typer.Typer(
     help="""Make, list and revoke the keys of a service that others can reach.
@@ -33,14 +33,13 @@ Exit status: 0 done, 1 it failed, 2 wrong usage.""",
     no_args_is_help=True,
 )
 
-SPAN: Final = re.compile(r"(\d{1,6})(h|d|w|y)", re.ASCII)
 HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}  # hours of each unit of a span
 GIB: Final = 1 << 30  # bytes of a GiB
 
 
 def _span(text: str) -> timedelta:
     """Read a span of time as people write it: 12h, 90d, 6w, 1y."""
-    match = SPAN.fullmatch(text.strip().lower())
+    match = re.fullmatch(r"(\d{1,6})([hdwy])", text.strip().lower(), re.ASCII)
     if match is None:
         raise UsageError(f"a span of time is a number and h, d, w or y, such as 90d; got {text!r}")
     return timedelta(hours=int(match[1]) * HOURS[match[2]])
@@ -49,18 +48,9 @@ def _span(text: str) -> timedelta:
 @contextmanager
 def _opened(data: Data) -> Iterator[Accounts]:
     """Open the keys of an installation, its schema brought up to date."""
-    from app.store import migrate  # noqa: PLC0415 - only these commands need the service
-    from app.store.accounts import Accounts  # noqa: PLC0415 - same
-    from app.store.database import Database  # noqa: PLC0415 - same
-
-    settings = settings_from(data)
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
-    database = Database(settings.database)
-    try:
-        migrate.upgrade(database)
-        yield Accounts(database)
-    finally:
-        database.close()
+    with opened(settings_from(data)) as store:
+        migrate.upgrade(store.database)
+        yield store.accounts
 
 
 @keys.command()
@@ -138,8 +128,6 @@ def listed(
 
     Exit status: 0 listed, 1 it failed, 2 wrong usage.
     """
-    from app.store.owners import ANY_OWNER  # noqa: PLC0415 - as above
-
     with _opened(data) as store:
         rows = [_described(key) for key in store.keys(owner or ANY_OWNER)]
     if json_output:
@@ -153,34 +141,25 @@ def listed(
 
 
 def _described(key: KeyRow) -> dict[str, str | None]:
-    now = datetime.now(UTC)
-    ended = key.expires_at is not None and key.expires_at <= now
+    ended = key.expires_at is not None and key.expires_at <= datetime.now(UTC)
+    times = {"created": key.created_at, "expires": key.expires_at, "used": key.last_used_at}
     return {
         "prefix": key.prefix,
         "owner": key.owner.name,
         "state": "revoked" if key.revoked_at else "expired" if ended else "valid",
         "scope": key.scopes,
         "label": key.label,
-        "created": _day(key.created_at),
-        "expires": _day(key.expires_at),
-        "used": _day(key.last_used_at),
+        **{name: at.isoformat(timespec="seconds") if at else None for name, at in times.items()},
     }
 
 
-def _day(moment: datetime | None) -> str | None:
-    return None if moment is None else moment.isoformat(timespec="seconds")
-
-
-Prefix = Annotated[str, typer.Argument(metavar="PREFIX", help="The characters after lpk_, or the whole key.")]
-
-
-def _prefix(text: str) -> str:
-    """Return the prefix of a key that was given wholly or in part."""
-    return text.removeprefix("lpk_").partition("_")[0]
-
-
 @keys.command()
-def revoke(prefix: Prefix, data: Data = None) -> None:
+def revoke(
+    prefix: Annotated[
+        str, typer.Argument(metavar="PREFIX", help="The characters after lpk_, or the whole key.")
+    ],
+    data: Data = None,
+) -> None:
     """Revoke a key and sign out all browsers that signed in with it, within a second.
 
     Example:
@@ -189,7 +168,8 @@ def revoke(prefix: Prefix, data: Data = None) -> None:
 
     Exit status: 0 ended, 1 there is no such key, 2 wrong usage.
     """
+    short = prefix.removeprefix("lpk_").partition("_")[0]
     with _opened(data) as store:
-        if not store.revoke_key(_prefix(prefix)):
-            raise InvalidInputError(f"no key begins with {_prefix(prefix)}: lensmodel keys list shows them")
-    typer.echo(f"key {_prefix(prefix)} is revoked")
+        if not store.revoke_key(short):
+            raise InvalidInputError(f"no key begins with {short}: lensmodel keys list shows them")
+    typer.echo(f"key {short} is revoked")

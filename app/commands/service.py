@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
+from app.runtime import supervisor
+from app.runtime.settings import PREFIX, Settings, described
+from app.sandbox import confine
+from app.store import Store
 from lensmodel.cli.ending import UsageError
-
-if TYPE_CHECKING:
-    from app.runtime.settings import Settings
 
 Data = Annotated[
     Path | None,
@@ -29,22 +33,24 @@ Host = Annotated[str | None, typer.Option("--host", help="Address to listen on."
 
 def settings_from(data: Path | None, host: str | None = None, port: int | None = None) -> Settings:
     """Read the settings of a service; what the command line says goes before the environment."""
-    from pydantic import ValidationError  # noqa: PLC0415 - only these commands need the service
-
-    from app.runtime.settings import Settings  # noqa: PLC0415 - same
-
     given = {"data_dir": data, "host": host, "port": port}
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]  # checked by pydantic
     except ValidationError as error:
-        messages = [str(problem["msg"]).removeprefix("Value error, ") for problem in error.errors()]
-        places = [".".join(str(part) for part in problem["loc"]) for problem in error.errors()]
-        raise UsageError(
-            "; ".join(
-                f"LENS_{place.upper()}: {text}" if place else text
-                for place, text in zip(places, messages, strict=True)
-            )
-        ) from error
+        problems = [
+            "".join(f"{PREFIX}{str(part).upper()}: " for part in problem["loc"])
+            + str(problem["msg"]).removeprefix("Value error, ")
+            for problem in error.errors()
+        ]
+        raise UsageError("; ".join(problems)) from error
+
+
+@contextlib.contextmanager
+def opened(settings: Settings) -> Iterator[Store]:
+    """Open the tables of an installation."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    with contextlib.closing(Store(settings)) as store:
+        yield store
 
 
 def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
@@ -63,25 +69,17 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
     """
     settings = settings_from(data, host, port)
     typer.echo("lensmodel is starting ...", err=True)
-    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
-
     raise typer.Exit(supervisor.serve(settings))
 
 
 def api(port: Port = None, host: Host = None, data: Data = None) -> None:
     """Run only the API process, for installations on many machines."""
-    settings = settings_from(data, host, port)
-    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
-
-    supervisor.run_api(settings)
+    supervisor.run_api(settings_from(data, host, port))
 
 
 def worker(data: Data = None) -> None:
     """Run only a worker process, for installations on many machines."""
-    settings = settings_from(data)
-    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
-
-    supervisor.run_worker(settings)
+    supervisor.run_worker(settings_from(data))
 
 
 def config(
@@ -100,8 +98,6 @@ def config(
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
-    from app.runtime.settings import PREFIX, described  # noqa: PLC0415 - only these commands need the service
-
     settings = settings_from(data)
     # up to the last @: a password may hold any sign, and need not be quoted everywhere
     shown = {
@@ -113,7 +109,5 @@ def config(
         return
     for name, value in shown.items():
         typer.echo(f"# {described()[name]}\n{PREFIX}{name.upper()}={value}")
-    from app.sandbox import confine  # noqa: PLC0415 - only this command asks
-
     for name, in_force in confine.available(settings.task_user, settings.data_dir).items():
         typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not available here'}")

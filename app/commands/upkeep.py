@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from app.commands.service import Data, settings_from
+from app.blobs.storage import Storage
+from app.commands.service import Data, opened, settings_from
+from app.runtime import backup as copies
+from app.runtime import doctor as examination
+from app.runtime.settings import Settings
+from app.store import migrate
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, Quiet
-
-if TYPE_CHECKING:
-    from app.blobs.storage import Storage
-    from app.runtime.settings import Settings
-    from app.store import Store
 
 
 def doctor(
@@ -39,16 +38,11 @@ def doctor(
 
     Exit status: 0 all is well, 1 something is not, 2 wrong usage.
     """
-    from dataclasses import asdict  # noqa: PLC0415 - only these commands need the service
-
-    from app.runtime import doctor as examination  # noqa: PLC0415 - same
-    from app.store import migrate  # noqa: PLC0415 - same
-
     shown = Display.of(context, quiet=quiet, verbose=0)
     settings = _existing(data)
-    with _opened(settings) as (store, storage):
+    with opened(settings) as store:
         migrate.check(store.database)
-        report = examination.examine(settings, store, storage, deep=deep)
+        report = examination.examine(settings, store, _storage(settings), deep=deep)
     if json_output:
         shown.document(asdict(report))
     else:
@@ -82,20 +76,15 @@ def backup(
 
     Exit status: 0 there is a new backup, 1 there is none, 2 wrong usage.
     """
-    from dataclasses import asdict  # noqa: PLC0415 - only these commands need the service
-
-    from app.runtime import backup as copies  # noqa: PLC0415 - same
-
     shown = Display.of(context, quiet=quiet, verbose=0)
     settings = _existing(data)
-    with _opened(settings) as (store, storage), shown.progress() as bars:
+    with opened(settings) as store, shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
-        result = copies.backup(
-            store.database,
-            storage,
-            folder,
-            lambda done, total: bars.update(task, completed=done, total=total),
-        )
+
+        def show(done: int, total: int) -> None:
+            bars.update(task, completed=done, total=total)
+
+        result = copies.backup(store.database, _storage(settings), folder, show)
     if json_output:
         shown.document(asdict(result))
     else:
@@ -111,14 +100,5 @@ def _existing(data: Path | None) -> Settings:
     return settings
 
 
-@contextlib.contextmanager
-def _opened(settings: Settings) -> Iterator[tuple[Store, Storage]]:
-    from app.blobs.storage import Storage  # noqa: PLC0415 - only these commands need it
-    from app.store import Store  # noqa: PLC0415 - same
-
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
-    store = Store(settings)
-    try:
-        yield store, Storage(settings.storage, patience_s=settings.storage_seconds, create=False)
-    finally:
-        store.close()
+def _storage(settings: Settings) -> Storage:
+    return Storage(settings.storage, patience_s=settings.storage_seconds, create=False)

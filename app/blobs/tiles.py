@@ -135,16 +135,11 @@ def _checked(storage: Storage, key: str, size: int) -> tuple[int, int, tuple[int
         signature, height, width, count = _HEAD.unpack(head)
         expected = _FIRST_TILE + sum(rows * cols for rows, cols in _levels(height, width))
         start = _HEAD.size + 8 * (count + 1)
-        if signature != _SIGNATURE or count != expected or start > size:
-            raise _damaged()
-        offsets = struct.unpack(f"<{count + 1}Q", b"".join(storage.stream(key, _HEAD.size, start)))
-    except struct.error as error:
-        raise _damaged() from error
-    lengths = [end - begin for begin, end in pairwise(offsets)]
-    if offsets[0] != start or offsets[-1] > size or not all(0 < n <= MAX_PICTURE for n in lengths):
-        raise _damaged()
-    return height, width, offsets
-
-
-def _damaged() -> NotReadyError:
-    return NotReadyError("this picture is damaged: ask for the work anew")
+        if signature == _SIGNATURE and count == expected and start <= size:
+            offsets = struct.unpack(f"<{count + 1}Q", b"".join(storage.stream(key, _HEAD.size, start)))
+            fit = all(0 < end - begin <= MAX_PICTURE for begin, end in pairwise(offsets))
+            if offsets[0] == start and offsets[-1] <= size and fit:
+                return height, width, offsets
+    except struct.error:
+        pass  # too short
+    raise NotReadyError("this picture is damaged: ask for the work anew")

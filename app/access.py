@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-import threading
 import time
-from collections import OrderedDict
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Final
@@ -52,8 +50,9 @@ class Gate:
         self._settings, self._store = settings, store
         self._closed = settings.needs_keys
         self._looked = -FRESH_S
-        self._known: OrderedDict[str, tuple[float, Who]] = OrderedDict()
-        self._guard = threading.Lock()
+        self._known: dict[
+            str, tuple[float, Who]
+        ] = {}  # each use of it is one step, which threads do not part
 
     def is_closed(self) -> bool:
         """Whether a key is required: always, or since one was created."""
@@ -91,11 +90,8 @@ class Gate:
             )
         return who
 
-    def admit(self, who: Who, method: str) -> None:
-        """Refuse what the scopes do not allow."""
-        self.require(who, "read" if method in {"GET", "HEAD", "OPTIONS"} else "write")
-
-    def require(self, who: Who, scope: Scope) -> None:
+    @staticmethod
+    def require(who: Who, scope: Scope) -> None:
         """Refuse a key without a scope."""
         if not accounts.covers(who.scopes, scope):
             held = " and ".join(who.scopes)
@@ -123,12 +119,10 @@ class Gate:
         token = request.cookies.get(COOKIE)
         if token:
             self._store.sign_out(accounts.digest_of(token))
-            with self._guard:
-                self._known.pop(accounts.digest_of(token), None)
+            self._known.pop(accounts.digest_of(token), None)
 
     def _remembered(self, digest: str) -> Who | None:
-        with self._guard:
-            entry = self._known.get(digest)
+        entry = self._known.get(digest)
         return entry[1] if entry is not None and time.monotonic() - entry[0] <= FRESH_S else None
 
     def _look_up(self, digest: str) -> Who | None:
@@ -139,11 +133,9 @@ class Gate:
         if key is None:
             return None
         who = Who(key.owner.name, tuple(key.scopes.split()), key.id, digest)
-        with self._guard:
-            self._known[digest] = (time.monotonic(), who)
-            self._known.move_to_end(digest)
-            while len(self._known) > MAX_CACHED:
-                self._known.popitem(last=False)
+        if len(self._known) >= MAX_CACHED:
+            self._known.clear()
+        self._known[digest] = (time.monotonic(), who)
         with contextlib.suppress(Exception):  # a full disk or a busy database must not refuse access
             self._store.note_use(key)
         return who

@@ -93,7 +93,7 @@ async def call_of(
     who = services.gate.quick(request)
     if who is None:
         who = await run_in_threadpool(services.gate.who, request)
-    services.gate.admit(who, request.method)
+    services.gate.require(who, "read" if request.method in {"GET", "HEAD", "OPTIONS"} else "write")
     return Call.of(request, response, who)
 
 

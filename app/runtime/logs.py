@@ -20,15 +20,7 @@ Format: TypeAlias = Literal["text", "json"]
 CONTINUED: Final = "\n    | "
 # Fields of a record besides its text; the same names in the context of a thread and in `extra`
 FIELDS: Final = (
-    "request_id",
-    "job_id",
-    "photo_id",
-    "lens_id",
-    "correction_id",
-    "method",
-    "path",
-    "status",
-    "ms",
+    *("request_id", "job_id", "photo_id", "lens_id", "correction_id", "method", "path", "status", "ms"),
 )
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import logging
 import random
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,14 +30,11 @@ LONGEST_PAUSE_S: Final = 60.0
 # Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
 # fault is reported soon
 BUGS: Final = 3
-_SQLITE_FULL: Final = 13  # SQLITE_FULL of sqlite3.h
 _POSTGRES_FULL: Final = "53100"  # SQLSTATE disk_full (PostgreSQL documentation, appendix A)
 # How the storage reports ENOSPC and EDQUOT of Linux: the disk, or the quota of its user, is full
 _FULL: Final = ("os error 28", "os error 122")
-# SQLITE_ERROR of sqlite3.h, an invalid statement; every other code is a fault of the machine
-_SQLITE_ERROR: Final = 1
-NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-_MACHINE: Final = NO_ROOM | {
+_NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+_MACHINE: Final = _NO_ROOM | {
     *(errno.EIO, errno.EROFS, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.EBUSY),
     *(errno.ENOMEM, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
     *(errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTDOWN, errno.EHOSTUNREACH),
@@ -61,7 +59,7 @@ def is_outage(error: BaseException) -> bool:
     if isinstance(error, exc.DBAPIError):
         code = getattr(error.orig, "sqlite_errorcode", None)
         away = isinstance(error, exc.OperationalError | exc.InterfaceError) or error.connection_invalidated
-        return away and code != _SQLITE_ERROR
+        return away and code != sqlite3.SQLITE_ERROR  # an invalid statement; all else is the machine's fault
     if isinstance(error, stored.BaseError):
         return not isinstance(error, _OF_THE_REQUEST)
     if isinstance(error, OSError):
@@ -75,11 +73,11 @@ def is_no_room(error: BaseException) -> bool:
     """Say whether a disk, or the quota of its user, is full."""
     if isinstance(error, exc.DBAPIError):
         return (
-            getattr(error.orig, "sqlite_errorcode", None) == _SQLITE_FULL
+            getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
             or getattr(error.orig, "sqlstate", None) == _POSTGRES_FULL
         )
     reported = isinstance(error, OSError | stored.BaseError) and any(sign in str(error) for sign in _FULL)
-    return reported or (isinstance(error, OSError) and error.errno in NO_ROOM)
+    return reported or (isinstance(error, OSError) and error.errno in _NO_ROOM)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import contextlib
 import ctypes
 import os
 import pwd
+import re
 import stat
 import sys
 from collections.abc import Iterator
@@ -76,23 +77,28 @@ class SystemAccount:
         # Tried in a forked process: call it while this one has a single thread
         if not may_change():
             return False
-        program = [Path(entry) for entry in [*sys.path, sys.prefix, sys.base_prefix] if entry]
-        program_paths = [path for path in [*program, Path(__file__).parents[2]] if path.exists()]
-        parents = [path for path in data.resolve().parents if path.exists()]
+        program = [*sys.path, sys.prefix, sys.base_prefix, str(Path(__file__).parents[2])]
+        needed = {Path(entry): os.R_OK for entry in program if entry}
+        needed |= dict.fromkeys(data.resolve().parents, os.X_OK)
+        there = [(path, mode) for path, mode in needed.items() if path.exists()]
         pid = os.fork()
         if pid == 0:
             status = 1
             with contextlib.suppress(OSError):
                 self.become()
-                reads = all(os.access(path, os.R_OK) for path in program_paths)
-                status = 0 if reads and all(os.access(path, os.X_OK) for path in parents) else 1
+                status = int(not all(os.access(path, mode) for path, mode in there))
             os._exit(status)
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def may_change() -> bool:
     """Say whether this process may change to other accounts, and end their processes."""
-    return _effective() & _NEEDED == _NEEDED
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
+        return False
+    effective = re.search(r"^CapEff:\s*(\w+)", status, re.MULTILINE)
+    return effective is not None and int(effective[1], 16) & _NEEDED == _NEEDED
 
 
 def find(name: str) -> SystemAccount | None:
@@ -126,14 +132,6 @@ def _inside(path: Path) -> Iterator[Path]:
             inner = Path(folder, name)
             if not inner.is_symlink():
                 yield inner
-
-
-def _effective() -> int:
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
 
 
 class _Header(ctypes.Structure):

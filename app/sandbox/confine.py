@@ -76,7 +76,7 @@ def confine(folder: Path, reads: Iterable[Path] = (), account: SystemAccount | N
     if sys.platform != "linux":
         return in_force
     tried: dict[str, Callable[[], object]] = {
-        "no_new_privs": lambda: _prctl(_PR_SET_NO_NEW_PRIVS, 1),
+        "no_new_privs": lambda: _check(_libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)),
         "namespaces": _separate,
         "files": lambda: _restrict_files(folder, reads),
         "system_calls": seccomp.refuse,
@@ -92,37 +92,27 @@ def keep_private() -> None:
     """Close files that this process writes to other accounts, and its memory to other processes."""
     os.umask(0o077)
     if sys.platform == "linux":
-        with contextlib.suppress(OSError):
-            _prctl(_PR_SET_DUMPABLE, 0)
+        _libc.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
 
 
 def available(user: str, data: Path) -> dict[str, bool]:
     """Return which measures are available on this machine, tried once in a separate process."""
     changes = user != accounts.NONE and accounts.may_change()
-    in_force = (
-        _measures_in_force(user, str(data.resolve())) if changes else _measures_in_force(accounts.NONE, "")
-    )
+    in_force = _measures_in_force(*((user, str(data.resolve())) if changes else (accounts.NONE, "")))
     return {name: name in in_force for name in MEASURES}
 
 
 @functools.cache
 def _measures_in_force(user: str, data: str) -> list[str]:
     try:
-        output = subprocess.run(  # noqa: S603 - ourselves
-            [sys.executable, "-m", "app.sandbox.confine", user, data],
-            check=True,
-            capture_output=True,
-            timeout=60,
-            cwd=Path(__file__).parents[2],
-        ).stdout
+        command = [sys.executable, "-m", "app.sandbox.confine", user, data]
+        output = subprocess.check_output(  # noqa: S603 - ourselves
+            command, timeout=60, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL
+        )
         in_force: list[str] = json.loads(output)
     except (OSError, ValueError, subprocess.SubprocessError):
         return []
     return in_force
-
-
-def _prctl(option: int, value: int) -> None:
-    _check(_libc.prctl(option, value, 0, 0, 0))
 
 
 def _check(result: int) -> int:

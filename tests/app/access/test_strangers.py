@@ -16,7 +16,6 @@ from starlette.testclient import TestClient
 from app.http.middleware import MAX_JSON_BYTES
 from app.main import create_app
 from app.routes import photos
-from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
 
@@ -266,17 +265,6 @@ def test_a_path_cannot_forge_a_line_of_the_log(client: TestClient, caplog: pytes
     assert "\x1b" not in said[-1]
 
 
-def test_no_text_forges_a_record() -> None:
-    formatter = logs.OneRecord("%(levelname)s %(message)s")
-    record = logging.LogRecord(
-        "app", logging.INFO, "", 0, "lens %s", ("x\nINFO forged\x1b[2J\r\u2028y",), None
-    )
-
-    lines = formatter.format(record).split("\n")
-
-    assert lines == ["INFO lens x", "    | INFO forged\\x1b[2J\\x0d\\x2028y"]
-
-
 # --- small things of HTTP ---------------------------------------------------------------------
 
 
@@ -288,14 +276,6 @@ def test_true_is_no_number(client: TestClient, steps: Any, body: dict[str, bool]
 
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
     assert steps.fresh(photo).given == {}
-
-
-def test_true_is_a_truth(client: TestClient, steps: Any) -> None:
-    photo = steps.counted()
-
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
-
-    assert answer.json()["state"] == "excluded"
 
 
 # --- pictures ---------------------------------------------------------------------------------

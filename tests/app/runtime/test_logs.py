@@ -67,14 +67,18 @@ def test_a_line_of_a_job_names_the_job_and_its_photo(lines: io.StringIO) -> None
     assert "job_id" not in after
 
 
-def test_lines_for_people_name_them_too() -> None:
-    record, written = logging.LogRecord("app", logging.INFO, "", 0, "at work\nforged", (), None), list[str]()
+TEXT = "at work\nINFO forged\x1b[2J\r\u2028y"
+
+
+def test_lines_for_people_name_them_too_and_no_text_forges_one() -> None:
+    record, written = logging.LogRecord("app", logging.INFO, "", 0, TEXT, (), None), list[str]()
 
     def work(*_: object) -> None:
         written.append(logs.OneRecord("%(message)s").format(record))
 
     contextvars.Context().run(durable("photo", work, print), "PHOTO", 1)
-    assert written == [f"at work job_id=photo/PHOTO/1 photo_id=PHOTO{logs.CONTINUED}forged"]
+    ids = "job_id=photo/PHOTO/1 photo_id=PHOTO"
+    assert written == [f"at work {ids}\n    | INFO forged\\x1b[2J\\x0d\\x2028y"]
 
 
 def test_the_line_of_a_request_says_what_was_asked_and_answered(

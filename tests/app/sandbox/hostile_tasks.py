@@ -59,8 +59,8 @@ def sleep(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
 
 def spawn(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    (folder / "own").write_text(str(os.getpid()))
     (folder / "pid").write_text(str(process.pid))
-    progress(0, 1)
     time.sleep(60)
 
 

@@ -47,7 +47,13 @@ def home(call: Call, _: str = "") -> Part:
     """Return what is shown of all photos and lenses."""
     photos, more = shown.photos(call)
     lenses = shown.lenses_with_photos(call)
-    values = {"photos": photos, "more": more, "lenses": lenses, "groups": shown.waiting(call)}
+    values = {
+        "photos": photos,
+        "more": more,
+        "lenses": lenses,
+        "groups": shown.waiting(call),
+        "next": shown.next_step(call, photos, lenses),
+    }
     return "_home.html", values, False
 
 

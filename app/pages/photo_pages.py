@@ -70,7 +70,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         reasons=left_out.most_common(),
         candidates=candidates,
         known=lens.samples > 0 if lens else bool(candidates),
-        proposed=shown.grouped([row])[0].name,
+        group=shown.grouped([row])[0],
         lens=lens,
         corrections=corrections,
         done=done,

@@ -107,11 +107,11 @@ def correction_layer(
 
 def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:
     """Return a point, `(row, col)`, in the coordinates of the upright picture."""
-    row, col = _turned(row, col, height - 1, width - 1, orientation)
+    row, col = turned(row, col, height - 1, width - 1, orientation)
     return round(row), round(col)
 
 
-def _turned(row: N, col: N, last_row: int, last_col: int, orientation: int) -> tuple[N, N]:
+def turned(row: N, col: N, last_row: int, last_col: int, orientation: int) -> tuple[N, N]:
     """Turn a place that lies in rows 0..last_row and columns 0..last_col as an EXIF orientation says."""
     below, right = last_row - row, last_col - col
     return {

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from app.http.dependencies import Call
+from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.routes.common import find_lens
 from app.schemas import LensOut, PhotoOut
 from app.store.tables import PhotoRow
-from lensmodel.core.names import camera_name, full_name
+from lensmodel.core.names import camera_name, full_name, name_key
 
 PHOTOS: Final = 60  # Photos and lenses of a list (chosen): the newest of them
 HOPELESS: Final = frozenset({"failed", "cancelled"})  # States of photos without a result
 MAX_WAITING: Final = 1000  # Waiting photos on the page at most: as many as one request can change
+NARROWEST_MM: Final = 10.0  # Width of the smallest sensor behind a mount (chosen): one inch has 13.2 mm
+# Focal length in mm below which a lens that has no name is no separate one (chosen): fisheyes begin at 8 mm,
+# and those that have no contacts do not tell their aperture
+SHORTEST_MM: Final = 8.0
+# Series of cameras without a mount whose sensors or focal lengths do not give them away
+_COMPACTS: Final = re.compile(
+    r"powershot|ixus|coolpix|finepix|cybershot|^dsc(rx|hx|wx|h|w|t|p|s)\d|^dmc(f|t|l[cfx])|^dc(f|t|lx)|^x100"
+    r"|^x\d0s?$|stylus|optio|ricohgr|^grii|hero\d|iphone|ipad|pixel|^sm[agns]\d|leicaq|^zv1"
+)
 
 
 def photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:
@@ -53,6 +64,17 @@ def counting(call: Call, lens_id: str) -> bool:
     return lens.sample_count > 0 and any(event.metrics is None for event in newest)
 
 
+def next_step(call: Call, listed: Sequence[PhotoOut], lenses: Sequence[LensOut]) -> PhotoOut | None:
+    """Return the newest photo that is, or soon can be, corrected; None where it has been already."""
+    known = {lens.id for lens in lenses if lens.samples}
+    hopeful = [photo for photo in listed if photo.state not in {*HOPELESS, "excluded", "needs_lens"}]
+    photo = next((each for each in hopeful if each.state != "stored" or each.lens_id in known), None)
+    if photo is None:
+        return None
+    corrections = correction_routes.list_corrections(call, limit=PHOTOS, photo_id=photo.id).items
+    return photo if all(correction.roi for correction in corrections) else None  # of a part: a preview
+
+
 def waiting(call: Call) -> list[WaitingGroup]:
     """Group the photos that wait for their owner to say which lens it was."""
     rows = call.store.photos.page(call.owner, before=None, limit=MAX_WAITING, state="needs_lens")
@@ -73,6 +95,8 @@ class WaitingGroup:
         What the files call the lens, where they do.
     needs_aperture : bool
         Whether any of the files does not say its aperture.
+    own_lens : bool
+        Whether the lens is a part of the camera.
     photos : list of PhotoRow
         Newest first.
     """
@@ -82,6 +106,7 @@ class WaitingGroup:
     focal_mm: float | None
     lens_model: str | None
     needs_aperture: bool
+    own_lens: bool
     photos: list[PhotoRow]
 
     @property
@@ -102,12 +127,24 @@ class WaitingGroup:
         return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
+def has_own_lens(row: PhotoRow) -> bool:
+    """Whether the lens of a photo is a part of its camera: by its name, or by the camera."""
+    camera = name_key(row.camera_model)
+    if not camera or row.lens_model:
+        return bool(camera) and camera in name_key(row.lens_model) and not row.lens_serial
+    if row.pixel_pitch_um and row.width and row.height:
+        small = max(row.width, row.height) * row.pixel_pitch_um / 1000.0 < NARROWEST_MM
+    else:
+        small = bool(row.aperture) and 0.0 < (row.focal_mm or 0.0) < SHORTEST_MM
+    return small or _COMPACTS.search(camera) is not None
+
+
 def grouped(rows: Sequence[PhotoRow]) -> list[WaitingGroup]:
-    """Group photos by body and lens name, those that name no lens by focal length."""
+    """Group photos by body and lens name, those whose lens may be any that has no name by focal length."""
     groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
     for row in rows:
         camera = camera_name(row.camera_maker, row.camera_model)
-        focal = 0.0 if row.lens_model else row.focal_mm or 0.0
+        focal = 0.0 if row.lens_model or has_own_lens(row) else row.focal_mm or 0.0
         groups[camera, row.body_key or "", focal, row.lens_model or ""].append(row)
     bodies: defaultdict[str, list[str]] = defaultdict(list)
     for camera, body, *_ in sorted(groups):
@@ -120,6 +157,7 @@ def grouped(rows: Sequence[PhotoRow]) -> list[WaitingGroup]:
             focal_mm=focal or None,
             lens_model=model or None,
             needs_aperture=any(row.aperture is None for row in photos),
+            own_lens=all(map(has_own_lens, photos)),
             photos=photos,
         )
         for (camera, body, focal, model), photos in sorted(groups.items())

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from app.pages.pictures import upright_point
+from app.pages.pictures import turned
 from app.pages.shown import WaitingGroup
 from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem
 from lensmodel.cli.console import gain_words
@@ -21,7 +21,7 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "inspecting": "Reading the file's details",
     "developing": "Developing the photo",
     "selecting": "Looking for parts that show the blur",
-    "needs_lens": "Which lens was it?",
+    "needs_lens": "Waiting for your answer",
     "counted": "Used",
     "stored": "Ready to correct",
     "excluded": "Left out, as you chose",
@@ -134,7 +134,7 @@ def correction_name(correction: CorrectionOut) -> str:
     """Name a correction by how it differs from others."""
     words = [correction.method.capitalize()]
     if correction.strength < 1:
-        words.append(f"strength {correction.strength:.0%}")
+        words.append(f"strength {percent(correction.strength)}")
     words.append(FILES.get(correction.output["format"], correction.output["format"]))
     return ", ".join(words)
 
@@ -229,7 +229,7 @@ def nothing_words(kind: str) -> str:
 def held_words(zone: Mapping[str, Any]) -> str:
     """Say where much of the correction was held back, and why."""
     held, reasons = zone.get("held_back") or 0.0, zone.get("reasons") or []
-    return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
+    return f", {percent(held)} held back ({', '.join(reasons[:3])})" if held > HELD else ""
 
 
 def held_back(audit: Mapping[str, Any]) -> tuple[str, list[str]] | None:
@@ -242,23 +242,34 @@ def held_back(audit: Mapping[str, Any]) -> tuple[str, list[str]] | None:
     for zone in zones:
         checks.update({name: part * zone["tiles"] / tiles for name, part in zone["checks"].items()})
     share = sum(zone["tiles"] * zone["held_back"] for zone in zones) / tiles
-    words = f"{share:.0%} of the correction was held back over the whole photo."
+    words = f"{percent(share)} of the correction was held back over the whole photo."
     return (
         "Applied almost in full." if share < LEAST else words,
-        [f"{CHECKS.get(name, name)}: {part:.1%}" for name, part in checks.most_common() if part >= LEAST],
+        [
+            f"{CHECKS.get(name, name)}: {100 * part:.1f} %"
+            for name, part in checks.most_common()
+            if part >= LEAST
+        ],
     )
 
 
 def held_map(
     audit: Mapping[str, Any], height: int, width: int, orientation: int
-) -> list[tuple[int, int, int, float]]:
-    """Return the tiles that were held back in the upright photo: left, top, side in pixels, and the share."""
-    side = audit.get("tile_side") or 0
-    found = []
+) -> list[tuple[int, int, int, int, float]]:
+    """Return the tiles that were held back in the upright photo: left, top, width, height, and the share.
+
+    They reach into their neighbours; what is drawn of each is its part of a lattice without gaps.
+    """
+    side, found = audit.get("tile_side") or 1, []
+    rise, run = (extent / max(1, round(extent / side)) for extent in (height, width))
     for tile in audit.get("tiles") or []:
-        middle = (tile["row"] + side / 2, tile["col"] + side / 2)
-        row, col = upright_point(*middle, height, width, orientation)
-        found.append((col - side // 2, row - side // 2, side, tile["held_back"]))
+        row, col = round(tile["row"] / rise), round(tile["col"] / run)
+        ends = [
+            turned(round(y * rise), round(x * run), height, width, orientation)
+            for y, x in ((row, col), (row + 1, col + 1))
+        ]
+        (top, bottom), (left, right) = (sorted(places) for places in zip(*ends, strict=True))
+        found.append((left, top, right - left, bottom - top, tile["held_back"]))
     return found
 
 

@@ -22,7 +22,7 @@ export function setUpLive() {
   on("error", () => (away.hidden = false));
   on("before:swap", () => (within = live.contains(document.activeElement)));
   on("after:swap", () => {
-    if (within && document.activeElement === document.body) (document.querySelector("[data-leave]") ?? byId("photos-title") ?? byId("main")).focus();
+    if (within && document.activeElement === document.body) (document.querySelector("[data-leave]") ?? byId("next-title") ?? byId("photos-title") ?? byId("main")).focus();
   });
   // a service on this very computer needs no network: ask it whether it is there
   for (const event of ["offline", "online"]) window.addEventListener(event, refresh);

@@ -339,7 +339,7 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     learn.click()
 
     expect(page.locator(".group")).to_have_count(0)
-    expect(page.locator("#photos-title")).to_be_focused()
+    expect(page.locator("#next-title")).to_be_focused()
     assert [url.rpartition("/v1/")[2] for url in wishes] == ["photos"]
     for photo in sent:
         job = service.job(photo["id"], until=lambda job: job["state"] == "waiting")
@@ -348,6 +348,9 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     expect(card).to_contain_text("2 photos")
     lenses = {service.get(f"/v1/photos/{photo['id']}")["lens_id"] for photo in sent}
     assert len(lenses) == 1
+    page.locator("#next").get_by_role("link", name="Correct this photo").click()
+    page.wait_for_url(f"**/photos/{sent[1]['id']}")
+    expect(page.get_by_role("button", name="Correct this photo")).to_be_in_viewport()
 
 
 def test_a_damaged_file_leaves_no_empty_lens(page: Page, service: Service, tmp_path: Path) -> None:
@@ -404,7 +407,7 @@ def test_a_photo_says_how_much_it_taught_and_why_no_more(
 
     used = page.locator("section[aria-labelledby=patches-title]")
     expect(used).to_contain_text(f"{half['patches']['done']} place")
-    counts = [int(count) for count in used.locator(".reasons b").all_inner_texts()]
+    counts = [int(count) for count in used.locator(".facts b").all_inner_texts()]
     assert sum(counts) == half["patches"]["rejected"] > 0
 
 

@@ -33,8 +33,10 @@ from app.schemas import Region
 from app.store import LensName, Store
 from app.store.jobs import Result
 from app.store.tables import PhotoRow
+from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
+from lensmodel.correction.tiles.lattice import cells
 from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
 
@@ -184,16 +186,28 @@ def test_a_corrected_dng_is_looked_at_and_its_audit_told(
     page = client.get(f"/corrections/{corrected['id']}").text
 
     assert 'id="viewer"' in page
-    assert "10% of the correction was held back over the whole photo." in page
-    assert "detail that does not match the photo: 10.0%" in page
-    assert '<rect x="200" y="0" width="100" height="100" fill-opacity="0.37"/>' in page
+    assert "10 % of the correction was held back over the whole photo." in page
+    assert "detail that does not match the photo: 10.0 %" in page
+    assert '<rect x="200" y="0" width="100" height="100" fill-opacity="0.44"/>' in page
     assert "open it in your RAW developer" in page
 
 
 def test_what_was_held_back_is_drawn_where_it_is_on_a_photo_held_upright() -> None:
     audit = {"tiles": [{"row": 0, "col": 200, "held_back": 0.4}], "tile_side": 100}
 
-    assert held_map(audit, 600, 800, 6) == [(499, 200, 100, 0.4)]  # at the right, 200 pixels down
+    assert held_map(audit, 600, 800, 6) == [(500, 200, 100, 100, 0.4)]  # at the right, 200 pixels down
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_map_of_what_was_held_back_covers_a_photo_once(orientation: int) -> None:
+    tiles = [{"row": c.top, "col": c.left, "held_back": 0.4} for c in cells(Frame(331, 503), 96)]
+    height, width = (503, 331) if orientation > 4 else (331, 503)
+    drawn = np.zeros((height, width), np.int8)
+
+    for left, top, across, down, _ in held_map({"tiles": tiles, "tile_side": 96}, 331, 503, orientation):
+        drawn[top : top + down, left : left + across] += 1
+
+    assert drawn.min() == drawn.max() == 1
 
 
 def test_the_page_of_a_photo_shows_its_correction(client: TestClient, corrected: dict[str, Any]) -> None:
@@ -383,18 +397,84 @@ def test_waiting_photos_are_grouped_by_body_and_focal_length(steps: Steps, store
 @pytest.mark.parametrize(
     ("maker", "model", "lens", "name"),
     [
-        ("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", None, "Kodak Z612, 5.85 mm"),
-        ("NIKON CORPORATION", "NIKON D1", None, "Nikon D1, 5.85 mm"),
-        ("FUJIFILM", "X-T3", None, "Fujifilm X-T3, 5.85 mm"),
+        ("NIKON CORPORATION", "NIKON D1", None, "Nikon D1, 20 mm"),
+        ("FUJIFILM", "X-T3", None, "Fujifilm X-T3, 20 mm"),
         ("Canon", "Canon EOS D30", "16-35 mm", "Canon 16-35 mm"),
         ("Canon", "Canon EOS 6D", "EF24-105mm f/4L IS USM", "EF24-105mm f/4L IS USM"),
-        (None, None, None, "5.85 mm"),
+        (None, None, None, "20 mm"),
     ],
 )
 def test_a_lens_is_proposed_a_name(maker: str | None, model: str | None, lens: str | None, name: str) -> None:
-    row = PhotoRow(camera_maker=maker, camera_model=model, lens_model=lens, focal_mm=5.85, aperture=2.8)
+    row = PhotoRow(camera_maker=maker, camera_model=model, lens_model=lens, focal_mm=20.0, aperture=2.8)
 
     assert grouped([row])[0].name == name
+    assert not grouped([row])[0].own_lens
+
+
+@pytest.mark.parametrize(
+    ("maker", "model", "more", "name"),
+    [
+        ("EASTMAN KODAK COMPANY", "KODAK Z612", {"pixel_pitch_um": 2.04}, "Kodak Z612"),
+        ("DJI", "FC300S", {"aperture": 2.8, "width": None}, "DJI FC300S"),
+        ("FUJIFILM", "X100V", {}, "Fujifilm X100V"),
+        ("Apple", "iPhone 7", {"lens_model": "iPhone 7 back camera"}, "iPhone 7 back camera"),
+    ],
+    ids=["by its pixels", "by its focal length", "by its series", "by the name of its lens"],
+)
+def test_the_own_lens_of_a_camera_is_proposed_for_all_its_photos(
+    maker: str, model: str, more: dict[str, Any], name: str
+) -> None:
+    seen = {"width": 2832, "height": 2128, "camera_maker": maker, "camera_model": model, **more}
+    rows = [PhotoRow(focal_mm=focal, **seen) for focal in (5.85, 7.2)]
+
+    (group,) = grouped(rows)
+
+    assert (group.own_lens, group.name) == (True, name)
+
+
+def test_a_camera_with_a_lens_of_its_own_is_not_asked_about(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.receive()
+    store.photos.set_state(photo.public_id, ("received",), "inspecting")
+    unnamed = LensName(None, None, None, "none")
+    about = {"aperture": 2.8, "focal_mm": 3.61, "focus_m": None, "pixel_pitch_um": 1.7}
+    store.photos.record_inspection(
+        photo.public_id, unnamed, width=4000, height=2250, camera_maker="DJI", camera_model="FC300S", **about
+    )
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    for path in ("/", f"/photos/{photo.public_id}"):
+        page = client.get(path).text
+        assert "Which lens was it?" not in page
+        assert re.search(
+            r'<details>\s*<summary>It was another lens</summary>.*value="DJI FC300S".*</details>',
+            page,
+            re.DOTALL,
+        )
+
+
+def test_what_was_learned_leads_to_correcting_until_it_was(
+    client: TestClient, steps: Steps, settings: Settings, store: Store
+) -> None:
+    photo = steps.receive()
+    first = client.get("/ui/parts?page=home").text
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo, (0,))
+    working = client.get("/ui/parts?page=home").text
+    steps.estimate(photo)
+    store.photos.finish(photo.public_id, 1)
+    ready = client.get("/ui/parts?page=home").text
+    client.post("/v1/corrections", json={"photo_id": photo.public_id})
+    corrected = client.get("/ui/parts?page=home").text
+
+    for part in (first, working):
+        assert f"Next: correct {photo.filename}" in part
+        assert "as soon as this is done" in part
+    assert "Measuring blur: 1 of 2 places" in working.partition('id="next"')[2].partition("</section>")[0]
+    assert f'<a class="button" href="/photos/{photo.public_id}">Correct this photo</a>' in ready
+    assert "Next: correct" not in corrected
 
 
 def test_a_lens_that_was_named_before_any_photo_is_listed_and_no_ghost(

@@ -174,9 +174,10 @@ def by_photos(lens: GridLens, photos: int, pitch_um: float) -> list[Sharpness]:
             known.shot(number, path)
         model = calibrate(shots, aperture=known.settings.aperture).model
     found = lens_report(model, "", channels=("g",)).tested[0]
-    ranges = zip(found.tangential_range, found.sagittal_range, strict=True)
-    rows = zip(found.positions, found.tangential, found.sagittal, ranges, found.unknown, strict=True)
-    return [Sharpness(*row) for row in rows]
+    return [
+        Sharpness(s.position, s.tangential, s.sagittal, (s.tangential_range, s.sagittal_range), s.unknown)
+        for s in found.map
+    ]
 
 
 def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:

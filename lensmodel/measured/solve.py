@@ -1,25 +1,18 @@
 """The PSF of one window of a photo, by weighted least squares against the sharp picture that it shows.
 
-**Slow changes** of light that lie over a window beside the blurred picture are taken out before solving::
+For the pixels p that the sensor measured in a window,
 
-    y(p) = sum_u k(u) x(p - u) + sum_j c_j q_j(p) + n(p)
+    y(p) = sum_t k(t) x(p - t) + sum_j c_j q_j(p) + n(p)          var n(p) = s(p)²
 
-The c_j need not be known. What the terms q_j can explain of y and of each column x(. - u) is taken out of
-both by weighted least squares; k is then the solution of what is left (R. Frisch and F. Waugh, Econometrica
-1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well: there, a constant.
-
-**One kernel for a window** (`solve`). For the pixels p that the sensor measured in a window,
-
-    y(p) = sum_u k(u) x(p - u) + c(p) + n(p)          var n(p) = s(p)²
-
-so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing; c changes
-slowly over the window and is taken out of both sides (`Smooth`). Every
-value of the kernel has a prior, normal with mean 0, whose width falls with the distance d to the middle
-as the light of a lens does:
+so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing. The q_j, terms
+of a quadratic, are slow changes of light over the blurred picture; the c_j are eliminated (R. Frisch and
+F. Waugh, Econometrica 1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well:
+there, a constant (`even`). Every value of the kernel has a prior, normal with mean 0, whose width falls with
+the distance d to the middle as the light of a lens does:
 
     t(d) = T / (1 + (d / D)²)
 
-The kernel is the minimum of  sum_p (y - k * x - c)² / (q s²) + sum_u k(u)² / t(u)²  over all k >= 0 whose sum
+The kernel is the minimum of  sum_p (y - k * x - c)² / (q s²) + sum_t k(t)² / t(d)²  over all k >= 0 whose sum
 is that of the minimum over all k, where q >= 1 is the mean of the squared residuals over what the noise
 explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the other: hundreds of
 values around a small core then add up to a halo that is not there. (Where the latent picture has noise of its
@@ -31,27 +24,21 @@ Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 200
 sharp picture, non-negative least squares); M. Delbracio et al., "The non-parametric sub-pixel local
 point spread function estimation is a well posed problem", IJCV 96, 2012, section 3.
 
-**A kernel that changes within the window** (`varying`), at the phase between pixels that
-fits best. It is linear in the place, with u and v from -1 to 1 over rows and columns of the window:
-
-    y(p) = sum_t (k(t) + u k_u(t) + v k_v(t)) x(p - t) + c(p) + n(p)
-
-k_u and k_v have the prior of `solve` with `CHANGE` of its width. What they explain is taken out of the
-normal equations (Schur's complement), so that k is found as if it were the same everywhere.
-
-A kernel that is not negative on one grid of pixels is so on no other, if it has a peak as narrow as a
-pixel: moved by half a pixel, the peak rings along its row and column, k >= 0 cuts one half of that off, and
-the rest is explained by something else. So the grid is fitted as well: X S(d) k is compared with y, where
-S(d) moves a kernel by d pixels (by sinc, which is exact for a picture without frequencies beyond the
-pixels'), and d minimises the misfit. Where the kernel is smooth, any d will do, and a weak prior keeps its
-centre of mass in the middle.
+**A kernel that changes within the window** (`varying`) is linear in the place, k + u k_u + v k_v with u and
+v from -1 to 1 over its rows and columns; k_u and k_v, whose prior has `CHANGE` of the width, are eliminated
+too. And it is found at the phase between pixels that fits best: a kernel that is not negative on one grid of
+pixels is so on no other, if it has a peak as narrow as a pixel. Moved by half a pixel, the peak rings along
+its row and column, k >= 0 cuts one half of that off, and the rest is explained by something else. So X S(d) k
+is compared with y, where S(d) moves a kernel by d pixels (by sinc, which is exact for a picture without
+frequencies beyond the pixels'), and d minimises the misfit. Where the kernel is smooth, any d will do, and a
+weak prior keeps its centre of mass in the middle.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -72,64 +59,6 @@ def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.floa
     return np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Smooth:
-    """What slow changes explain of a window and of its latent picture."""
-
-    basis: NDArray[np.float32]  # (H, W, n), terms that are orthonormal under the weight, as single precision
-    of_y: NDArray[np.float64]  # (n,), their share of what was observed
-    # (n, k²), their share of x(p - u), for each u in the order of the kernel's values
-    of_x: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls,
-        observed: NDArray[np.floating],
-        latent: NDArray[np.floating],
-        weight: NDArray[np.float64],
-        size: int,
-        *,
-        even: bool = False,
-    ) -> Smooth:
-        """Project a window, shape (H, W), and its latent picture, with a margin of half a kernel.
-
-        With `even`, on a constant alone.
-        """
-        height, width = weight.shape
-        terms = quadratic(np.linspace(-1.0, 1.0, height)[:, None], np.linspace(-1.0, 1.0, width)[None, :])
-        if even:
-            terms = terms[..., :1]
-        gram = np.einsum("rci,rc,rcj->ij", terms, weight, terms, optimize=True)
-        # where few pixels count, what cannot be told apart is left in
-        values, vectors = np.linalg.eigh(gram)
-        determined = values > 1e-9 * values[-1]
-        basis = terms @ (vectors[:, determined] / np.sqrt(values[determined]))
-        weighted = basis * weight[..., None]
-        of_x = np.empty((basis.shape[-1], size, size))
-        for i in range(size):
-            for j in range(size):
-                part = latent[size - 1 - i : size - 1 - i + height, size - 1 - j : size - 1 - j + width]
-                of_x[:, i, j] = np.einsum("rci,rc->i", weighted, part)
-        return cls(
-            basis=basis.astype(np.float32),
-            of_y=np.einsum("rci,rc->i", weighted, np.asarray(observed, dtype=np.float64)),
-            of_x=of_x.reshape(len(of_x), -1),
-        )
-
-    def out_of_y(
-        self, values: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
-    ) -> NDArray[np.float32]:
-        """Return the residual of observed values at some pixels."""
-        rest = np.asarray(values, dtype=np.float64) - self.basis[part] @ self.of_y
-        return np.asarray(rest, dtype=np.float32)
-
-    def out_of_x(
-        self, rows: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
-    ) -> NDArray[np.float32]:
-        """Return the residual of rows of X, shape (n, k²), at some pixels."""
-        return np.asarray(rows - self.basis[part] @ self.of_x.astype(np.float32), dtype=np.float32)
-
-
 # T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light
 PEAK: Final = 0.5
 # D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have
@@ -138,6 +67,7 @@ _ROWS: Final = 2048  # of the design matrix at once: a whole window would take h
 # Of the projected gradient, whose error falls with the square of their number: more only cost time (chosen)
 _STEPS: Final = 300
 _STILL: Final = 1e-7  # of the light: no value moves by more
+_NO_KERNEL: Final = "no kernel explains this window; the latent picture does not match it"
 _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 
 
@@ -194,15 +124,23 @@ def solve(
     NotEnoughEvidenceError
         If fewer pixels count than the kernel has, or no kernel explains them.
     """
-    _require_fit(observed, latent, measured, size)
+    if size < 3 or size % 2 == 0 or latent.shape != tuple(n + size - 1 for n in observed.shape):
+        raise InvalidInputError(
+            f"a latent picture of {latent.shape} does not fit a window of {observed.shape} and kernels of "
+            f"{size}"
+        )
+    if int(measured.sum()) < size * size:
+        raise NotEnoughEvidenceError(
+            f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"
+        )
     weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
-    a, b, power = _normal_equations(observed, latent, weight, size, even=even, varying=varying)
+    whole = _normal_equations(observed, latent, weight, size, even=even, varying=varying)
     if latent_noise is not None:
-        a -= _stationary(latent_noise, size) * weight.sum()
+        whole = replace(whole, a=whole.a - _stationary(latent_noise, size) * weight.sum())
     prior = 1.0 / prior_width(size) ** 2
     count, misfit, moved = int(measured.sum()), 1.0, (0.0, 0.0)
     k = np.zeros(size * size)
-    eq = _Equations(a, b, power).over(misfit, prior)
+    eq = whole.over(misfit, prior)
     for _ in range(2):  # the second time with the residuals of the first
         if latent_noise is None:
             k = _bounded(eq.a + np.diag(prior), eq.b, k)
@@ -210,12 +148,12 @@ def solve(
             k = nonnegative_least_squares(eq.a + np.diag(prior), eq.b, k, _STEPS)
         rest = eq.power - 2.0 * float(eq.b @ k) + float(k @ eq.a @ k)
         misfit = max(misfit * rest / count, 1.0)
-        eq = _Equations(a, b, power).over(misfit, prior)
+        eq = whole.over(misfit, prior)
     if varying:
         k, moved = _on_its_grid(eq, prior, k, size)
     light = float(k.sum())
     if not light > 0.0:
-        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
+        raise NotEnoughEvidenceError(_NO_KERNEL)
     kernel = as_kernel(k.reshape(size, size))
     off = centroid(kernel)
     return Solved(
@@ -227,19 +165,62 @@ def solve(
     )
 
 
-def _require_fit(
-    observed: NDArray[np.floating], latent: NDArray[np.floating], measured: NDArray[np.bool_], size: int
-) -> None:
-    """Refuse shapes that do not fit each other, and too few pixels; see `solve`."""
-    if size < 3 or size % 2 == 0 or latent.shape != tuple(n + size - 1 for n in observed.shape):
-        raise InvalidInputError(
-            f"a latent picture of {latent.shape} does not fit a window of {observed.shape} and kernels of "
-            f"{size}"
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Normal equations of the kernel, or of k, k_u and k_v: k'Ak/2 - b'k, and y'Wy."""
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    power: float
+
+    def over(self, misfit: float, prior: NDArray[np.float64]) -> _Equations:
+        """Divide by the misfit, and eliminate k_u and k_v where they are there."""
+        scaled, n = _Equations(self.a / misfit, self.b / misfit, self.power / misfit), len(prior)
+        if len(self.b) == n:
+            return scaled
+        inner = scaled.a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
+        return scaled.without(n, lambda right: scipy.linalg.solve(inner, right, assume_a="sym"))
+
+    def without(self, n: int, solved: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> _Equations:
+        """Eliminate all unknowns but the first n (Schur's complement); `solved` divides by their block."""
+        across, b = self.a[n:, :n], self.b[n:]
+        by = solved(np.concatenate([across, b[:, None]], axis=1))
+        return _Equations(
+            self.a[:n, :n] - across.T @ by[:, :n], self.b[:n] - across.T @ by[:, n], self.power - b @ by[:, n]
         )
-    if int(measured.sum()) < size * size:
-        raise NotEnoughEvidenceError(
-            f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"
-        )
+
+
+def _normal_equations(
+    observed: NDArray[np.floating],
+    latent: NDArray[np.floating],
+    weight: NDArray[np.float64],
+    size: int,
+    *,
+    even: bool,
+    varying: bool,
+) -> _Equations:
+    """Normal equations of k, or of k, k_u and k_v, with slow changes of light eliminated."""
+    # a constant is one of the slow changes; without it single precision holds the detail
+    latent = np.asarray(latent - latent.mean(), dtype=np.float32)
+    observed = np.asarray(observed - observed[weight > 0].mean(), dtype=np.float32)
+    views = sliding_window_view(latent, (size, size))[:, :, ::-1, ::-1]
+    u, v = (np.linspace(-1.0, 1.0, n) for n in weight.shape)
+    terms = quadratic(u[:, None], v[None, :]).astype(np.float32)
+    rows, cols = np.nonzero(weight)
+    n = (3 if varying else 1) * size * size
+    of_light = 1 if even else terms.shape[-1]
+    gram = np.zeros((n + of_light + 1,) * 2)
+    for first in range(0, rows.size, _ROWS):
+        part = rows[first : first + _ROWS], cols[first : first + _ROWS]
+        x, slow = views[part].reshape(part[0].size, -1), terms[part]
+        moving = [x * slow[:, 1:2], x * slow[:, 2:3]] if varying else []
+        columns = np.concatenate([x, *moving, slow[:, :of_light], observed[part][:, None]], axis=1)
+        columns *= np.sqrt(weight[part]).astype(np.float32)[:, None]
+        gram += columns.T @ columns
+    light = np.linalg.pinv(gram[n:-1, n:-1], hermitian=True)  # few pixels may not tell all terms apart
+    return _Equations(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])).without(
+        n, lambda right: light @ right
+    )
 
 
 def _bounded(
@@ -252,8 +233,8 @@ def _bounded(
     a = a + lift * np.eye(len(b))
     light = float(scipy.linalg.solve(a, b, assume_a="pos").sum())
     if not light > 0.0:
-        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    return _of_sum(a, b, start, light, largest + lift)
+        raise NotEnoughEvidenceError(_NO_KERNEL)
+    return _of_sum(a, b, start, light, largest + lift, _STEPS)
 
 
 def _of_sum(
@@ -262,12 +243,9 @@ def _of_sum(
     start: NDArray[np.float64],
     light: float,
     largest: float,
-    steps: int = _STEPS,
+    steps: int,
 ) -> NDArray[np.float64]:
-    """Minimise k'Ak/2 - b'k over k >= 0 of sum `light` by accelerated projected gradients.
-
-    `largest` bounds the eigenvalues of A.
-    """
+    """Minimise k'Ak/2 - b'k over k >= 0 of a sum; `largest` bounds the eigenvalues of A."""
     return fista(
         lambda k: a @ k - b,
         start,
@@ -288,35 +266,6 @@ def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]
     excess = (np.cumsum(falling) - total) / np.arange(1, len(values) + 1)
     last = int(np.nonzero(falling > excess)[0][-1])
     return np.asarray(np.maximum(values - excess[last], 0.0))
-
-
-def _normal_equations(
-    observed: NDArray[np.floating],
-    latent: NDArray[np.floating],
-    weight: NDArray[np.float64],
-    size: int,
-    *,
-    even: bool = False,
-    varying: bool = False,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """X'WX, X'Wy and y'Wy of k, or of k, k_u and k_v, after slow changes were taken out."""
-    smooth = Smooth.of(observed, latent, weight, size, even=even)
-    views = sliding_window_view(np.asarray(latent, dtype=np.float32), (size, size))[:, :, ::-1, ::-1]
-    u, v = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in weight.shape)
-    rows, cols = np.nonzero(weight)
-    n = (3 if varying else 1) * size * size
-    a, b, power = np.zeros((n, n)), np.zeros(n), 0.0
-    for first in range(0, rows.size, _ROWS):
-        part = rows[first : first + _ROWS], cols[first : first + _ROWS]
-        root = np.sqrt(weight[part]).astype(np.float32)
-        x = smooth.out_of_x(views[part].reshape(root.size, -1), part) * root[:, None]
-        if varying:
-            x = np.concatenate([x, x * u[part[0], None], x * v[part[1], None]], axis=1)
-        y = smooth.out_of_y(observed[part], part) * root
-        a += x.T @ x
-        b += x.T @ y
-        power += float(y @ y)
-    return a, b, power
 
 
 def _stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
@@ -357,29 +306,6 @@ _MOST_PX: Final = 1.0
 _MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
 # Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)
 _SEARCHED: Final = 100
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    """Normal equations of the kernel, or of k, k_u and k_v: k'Ak/2 - b'k, and y'Wy."""
-
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
-    power: float
-
-    def over(self, misfit: float, prior: NDArray[np.float64]) -> _Equations:
-        """Divide by the misfit, and eliminate k_u and k_v where they are there (Schur's complement)."""
-        a, b, power, n = self.a / misfit, self.b / misfit, self.power / misfit, len(prior)
-        if len(b) == n:
-            return _Equations(a, b, power)
-        inner = a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
-        right = np.concatenate([a[n:, :n], b[n:, None]], axis=1)
-        solved = scipy.linalg.solve(inner, right, assume_a="sym", check_finite=False)
-        return _Equations(
-            a[:n, :n] - a[:n, n:] @ solved[:, :n],
-            b[:n] - a[:n, n:] @ solved[:, n],
-            power - float(b[n:] @ solved[:, n]),
-        )
 
 
 def _on_its_grid(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from statistics import median
-from typing import Final, Literal, TypeAlias, TypedDict
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from lensmodel.core.types import (
     ZONES,
     Channel,
     FieldPosition,
-    Kernel,
     LensSettings,
     StepHook,
     Zone,
@@ -159,7 +158,7 @@ class Spot:
     sagittal_range: Range
     predicted_error: float  # expected relative L2 of the kernel
     unknown: bool  # whether too little is known of the place to call this the lens
-    kernel: tuple[tuple[float, ...], ...]
+    kernel: tuple[tuple[float, ...], ...] = ()  # left out of the places of a map
 
     @property
     def mean(self) -> float:
@@ -168,14 +167,21 @@ class Spot:
 
     @property
     def side(self) -> str:
-        """The place without the word corner: "the upper left"."""
-        return self.place.removesuffix(" corner")
+        """The place without its article and the word corner: "upper left"."""
+        return self.place.removeprefix("the ").removesuffix(" corner")
 
     @property
     def mean_range(self) -> Range:
         """Between what the mean is expected."""
         low, high = np.minimum([self.tangential_range, self.sagittal_range], NYQUIST).mean(axis=0)
         return float(low), float(high)
+
+    @property
+    def give_or_take(self) -> float:
+        """Half of the range of MTF50 over the figure, the larger of both directions."""
+        ranges = np.minimum([self.tangential_range, self.sagittal_range], NYQUIST)
+        figures = np.clip([self.tangential, self.sagittal], 1e-6, NYQUIST)
+        return float((np.ptp(ranges, axis=1) / 2.0 / figures).max())
 
     @property
     def words(self) -> str:
@@ -193,44 +199,23 @@ class ApertureReport:
     aspect: float  # width over height of the map
     rows: int
     cols: int
-    positions: tuple[FieldPosition, ...]  # of the map, row by row from the top left
-    tangential: tuple[float, ...]  # MTF50 at each place, cycles/pixel
-    sagittal: tuple[float, ...]
-    tangential_range: tuple[Range, ...]
-    sagittal_range: tuple[Range, ...]
-    predicted_error: tuple[float, ...]  # expected relative L2 of the kernel at each place
-    extrapolated: tuple[bool, ...]  # whether no photo shows a place
+    map: tuple[Spot, ...]  # row by row from the top left, without kernels
     radii: tuple[float, ...]
     curves: tuple[Curve, ...]
     spots: tuple[Spot, ...]  # the centre and the four corners
     sides: tuple[Spot, ...]  # left, right, top and bottom, at four fifths of the way to the edge
     centring: Centring
-    # whether photos of charts or targets alone tell of the lens: what lies between their places is known
-    measured: bool = False
 
     @property
-    def mean(self) -> tuple[float, ...]:
-        """Mean of tangential and sagittal MTF50 at each place, none beyond what a sensor shows."""
-        pairs = zip(self.tangential, self.sagittal, strict=True)
-        return tuple((min(t, NYQUIST) + min(s, NYQUIST)) / 2.0 for t, s in pairs)
-
-    @property
-    def give_or_take(self) -> tuple[float, ...]:
-        """Half of the range of MTF50 at each place over the figure, the larger of both directions."""
-        ranges = np.minimum([self.tangential_range, self.sagittal_range], NYQUIST)
-        figures = np.clip([self.tangential, self.sagittal], 1e-6, NYQUIST)
-        return tuple(float(x) for x in (np.ptp(ranges, axis=2) / 2.0 / figures).max(axis=0))
-
-    @property
-    def unknown(self) -> tuple[bool, ...]:
-        """Whether too little is known of a place to draw it as if it were the lens."""
-        known = zip(self.predicted_error, self.extrapolated, strict=True)
-        return tuple(_is_unknown(error, gone, self.measured) for error, gone in known)
+    def unknown_share(self) -> float:
+        """Share of the map of which too little is known to draw it as if it were the lens."""
+        return sum(spot.unknown for spot in self.map) / len(self.map)
 
     @property
     def zones(self) -> dict[Zone, float]:
-        """Mean MTF50 of the map's places in each zone, cycles/pixel."""
-        return {zone: _mean_in(zone, self.positions, self.mean) for zone in ZONES}
+        """Mean MTF50 of the map's places in each zone, cycles/pixel; not a number where it has none."""
+        own = {zone: [s.mean for s in self.map if zone_of(s.position.r) == zone] for zone in ZONES}
+        return {zone: float(np.mean(means)) if means else math.nan for zone, means in own.items()}
 
     @property
     def worst(self) -> Spot:
@@ -267,6 +252,7 @@ class LensReport:
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
     size_px: tuple[int, int] | None = None  # width and height of its photos, where they are known
+    measured: bool = False  # whether photos of charts, targets or points alone tell of the lens
 
     def at(self, aperture: float | None, channel: Channel = "g") -> ApertureReport:
         """Return what was found at an aperture that was tested; the widest for None or another one."""
@@ -296,7 +282,7 @@ class LensReport:
     @property
     def advice(self) -> str:
         """Which photo would help most: of the place and aperture whose blur is known least."""
-        if self.tested[0].measured and any(self.tested[0].unknown):
+        if self.measured and self.tested[0].unknown_share:
             return "Nothing is known beyond the outermost places of the chart: let it fill the frame."
         green = [one for one in self.tested if one.settings.channel == self.tested[0].settings.channel]
         spots = [(spot, one) for one in green for spot in (*one.spots, *one.sides)]
@@ -314,9 +300,10 @@ class LensReport:
         """The report in sentences, those of its first aperture."""
         first = self.tested[0]
         lines = [self.verdict, f"{first.centring.text[:1].upper()}{first.centring.text[1:]}."]
-        if any(first.unknown):
-            share = sum(first.unknown) / len(first.unknown)
-            lines.append(f"Too little is known of {share:.0%} of the picture; those figures are guesses.")
+        if first.unknown_share:
+            lines.append(
+                f"Too little is known of {first.unknown_share:.0%} of the picture; those figures are guesses."
+            )
         return (*lines, self.advice)
 
 
@@ -387,79 +374,64 @@ def lens_report(
     """
     if not 3 <= size <= 255 or size % 2 == 0:
         raise InvalidInputError(f"size must be odd and lie in 3..255, got {size}")
-    pitch = _shared(s.pixel_pitch_um for s in model.samples)
     aspect = filled_aspect(model) if aspect is None else aspect
-    cols = max(3, round(rows * aspect))
     numbers = list(apertures) if apertures is not None else _chosen(model)
     wanted = [LensSettings(aperture=n) for n in numbers] or [widest(model)]
     questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
     tested = []
     for settings in questions:
-        tested.append(_tested(model, settings, (rows, cols, aspect, size), pitch))
+        tested.append(_tested(model, settings, rows, aspect, size))
         on_step(len(tested), len(questions))
-    first = tested[0]
+    # by their half diagonals, where the samples know and agree
+    half = _shared(s.half_diagonal_px for s in model.samples)
+    guessed = None if half is None else round(2.0 * half / math.hypot(max(aspect, 1.0 / aspect), 1.0))
     return LensReport(
         name=name,
-        verdict=verdict(first, _best(tested)),
+        verdict=verdict(tested[0], _best(tested)),
         photos=len({s.photo for s in model.samples}),
         places=max(Counter(s.settings.channel for s in model.samples).values(), default=0),
-        sensor=SensorGeometry(pitch, height_px or _height(model, aspect)),
+        sensor=SensorGeometry(_pitch(model), height_px or guessed),
         tested=tuple(tested),
         lateral=_lateral(lateral),
         details=dict(details or {}),
         size_px=None if height_px is None else (round(height_px * aspect), height_px),
+        measured=_measured(model),
     )
 
 
-def _tested(
-    model: LensModel,
-    settings: LensSettings,
-    shape: tuple[int, int, float, int],
-    pitch: float | None,
-) -> ApertureReport:
-    rows, cols, aspect, size = shape
-    places = grid(rows, cols, aspect)
-    rings = [ring(r, _RING, aspect) for r in RADII]
-    around = [place for ring_places in rings for place in ring_places]
-    frequencies = _frequencies(pitch)
-    answers = [model.query(place, settings, size) for place in places]
-    measured = all(is_measured(sample) for sample in model.samples)
-    figures = [_figures(answer, place, measured) for answer, place in zip(answers, places, strict=True)]
-    corners = [("the centre", FieldPosition(0.0, 0.0))]
-    corners += [(place_in_words(place), place) for place in corner_places(aspect)]
-    sides = [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
-    outside = _outside_chart(model, [*places, *(place for _, place in (*corners, *sides))])
-    spots = tuple(
-        _spot(model, words, place, settings, size, measured=measured, outside=bool(out))
-        for (words, place), out in zip((*corners, *sides), outside[len(places) :], strict=True)
-    )
-    kernels = list(model.kernels(around, settings, size))
-    curves = _contrast(kernels, rings, [f for f, _ in frequencies])
+def _tested(model: LensModel, settings: LensSettings, rows: int, aspect: float, size: int) -> ApertureReport:
+    cols = max(3, round(rows * aspect))
+    mapped = [(place_in_words(place), place) for place in grid(rows, cols, aspect)]
+    named = [("the centre", FieldPosition(0.0, 0.0))]
+    named += [(place_in_words(place), place) for place in corner_places(aspect)]
+    named += [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
+    asked = [*mapped, *named]
+    outside = _outside_chart(model, [place for _, place in asked])
+    spots = [
+        _spot(model, words, place, settings, size, outside=bool(out))
+        for (words, place), out in zip(asked, outside, strict=True)
+    ]
+    count = len(mapped)
     return ApertureReport(
         settings=settings,
         aspect=aspect,
         rows=rows,
         cols=cols,
-        positions=places,
-        tangential=tuple(figure["tangential"] for figure in figures),
-        sagittal=tuple(figure["sagittal"] for figure in figures),
-        tangential_range=tuple(figure["tangential_range"] for figure in figures),
-        sagittal_range=tuple(figure["sagittal_range"] for figure in figures),
-        predicted_error=tuple(float(answer.predicted_error) for answer in answers),
-        extrapolated=tuple(
-            bool(answer.extrapolated or out)
-            for answer, out in zip(answers, outside[: len(places)], strict=True)
-        ),
+        map=tuple(replace(spot, kernel=()) for spot in spots[:count]),
         radii=RADII,
-        curves=tuple(
-            Curve(f, lp, *(tuple(values.tolist()) for values in curves[i]))
-            for i, (f, lp) in enumerate(frequencies)
-        ),
-        spots=spots[: len(corners)],
-        sides=spots[len(corners) :],
+        curves=_curves(model, settings, aspect, size),
+        spots=tuple(spots[count : count + 5]),
+        sides=tuple(spots[count + 5 :]),
         centring=centring(model, settings),
-        measured=measured,
     )
+
+
+def _measured(model: LensModel) -> bool:
+    return all(is_measured(sample) for sample in model.samples)
+
+
+def _pitch(model: LensModel) -> float | None:
+    return _shared(sample.pixel_pitch_um for sample in model.samples)
 
 
 def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray[np.bool_]:
@@ -478,39 +450,14 @@ def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray
 
 
 def _spot(
-    model: LensModel,
-    words: str,
-    place: FieldPosition,
-    settings: LensSettings,
-    size: int,
-    *,
-    measured: bool,
-    outside: bool,
+    model: LensModel, words: str, place: FieldPosition, settings: LensSettings, size: int, *, outside: bool
 ) -> Spot:
-    answer = model.query(place, settings, size)
-    kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
+    answer, measured = model.query(place, settings, size), _measured(model)
     error = float(answer.predicted_error)
-    unknown = _is_unknown(error, answer.extrapolated or outside, measured)
-    figures = _figures(answer, place, measured)
-    return Spot(words, place, **figures, predicted_error=error, unknown=unknown, kernel=kernel)
-
-
-def _is_unknown(error: float, extrapolated: bool, measured: bool) -> bool:
-    return bool(extrapolated or not (measured or error < UNKNOWN))
-
-
-class _Figures(TypedDict):
-    """MTF50 along u and along v, each with its range."""
-
-    tangential: float
-    sagittal: float
-    tangential_range: Range
-    sagittal_range: Range
-
-
-def _figures(answer: PsfAnswer, place: FieldPosition, measured: bool) -> _Figures:
     (t, t_range), (s, s_range) = (_mtf50(answer, place.phi + turn, measured) for turn in (0.0, math.pi / 2.0))
-    return {"tangential": t, "sagittal": s, "tangential_range": t_range, "sagittal_range": s_range}
+    unknown = bool(answer.extrapolated or outside or not (measured or error < UNKNOWN))
+    kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
+    return Spot(words, place, t, s, t_range, s_range, error, unknown, kernel)
 
 
 def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Range]:
@@ -524,21 +471,23 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
     return value, (crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5))
 
 
-def _contrast(
-    kernels: Sequence[Kernel], rings: Sequence[Sequence[FieldPosition]], frequencies: Sequence[float]
-) -> np.ndarray:
-    """Contrast `(frequency, 2, radius)`, tangential first, mean over the places of a radius."""
-    left = iter(kernels)
-    out = np.empty((len(frequencies), 2, len(rings)))
+def _curves(model: LensModel, settings: LensSettings, aspect: float, size: int) -> tuple[Curve, ...]:
+    """Contrast over the radius, mean over the places of a radius."""
+    wanted = _frequencies(_pitch(model))
+    frequencies = [f for f, _ in wanted]
+    rings = [ring(r, _RING, aspect) for r in RADII]
+    kernels = iter(model.kernels([place for places in rings for place in places], settings, size))
+    out = np.empty((len(wanted), 2, len(rings)))  # frequency, tangential and sagittal, radius
     for column, places in enumerate(rings):
-        own = [(next(left), place) for place in places]
+        own = [(next(kernels), place.phi) for place in places]
         for row, turn in enumerate((0.0, math.pi / 2.0)):
-            out[:, row, column] = np.mean(
-                [mtf_from_kernel(k, p.phi + turn, frequencies) for k, p in own], axis=0
-            )
+            contrasts = [mtf_from_kernel(kernel, phi + turn, frequencies) for kernel, phi in own]
+            out[:, row, column] = np.mean(contrasts, axis=0)
         if len(places) == 1:
             out[:, :, column] = out[:, :, column].mean(axis=1, keepdims=True)  # u has no direction there
-    return out
+    return tuple(
+        Curve(f, lp, tuple(t), tuple(s)) for (f, lp), (t, s) in zip(wanted, out.tolist(), strict=True)
+    )
 
 
 def verdict(found: ApertureReport, best: float | None = None) -> str:
@@ -546,17 +495,15 @@ def verdict(found: ApertureReport, best: float | None = None) -> str:
     words = [sharpness(found)]
     if best is not None and best != found.settings.aperture:
         words.append(f"It is sharpest over the whole picture at f/{best:g}.")
-    side = found.centring.side
+    side, tails = found.centring.side, "points in the middle of the picture have tails"
     words.append(
         {
             "centred": "It is well centred.",
-            "decentred": f"It is decentred: {side} is softer than the opposite side."
-            if side
-            else "It is decentred: points in the middle of the picture have tails.",
+            "decentred": f"It is decentred: {side + ' is softer than the opposite side' if side else tails}.",
             "unknown": "It is not yet possible to say whether it is centred.",
         }[found.centring.verdict]
     )
-    if not float(np.mean(found.predicted_error)) < UNKNOWN:
+    if not np.mean([spot.predicted_error for spot in found.map]) < UNKNOWN:
         words.append("Much of this is still a guess; more photos will help.")
     return " ".join(words)
 
@@ -580,7 +527,7 @@ def sharpness(found: ApertureReport) -> str:
             "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
         )
         verb = "is" if sure else "seems"
-        fall = f"its worst corner, {worst.side}, {verb} {how} ({worst.words})"
+        fall = f"its worst corner, the {worst.side}, {verb} {how} ({worst.words})"
     if worst.unknown:
         fall += ", but too little is known there"
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
@@ -608,7 +555,9 @@ def _best(tested: Sequence[ApertureReport]) -> float | None:
     own = [one for one in tested if one.settings.channel == tested[0].settings.channel]
     if len(own) < 2:
         return None
-    return max(own, key=lambda one: (np.mean(one.mean), -(one.settings.aperture or 0.0))).settings.aperture
+    return max(
+        own, key=lambda one: (np.mean([spot.mean for spot in one.map]), -(one.settings.aperture or 0.0))
+    ).settings.aperture
 
 
 def _shared(values: object) -> float | None:
@@ -628,13 +577,6 @@ def filled_aspect(model: LensModel) -> float:
         aspect: share for aspect, share in shares.items() if share.max() <= 1.0 and share.min() > _FILLED
     }
     return min(inside, key=lambda a: abs(float(np.diff(inside[a])[0])), default=DEFAULT_ASPECT)
-
-
-def _height(model: LensModel, aspect: float) -> int | None:
-    """Height of the photos by their half diagonals, where the samples know and agree."""
-    half = _shared(s.half_diagonal_px for s in model.samples)
-    long = max(aspect, 1.0 / aspect)
-    return None if half is None else round(2.0 * half / math.hypot(long, 1.0))
 
 
 def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
@@ -661,11 +603,6 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
     )
 
 
-def _mean_in(zone: Zone, positions: Sequence[FieldPosition], values: Sequence[float]) -> float:
-    own = [value for place, value in zip(positions, values, strict=True) if zone_of(place.r) == zone]
-    return float(np.mean(own)) if own else math.nan
-
-
 @dataclass(frozen=True, slots=True)
 class Side:
     """One of two that are compared: what to call it, what was found, and what that rests on."""
@@ -676,28 +613,6 @@ class Side:
 
 
 @dataclass(frozen=True, slots=True)
-class ZoneChange:
-    """How the second differs from the first in one zone: MTF50 in cycles/pixel."""
-
-    zone: Zone
-    first: float
-    second: float
-
-    @property
-    def share(self) -> float:
-        """Difference over the first."""
-        return (self.second - self.first) / self.first
-
-    @property
-    def words(self) -> str:
-        """The same for people."""
-        place = _ZONE_WORDS[self.zone]
-        if abs(self.share) < _ALIKE:
-            return f"about the same {place}"
-        return f"{abs(self.share):.0%} {'sharper' if self.share > 0 else 'softer'} {place}"
-
-
-@dataclass(frozen=True, slots=True)
 class Comparison:
     """Two copies of a lens, or two apertures of one, side by side."""
 
@@ -705,16 +620,22 @@ class Comparison:
     second: Side
 
     @property
-    def zones(self) -> tuple[ZoneChange, ...]:
-        """How the second differs from the first, from the centre outwards."""
+    def changes(self) -> dict[Zone, float]:
+        """Difference of MTF50 over the first, from the centre outwards."""
         one, two = self.first.found.zones, self.second.found.zones
-        return tuple(ZoneChange(zone, one[zone], two[zone]) for zone in ZONES)
+        return {zone: (two[zone] - one[zone]) / one[zone] for zone in ZONES}
 
     @property
     def verdict(self) -> str:
         """The difference as one sentence."""
-        *some, last = (change.words for change in self.zones)
+        *some, last = (_change_in_words(zone, share) for zone, share in self.changes.items())
         return f"Compared with {self.first.name}, {self.second.name} is {', '.join(some)} and {last}."
+
+
+def _change_in_words(zone: Zone, share: float) -> str:
+    if abs(share) < _ALIKE:
+        return f"about the same {_ZONE_WORDS[zone]}"
+    return f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'} {_ZONE_WORDS[zone]}"
 
 
 def compare(first: Side, second: Side) -> Comparison:

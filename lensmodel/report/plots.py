@@ -22,7 +22,6 @@ from lensmodel.report.lens_report import (
     Curve,
     LateralColourCurve,
     LensReport,
-    SensorGeometry,
     Unit,
 )
 
@@ -32,6 +31,7 @@ try:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure, SubFigure
+    from matplotlib.image import AxesImage
     from matplotlib.patches import Circle, Rectangle
     from matplotlib.ticker import MaxNLocator
 except ModuleNotFoundError as error:
@@ -43,6 +43,7 @@ _SHARPNESS: Final = LinearSegmentedColormap.from_list(
     "sharpness", [(0.0, "#7f1d1d"), (0.35, "#fdf6e3"), (0.7, "#0b6e99"), (1.0, "#083d56")]
 )
 _CHANGES: Final = LinearSegmentedColormap.from_list("changes", ["#7f1d1d", "#fdf6e3", "#0b6e99"])
+_BLACK, _GREY = "#191a1c", "#55585d"
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
 _CHANNELS: Final[dict[Channel, tuple[str, str]]] = {
     "r": ("red", "#c2410c"),
@@ -128,9 +129,8 @@ def error_history(versions: Sequence[int], errors: Mapping[Zone, Sequence[float 
 
     def draw(ax: Axes) -> None:
         for ink, (zone, shares) in zip(_INKS, errors.items(), strict=False):
-            ax.plot(
-                versions, [math.nan if e is None else 100.0 * e for e in shares], "o-", color=ink, label=zone
-            )
+            percent = [math.nan if share is None else 100.0 * share for share in shares]
+            ax.plot(versions, percent, "o-", color=ink, label=zone)
         ax.set(xlabel="version of the lens", ylabel="error, %")
         ax.set_ylim(bottom=0.0)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -143,51 +143,85 @@ def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     drawn = [_photographer(report)]
     for number in report.apertures:
-        found = report.at(number)
-        panels = _panels(report, found, "c/px")
-        for first in range(0, len(panels), _A_PAGE):
-            figure, top = _page(report.name, "")
-            _placed(figure, top, panels[first : first + _A_PAGE])
-            drawn.append(figure)
+        panels = _panels(report, report.at(number), "c/px")
+        drawn += [_page(report.name, "", panels[k : k + _A_PAGE]) for k in range(0, len(panels), _A_PAGE)]
     return drawn
 
 
 def comparison_page(comparison: Comparison) -> Figure:
     """Draw a comparison on one page."""
     sides = (comparison.first, comparison.second)
-    facts = [f"{side.name}: {side.facts}" for side in sides if side.facts]
-    figure, top = _page(" and ".join(side.name for side in sides), "\n".join([comparison.verdict, *facts]))
-    _placed(figure, top, _compared(comparison))
-    return figure
+    words = [comparison.verdict, *(f"{side.name}: {side.facts}" for side in sides if side.facts)]
+    return _page(" and ".join(side.name for side in sides), "\n".join(words), _compared(comparison))
+
+
+def to_pdf(figures: Iterable[Figure]) -> bytes:
+    """Write figures as the pages of a PDF."""
+    out = io.BytesIO()
+    about = {"CreationDate": None, "Creator": "lensmodel"}
+    with mpl.rc_context(_STYLE), PdfPages(out, metadata=about) as pdf:
+        for figure in figures:
+            pdf.savefig(figure)
+    return out.getvalue()
+
+
+def to_png(figure: Figure) -> bytes:
+    """Write a figure as PNG."""
+    out = io.BytesIO()
+    with mpl.rc_context(_STYLE):
+        figure.savefig(out, format="png", dpi=_DOTS)
+    return out.getvalue()
+
+
+# --- what stands where --------------------------------------------------------------------------
+
+
+def _simple(report: LensReport) -> list[Panel]:
+    """What a photographer is shown."""
+    found = report.tested[0]
+    at = f", {found.at}" if found.at else ""
+    hatched = " (hatched: not known)" if found.unknown_share else ""
+    return [
+        (f"Sharpness over the picture{at}: MTF50, mean of T and S{hatched}", _on(_overview, found)),
+        ("What becomes of a point of light in the centre and the corners", lambda on: _points(on, found)),
+    ]
 
 
 def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
+    """What a tester is shown of one aperture."""
     at = f", {found.at}" if found.at else ""
-    panels: list[Panel] = [(f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor, unit))]
-    panels += [
-        (f"How far off MTF50 may be, in percent{at}", _on(error_map, found)),
+    panels: list[Panel] = [
+        (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.factor(unit) or 1.0)),
+        (f"How far off MTF50 may be, in percent{at}", _on(_error_map, found)),
         (
             f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
-            _on(contrast, found),
+            _on(_contrast, [(curve.name, found, curve) for curve in found.curves]),
         ),
-        (f"Contrast by colour{at}", _on(colours, report, found.settings.aperture)),
-        (f"Centring{at}", _on(side_softer, found)),
+        (f"Contrast by colour{at}", _on(_colours, report, found.settings.aperture)),
+        (f"Centring{at}", _on(_side_softer, found)),
     ]
     if len(report.apertures) > 1:
-        panels.append(("MTF50 by aperture", _on(over_apertures, report, unit)))
+        panels.append(("MTF50 by aperture", _on(_over_apertures, report, unit)))
     if report.lateral is not None:
-        panels.append(("Lateral colour", _on(lateral_colour, report.lateral)))
+        panels.append(("Lateral colour", _on(_lateral_colour, report.lateral)))
     return panels
 
 
 def _compared(comparison: Comparison) -> list[Panel]:
+    """Two lenses beside each other, at the lowest and the highest frequency that both have."""
+    first, second = comparison.first, comparison.second
+    one, two = first.found, second.found
+    shared = [(a, b) for a in one.curves for b in two.curves if a.name == b.name]
+    pairs = shared or [(one.curves[0], two.curves[0])]
     panels: list[Panel] = [
-        ("Contrast of coarse detail", _on(both_contrasts, comparison, 0)),
-        ("Contrast of fine detail", _on(both_contrasts, comparison, -1)),
+        (
+            f"Contrast of {detail} detail, {a.name}",
+            _on(_contrast, [(first.name, one, a), (second.name, two, b)]),
+        )
+        for detail, (a, b) in (("coarse", pairs[0]), ("fine", pairs[-1]))
     ]
-    one, two = comparison.first.found, comparison.second.found
     if (one.rows, one.cols) == (two.rows, two.cols):
-        panels.append(("Difference of MTF50, cycles/pixel", _on(difference, comparison)))
+        panels.append(("Difference of MTF50, cycles/pixel", _on(_difference, comparison)))
     return panels
 
 
@@ -211,65 +245,94 @@ def _titled(place: Place, panel: Panel) -> None:
     draw(place)
 
 
-def _page(title: str, words: str, size: float = 8.5, ink: str = "#55585d") -> tuple[Figure, float]:
-    """Begin a page; returns the height of the end of its words too."""
-    figure = Figure(figsize=_PAGE)
-    top = _written(figure, 0.97, title, 15.0, "#191a1c", "bold")
-    return figure, _written(figure, top - 0.008, words, size, ink)
+def _page(title: str, words: str, panels: Sequence[Panel]) -> Figure:
+    """Panels below each other, as many to a page whatever their number."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=_PAGE)
+        top = _written(figure, 0.97, title, 15.0, weight="bold")
+        top = _written(figure, top, words, 8.5, _GREY)
+        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, top - 0.03))
+        for place, panel in zip(_parts(figure, [1.0] * _A_PAGE), panels, strict=False):
+            _titled(place, panel)
+    return figure
 
 
-def _written(figure: Figure, top: float, words: str, size: float, ink: str, weight: str = "normal") -> float:
-    """Write lines from a height on down, as wide as a page; return the height of their end."""
+def _photographer(report: LensReport) -> Figure:
+    """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=_PAGE)
+        top = _written(figure, 0.97, report.name, 15.0, weight="bold")
+        top = _written(figure, top, report.verdict, 11.0)
+        below = _written(figure, 0.25, EXPLAINED, 9.0)
+        below = _written(figure, below, report.advice, 11.0)
+        _written(figure, below, "\n".join(report.notes), 8.5, _GREY)
+        figure.set_layout_engine("constrained", rect=(0.06, 0.26, 0.88, top - 0.28), h_pad=0.08)
+        for place, panel in zip(_parts(figure, [2.6, 1.0]), _simple(report), strict=True):
+            _titled(place, panel)
+    return figure
+
+
+def _parts(figure: Figure, heights: Sequence[float]) -> list[Place]:
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
+    return list(parts)
+
+
+def _written(
+    figure: Figure, top: float, words: str, size: float, ink: str = _BLACK, weight: str = "normal"
+) -> float:
+    """Write lines as wide as a page from a height on down; return the height where the next begin."""
     wide = round(_LETTERS_OF_A_LINE / size)
     lines = [part for line in words.split("\n") for part in textwrap.wrap(line, wide) or [""]]
     figure.text(_LEFT, top, "\n".join(lines), fontsize=size, color=ink, weight=weight, va="top")
-    return top - len(lines) * 1.25 * size / 72.0 / _PAGE[1]
+    return top - len(lines) * 1.25 * size / 72.0 / _PAGE[1] - 0.01
 
 
-def _placed(figure: Figure, top: float, panels: Sequence[Panel]) -> None:
-    """Draw panels below each other, as many to a page whatever their number."""
-    with mpl.rc_context(_STYLE):
-        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, top - 0.03))
-        places: Any = figure.subfigures(_A_PAGE, 1)
-        for place, panel in zip(places, panels, strict=False):
-            _titled(place, panel)
+# --- maps ---------------------------------------------------------------------------------------
 
 
-def to_pdf(figures: Iterable[Figure]) -> bytes:
-    """Write figures as the pages of a PDF."""
-    out = io.BytesIO()
-    with (
-        mpl.rc_context(_STYLE),
-        PdfPages(out, metadata={"CreationDate": None, "Creator": "lensmodel"}) as pdf,
-    ):
-        for figure in figures:
-            pdf.savefig(figure)
-    return out.getvalue()
+def _overview(ax: Axes, found: ApertureReport) -> None:
+    """Mean MTF50 over the picture, with a scale in words."""
+    image = _sharpness_map(ax, found, [spot.mean for spot in found.map])
+    scale = ax.figure.colorbar(image, ax=ax, location="bottom", fraction=0.05, aspect=50)
+    scale.set_ticks([0.02, 0.25, 0.43], labels=["soft", ".25", "as sharp as a sensor can show"])
 
 
-def to_png(figure: Figure) -> bytes:
-    """Write a figure as PNG."""
-    out = io.BytesIO()
-    with mpl.rc_context(_STYLE):
-        figure.savefig(out, format="png", dpi=_DOTS)
-    return out.getvalue()
+def _maps(place: Place, found: ApertureReport, factor: float) -> None:
+    """Tangential and sagittal MTF50 on one scale."""
+    axes = place.subplots(1, 2)
+    _sharpness_map(axes[0], found, [spot.tangential for spot in found.map], factor)
+    image = _sharpness_map(axes[1], found, [spot.sagittal for spot in found.map], factor)
+    axes[0].set_xlabel("tangential (T)")
+    axes[1].set_xlabel("sagittal (S)")
+    scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
+    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, NYQUIST * factor)
+    ticks = [tick / factor for tick in round_ticks if tick <= NYQUIST * factor]
+    scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
 
 
-# --- single axes ------------------------------------------------------------------------------
-
-
-def sharpness_map(ax: Axes, found: ApertureReport, values: Sequence[float], *, factor: float = 1.0) -> Any:  # noqa: ANN401 - an image of matplotlib, which colour bars take
-    """Draw a map of MTF50; places of which too little is known are hatched."""
-    shown = np.clip(values, 0.0, NYQUIST)
+def _sharpness_map(
+    ax: Axes, found: ApertureReport, values: Sequence[float], factor: float = 1.0
+) -> AxesImage:
+    """MTF50 at each place; where too little is known it is hatched."""
     words = [(">" if v >= NYQUIST else "") + _number(min(v, NYQUIST), factor) for v in values]
-    return _map(ax, found, shown, words, _SHARPNESS, (0.0, NYQUIST), found.unknown)
+    hatched = [spot.unknown for spot in found.map]
+    return _map(ax, found, np.clip(values, 0.0, NYQUIST), words, _SHARPNESS, (0.0, NYQUIST), hatched)
 
 
-def error_map(ax: Axes, found: ApertureReport) -> None:
-    """Draw by how much MTF50 may be off at each place, in percent."""
-    shown = np.array(found.give_or_take)
-    words = [f"{100.0 * share:.0f}" for share in shown]
-    _map(ax, found, np.minimum(shown, 1.0), words, "Greys", (0.0, 1.0))
+def _error_map(ax: Axes, found: ApertureReport) -> None:
+    """By how much MTF50 may be off at each place, in percent."""
+    shares = np.array([spot.give_or_take for spot in found.map])
+    words = [f"{100.0 * share:.0f}" for share in shares]
+    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0))
+
+
+def _difference(ax: Axes, comparison: Comparison) -> None:
+    """MTF50 of the second less that of the first."""
+    one, two = ([spot.mean for spot in s.found.map] for s in (comparison.first, comparison.second))
+    values = np.subtract(two, one)
+    top = max(0.02, float(np.abs(values).max()))
+    _map(ax, comparison.first.found, values, [f"{v:+.2f}" for v in values], _CHANGES, (-top, top))
+    ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 
 def _map(
@@ -279,8 +342,8 @@ def _map(
     words: Sequence[str],
     colours: LinearSegmentedColormap | str,
     ends: tuple[float, float],
-    hatched: Sequence[bool] = (),
-) -> Any:  # noqa: ANN401 - as above
+    hatched: Sequence[bool] | None = None,
+) -> AxesImage:
     """Draw a value at each place of a report as a cell with its figure."""
     ax.grid(visible=False)
     ax.set(xticks=[], yticks=[])
@@ -293,11 +356,11 @@ def _map(
     for i, (word, value) in enumerate(zip(words, values, strict=True)):
         row, col = divmod(i, found.cols)
         left, low, pale = col * wide, 1.0 - (row + 1) * high, True
-        if any(hatched[i : i + 1]):
+        if hatched is not None and hatched[i]:
             ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
         else:
             pale = np.dot(image.to_rgba(value)[:3], _LUMA) > _PALE
-        ax.text(left + wide / 2, low + high / 2, word, color="#131416" if pale else "#ffffff", **_IN_CELL)
+        ax.text(left + wide / 2, low + high / 2, word, color=_BLACK if pale else "#ffffff", **_IN_CELL)
     return image
 
 
@@ -307,89 +370,84 @@ def _number(value: float, factor: float) -> str:
     return f"{value:.3f}" if 0.0 < value < 0.02 else f"{value:.2f}".removeprefix("0")
 
 
-def contrast(ax: Axes, found: ApertureReport) -> None:
-    """Draw contrast over the radius: sagittal solid, tangential dashed."""
-    for ink, curve in zip(_INKS, found.curves, strict=False):
-        _both_ways(ax, found.radii, curve, curve.name, ink)
+# --- curves and pictures ------------------------------------------------------------------------
+
+
+def _points(place: Place, found: ApertureReport) -> None:
+    """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
+    kernels = [np.array(spot.kernel) for spot in found.spots]
+    middle = len(kernels[0]) // 2
+    bright = [np.abs(np.argwhere(kernel > _SEEN * kernel.max()) - middle).max() for kernel in kernels]
+    half = min(max(_LEAST_HALF, *bright), middle)
+    near = slice(middle - half, middle + half + 1)
+    for ax, spot, kernel in zip(place.subplots(1, len(kernels)), found.spots, kernels, strict=True):
+        ax.imshow(kernel[near, near], cmap="gray", vmin=0.0)
+        name = spot.side + (" (not known)" if spot.unknown else "")
+        weight = "bold" if spot is found.worst else "normal"
+        ax.set_title(name, fontsize=8.5, weight=weight, loc="center")
+        ax.set(xticks=[], yticks=[])
+        ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
+        ax.grid(visible=False)
+
+
+def _contrast(ax: Axes, curves: Sequence[tuple[str, ApertureReport, Curve]]) -> None:
+    """Contrast over the radius by name: sagittal solid, tangential dashed."""
+    for ink, (name, found, curve) in zip(_INKS, curves, strict=False):
+        ax.plot(found.radii, curve.sagittal, color=ink, ls="-", label=f"{name} S")
+        ax.plot(found.radii, curve.tangential, color=ink, ls="--", label=f"{name} T")
     _radial(ax, "contrast", 1.0)
 
 
-def _both_ways(ax: Axes, radii: Sequence[float], curve: Curve, name: str, ink: str) -> None:
-    ax.plot(radii, curve.sagittal, color=ink, ls="-", label=f"{name} S")
-    ax.plot(radii, curve.tangential, color=ink, ls="--", label=f"{name} T")
-
-
-def colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
-    """Draw contrast of red, green and blue over the radius, mean of tangential and sagittal."""
+def _colours(ax: Axes, report: LensReport, aperture: float | None) -> None:
+    """Contrast of red, green and blue over the radius, mean of tangential and sagittal."""
     for found in (one for one in report.tested if one.settings.aperture == aperture):
         name, ink = _CHANNELS[found.settings.channel]
         curve = found.curves[min(1, len(found.curves) - 1)]
-        both = [(t + s) / 2.0 for t, s in zip(curve.tangential, curve.sagittal, strict=True)]
+        both = np.mean([curve.tangential, curve.sagittal], axis=0)
         ax.plot(found.radii, both, color=ink, label=f"{name}, {curve.name}")
     _radial(ax, "contrast", 1.0)
 
 
-def side_softer(ax: Axes, found: ApertureReport) -> None:
-    """Draw towards which side the lens is softer, with the circle of two standard errors."""
+def _side_softer(ax: Axes, found: ApertureReport) -> None:
+    """Towards which side the lens is softer, with the circle of two standard errors."""
     ax.grid(visible=False)
     ax.set_aspect("equal")
     ax.set(xlim=(-found.aspect, found.aspect), ylim=(-1.0, 1.0), xticks=[], yticks=[])
     ax.spines[["top", "right"]].set_visible(True)
-    ax.plot(0.0, 0.0, "+", color="#55585d", ms=12)
+    ax.plot(0.0, 0.0, "+", color=_GREY, ms=12)
     softer = found.centring.softer
-    if softer is not None and softer.error < 1.0:
-        scale = 1.0 / math.log(2.0)  # sides that differ by a factor of two reach the edge
-        x, y = (scale * softer.amount * f(softer.direction) for f in (math.cos, math.sin))
-        ax.add_patch(Circle((x, y), 2.0 * scale * softer.error, color=_INKS[0], alpha=0.2))
-        ax.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": _INKS[1], "lw": 2.0})
-        ax.set_xlabel(
-            "arrow: to the softer side; circle: two standard errors; certain where the cross lies outside it"
-        )
-    else:
+    if softer is None or softer.error >= 1.0:
         ax.set_xlabel("too little is known to say")
+        return
+    scale = 1.0 / math.log(2.0)  # sides that differ by a factor of two reach the edge
+    x, y = (scale * softer.amount * f(softer.direction) for f in (math.cos, math.sin))
+    ax.add_patch(Circle((x, y), 2.0 * scale * softer.error, color=_INKS[0], alpha=0.2))
+    ax.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": _INKS[1], "lw": 2.0})
+    ax.set_xlabel(
+        "arrow: to the softer side; circle: two standard errors; certain where the cross lies outside it"
+    )
 
 
-def over_apertures(ax: Axes, report: LensReport, unit: Unit = "c/px") -> None:
-    """Draw MTF50 of the centre and of each corner by aperture."""
-    known = [
-        one for one in report.tested if one.settings.channel == "g" and one.settings.aperture is not None
-    ]
-    stops = range(len(known))
+def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
+    """MTF50 of the centre and of each corner by aperture."""
+    known = [one for one in report.tested if one.settings.channel == "g" and one.at]
     factor = report.sensor.factor(unit) or 1.0
     for k, spot in enumerate(known[0].spots):
         values = [factor * one.spots[k].mean for one in known]
-        ax.plot(stops, values, "o-", label=spot.side.removeprefix("the "), lw=2.5 if k == 0 else 1.2)
-    ax.set_xticks(list(stops), [one.at for one in known])
+        ax.plot(values, "o-", label=spot.side, lw=2.5 if k == 0 else 1.2)
+    ax.set_xticks(range(len(known)), [one.at for one in known])
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel(f"MTF50, {_UNITS[unit]}")
     _legend(ax)
 
 
-def lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
-    """Draw by how much red and blue images lie outwards of the green one."""
+def _lateral_colour(ax: Axes, shift: LateralColourCurve) -> None:
+    """By how much red and blue images lie outwards of the green one."""
     ax.plot(shift.radii, shift.red, color=_CHANNELS["r"][1], label="red")
     ax.plot(shift.radii, shift.blue, color=_CHANNELS["b"][1], label="blue")
     ax.axhline(0.0, color=_CHANNELS["g"][1], lw=0.8)
     reach = 1.2 * max(0.1, *(abs(v) for v in (*shift.red, *shift.blue)))
     _radial(ax, "pixels outwards of green", reach, low=-reach)
-
-
-def both_contrasts(ax: Axes, comparison: Comparison, which: int) -> None:
-    """Draw contrast of two lenses at the lowest (0) or highest (-1) frequency that both have."""
-    one, two = comparison.first.found.curves, comparison.second.found.curves
-    pairs = [(a, b) for a in one for b in two if a.name == b.name] or [(one[0], two[0])]
-    for ink, side, curve in zip(_INKS, (comparison.first, comparison.second), pairs[which], strict=False):
-        _both_ways(ax, side.found.radii, curve, side.name, ink)
-    _radial(ax, f"contrast at {pairs[which][0].name}", 1.0)
-
-
-def difference(ax: Axes, comparison: Comparison) -> None:
-    """Draw MTF50 of the second less that of the first."""
-    one, two = comparison.first.found, comparison.second.found
-    values = np.array(two.mean) - np.array(one.mean)
-    top = max(0.02, float(np.abs(values).max()))
-    _map(ax, one, values, [f"{value:+.2f}" for value in values], _CHANGES, (-top, top))
-    ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 
 def _legend(ax: Axes) -> None:
@@ -403,74 +461,3 @@ def _radial(ax: Axes, words: str, top: float, low: float = 0.0) -> None:
     ax.set(xlim=(0.0, 1.0), ylim=(low, top), ylabel=words)
     ax.set_xlabel("0 centre, 1 corner", loc="right")
     _legend(ax)
-
-
-# --- pages ------------------------------------------------------------------------------------
-
-
-def _maps(place: Place, found: ApertureReport, sensor: SensorGeometry, unit: Unit) -> None:
-    """Tangential and sagittal MTF50 on one scale."""
-    factor = sensor.factor(unit) or 1.0
-    axes = place.subplots(1, 2)
-    for ax, name, values in zip(
-        axes, ("tangential (T)", "sagittal (S)"), (found.tangential, found.sagittal), strict=True
-    ):
-        image = sharpness_map(ax, found, values, factor=factor)
-        ax.set_xlabel(name)
-    scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
-    round_ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, NYQUIST * factor)
-    ticks = [tick / factor for tick in round_ticks if tick <= NYQUIST * factor]
-    scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
-
-
-def _overview(ax: Axes, found: ApertureReport) -> None:
-    """Mean MTF50 over the picture, with a scale in words."""
-    image = sharpness_map(ax, found, found.mean)
-    scale = ax.figure.colorbar(image, ax=ax, location="bottom", fraction=0.05, aspect=50)
-    scale.set_ticks([0.02, 0.25, 0.43], labels=["soft", ".25", "as sharp as a sensor can show"])
-
-
-def _points(place: Place, found: ApertureReport) -> None:
-    """What becomes of a point in the centre and in each corner; the worst one's name is bold."""
-    kernels = [np.array(spot.kernel) for spot in found.spots]
-    cut = min(_dark_rim(kernel) for kernel in kernels)
-    for ax, spot, kernel in zip(place.subplots(1, len(kernels)), found.spots, kernels, strict=True):
-        ax.imshow(kernel[cut : len(kernel) - cut, cut : len(kernel) - cut], cmap="gray", vmin=0.0)
-        weight = "bold" if spot is found.worst else "normal"
-        name = spot.side.removeprefix("the ") + (" (not known)" if spot.unknown else "")
-        ax.set_title(name, fontsize=8.5, weight=weight, loc="center")
-        ax.set(xticks=[], yticks=[])
-        ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
-        ax.grid(visible=False)
-
-
-def _dark_rim(kernel: NDArray[np.float64]) -> int:
-    """Pixels around a kernel that are too dark to be seen; a few are always left in the middle."""
-    rows, cols = np.nonzero(kernel > _SEEN * kernel.max())
-    middle = len(kernel) // 2
-    return middle - max(_LEAST_HALF, *np.abs(rows - middle), *np.abs(cols - middle))
-
-
-def _simple(report: LensReport) -> list[Panel]:
-    """What a photographer is shown."""
-    found = report.tested[0]
-    words = f"Sharpness over the picture{', ' + found.at if found.at else ''}"
-    hatched = " (hatched: not known)" if any(found.unknown) else ""
-    return [
-        (f"{words}: MTF50, mean of T and S{hatched}", _on(_overview, found)),
-        ("What becomes of a point of light in the centre and the corners", lambda on: _points(on, found)),
-    ]
-
-
-def _photographer(report: LensReport) -> Figure:
-    """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
-    with mpl.rc_context(_STYLE):
-        figure, top = _page(report.name, report.verdict, size=11.0, ink="#191a1c")
-        below = _written(figure, 0.25, EXPLAINED, 9.0, "#191a1c")
-        below = _written(figure, below - 0.012, report.advice, 11.0, "#191a1c")
-        _written(figure, below - 0.012, "\n".join(report.notes), 8.5, "#55585d")
-        figure.set_layout_engine("constrained", rect=(0.06, 0.26, 0.88, top - 0.28), h_pad=0.08)
-        places: Any = figure.subfigures(2, 1, height_ratios=(2.6, 1.0))
-        for place, panel in zip(places, _simple(report), strict=True):
-            _titled(place, panel)
-    return figure

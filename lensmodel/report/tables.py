@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, TypeAlias
 
-from lensmodel.core.types import FieldPosition
-from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport, Range
+from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
-    *("direction", "value", "low", "high", "unit", "predicted_error", "extrapolated"),
+    *("direction", "value", "low", "high", "unit", "predicted_error", "unknown"),
 )
+_Row: TypeAlias = dict[str, str | float | None]
 
 
 def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
@@ -37,65 +37,42 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
 
 
 def to_csv(report: LensReport) -> str:
-    """Write a report as CSV: MTF50 over the picture, contrast by radius, widths, lateral colour."""
+    """Write a report as CSV: MTF50 over the picture, contrast by radius, lateral colour; a line a figure."""
     out = io.StringIO()
     writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
     writer.writeheader()
-    for found in report.tested:
-        known = {"aperture": _number(found.settings.aperture), "channel": found.settings.channel}
-        writer.writerows(known | row for row in _rows(found))
+    rows = [row for found in report.tested for row in _rows(found)]
     if report.lateral is not None:
         for channel, values in (("r", report.lateral.red), ("b", report.lateral.blue)):
-            for r, value in zip(report.lateral.radii, values, strict=True):
-                known = {"quantity": "lateral colour", "channel": channel, "unit": "px"}
-                writer.writerow(known | {"r": _number(r), "value": _number(value)})
+            rows += [
+                {"quantity": "lateral colour", "channel": channel, "unit": "px", "r": r, "value": value}
+                for r, value in zip(report.lateral.radii, values, strict=True)
+            ]
+    for row in rows:
+        writer.writerow(
+            {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items() if v is not None}
+        )
     return out.getvalue()
 
 
-def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
+def _rows(found: ApertureReport) -> Iterator[_Row]:
+    """What was found at one aperture in one colour, as figures with what is known of each."""
+    known: _Row = {"aperture": found.settings.aperture, "channel": found.settings.channel}
     for zone, value in found.zones.items():
-        yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": "c/px"}
-    for spot in (*found.spots, *found.sides):
-        own = {"quantity": f"MTF50 at {spot.place}"} | _at(spot.position)
-        own |= {"predicted_error": _number(spot.predicted_error)}
-        yield own | {"direction": "tangential"} | _figure(spot.tangential, spot.tangential_range)
-        yield own | {"direction": "sagittal"} | _figure(spot.sagittal, spot.sagittal_range)
-    for direction, values, ranges in (
-        ("tangential", found.tangential, found.tangential_range),
-        ("sagittal", found.sagittal, found.sagittal_range),
-    ):
-        for i, (place, value, between) in enumerate(zip(found.positions, values, ranges, strict=True)):
-            row, col = divmod(i, found.cols)
-            yield (
-                _at(place)
-                | _figure(value, between)
-                | {
-                    "quantity": "MTF50",
-                    "direction": direction,
-                    "row": str(row),
-                    "col": str(col),
-                    "predicted_error": _number(found.predicted_error[i]),
-                    "extrapolated": str(int(found.extrapolated[i])),
-                }
-            )
+        yield known | {"quantity": f"MTF50, mean of {zone}", "value": value, "unit": "c/px"}
+    cells = [(divmod(i, found.cols), spot) for i, spot in enumerate(found.map)]
+    spots = [(known | {"quantity": f"MTF50 at {s.place}"}, s) for s in (*found.spots, *found.sides)]
+    spots += [(known | {"quantity": "MTF50", "row": row, "col": col}, s) for (row, col), s in cells]
+    for own, spot in spots:
+        own |= {"r": spot.position.r, "phi": spot.position.phi, "unit": "c/px", "unknown": int(spot.unknown)}
+        own |= {"predicted_error": spot.predicted_error}
+        for direction, value, (low, high) in (
+            ("tangential", spot.tangential, spot.tangential_range),
+            ("sagittal", spot.sagittal, spot.sagittal_range),
+        ):
+            yield own | {"direction": direction, "value": value, "low": low, "high": high}
     for curve in found.curves:
-        known = {
-            "quantity": "MTF",
-            "frequency_c_px": _number(curve.frequency),
-            "frequency_lp_mm": _number(curve.lp_mm),
-        }
+        own = known | {"quantity": "MTF", "frequency_c_px": curve.frequency, "frequency_lp_mm": curve.lp_mm}
         for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
             for r, value in zip(found.radii, values, strict=True):
-                yield known | {"r": _number(r), "direction": direction, "value": _number(value)}
-
-
-def _at(place: FieldPosition) -> dict[str, str]:
-    return {"r": _number(place.r), "phi": _number(place.phi)}
-
-
-def _figure(value: float, between: Range) -> dict[str, str]:
-    return {"value": _number(value), "low": _number(between[0]), "high": _number(between[1]), "unit": "c/px"}
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"
+                yield own | {"direction": direction, "r": r, "value": value}

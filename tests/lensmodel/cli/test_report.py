@@ -91,7 +91,9 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, g
     with (folder / "out" / "report.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
     found = [row for row in rows if row["aperture"] == "2" and row["direction"] == "sagittal"]
-    assert [float(row["value"]) for row in found] == pytest.approx(stored["tested"][0]["sagittal"], rel=1e-4)
+    assert [float(row["value"]) for row in found] == pytest.approx(
+        [spot["sagittal"] for spot in stored["tested"][0]["map"]], rel=1e-4
+    )
 
 
 def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone: None) -> None:

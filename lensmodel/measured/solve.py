@@ -186,7 +186,9 @@ class _Equations:
         across, b = self.a[n:, :n], self.b[n:]
         by = solved(np.concatenate([across, b[:, None]], axis=1))
         return _Equations(
-            self.a[:n, :n] - across.T @ by[:, :n], self.b[:n] - across.T @ by[:, n], self.power - b @ by[:, n]
+            self.a[:n, :n] - across.T @ by[:, :n],
+            self.b[:n] - across.T @ by[:, n],
+            self.power - float(b @ by[:, n]),
         )
 
 

@@ -29,7 +29,7 @@ from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
-from lensmodel.patches.checks import joined_details, look_at
+from lensmodel.patches.checks import details_of
 from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.patches.select import RMapSelector, first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, measure_blocks, windows_of
@@ -75,12 +75,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
         np.ascontiguousarray(plane[r : r + SIZE, c : c + SIZE])
         for r, c in zip(part.rows, part.cols, strict=True)
     ]
-    looked = joined_details(
-        [
-            look_at(patch, sigma, 1.0, (int(r), int(c)))
-            for patch, r, c in zip(patches, part.rows, part.cols, strict=True)
-        ]
-    )
+    looked = details_of(plane, part, 1.0)
     features, r_map = features_of(part, looked), RMapSelector().score(part, looked)
     for own, score, patch in zip(features, r_map, patches, strict=True):
         try:

@@ -17,8 +17,8 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.geometry import zone_of
-from lensmodel.core.types import FieldPosition, Plane
-from lensmodel.patches.windows import CLIP_SHARE, SLOPE_ORDER, Patch
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane
+from lensmodel.patches.windows import CLIP_SHARE, Patch, Windows, polynomials
 
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
 BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
@@ -80,13 +80,26 @@ def repeats(patch: Plane) -> bool:
     return valley < _REPEATS[0] and peak > _REPEATS[1]
 
 
+def details_of(plane: Plane, windows: Windows, clip: float, coarse: NoiseModel | None = None) -> Details:
+    """Look at windows of a plane; `coarse` is the noise between 0.1 and 0.4 cycles/pixel where it is more."""
+    size, parts = windows.size, []
+    for i, (row, col) in enumerate(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True)):
+        patch = np.array(plane[row : row + size, col : col + size])
+        more = 0.0 if coarse is None else float(np.sqrt(coarse.variance(windows.level[i])))
+        parts.append(look_at(patch, float(windows.sigma[i]), clip, (row, col), more))
+    return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
+
+
 def look_at(
-    patch: Plane, sigma: float, clip: float, corner: tuple[int, int], coarse_sigma: float | None = None
+    patch: Plane, sigma: float, clip: float, corner: tuple[int, int], coarse_sigma: float = 0.0
 ) -> Details:
     """Look at one window."""
     values = np.asarray(patch, dtype=np.float64)
-    power = _power(_detrended(values))
-    noise = max(sigma, coarse_sigma or 0.0) ** 2
+    grids, flat = _grids(values.shape[0]), values.ravel()
+    detrended = (flat - grids.slopes @ (flat @ grids.slopes)).reshape(values.shape)
+    # periodogram under a Hann window, scaled so that white noise gives its variance
+    power = np.square(np.abs(fft.rfft2(detrended * grids.hann))) / float(np.square(grids.hann).sum())
+    noise = max(sigma, coarse_sigma) ** 2
     noise += (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
     return Details(
         information=_information(power, sigma)[None],
@@ -98,59 +111,61 @@ def look_at(
     )
 
 
-def joined_details(parts: list[Details]) -> Details:
-    """Put the entries of several together."""
-    return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grids:
+    """What depends on the side of a window alone."""
 
-
-@lru_cache(maxsize=2)
-def _slopes(size: int) -> NDArray[np.float64]:
-    """Orthonormal polynomials up to `SLOPE_ORDER` over a window, `(size^2, count)`."""
-    t = np.linspace(-1.0, 1.0, size)
-    powers = [(i, j) for i in range(SLOPE_ORDER + 1) for j in range(SLOPE_ORDER + 1 - i)]
-    basis: NDArray[np.float64] = np.linalg.qr(
-        np.stack([np.outer(t**i, t**j).ravel() for i, j in powers], axis=1)
-    )[0]
-    return basis
-
-
-def _detrended(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    basis = _slopes(values.shape[0])
-    flat = values.ravel()
-    return (flat - basis @ (flat @ basis)).reshape(values.shape)
+    slopes: NDArray[np.float64]  # (size^2, count), orthonormal polynomials up to `SLOPE_ORDER`
+    hann: NDArray[np.float64]  # (size, size)
+    # (size, size // 2 + 1), number of the band of either kind and the sector of each frequency, -1 outside
+    bands: NDArray[np.intp]
+    evidence: NDArray[np.intp]
+    gradient: NDArray[np.float64]  # (size, size // 2 + 1), weights of the power of smoothed gradients
+    # of `_near_lags`: the window's own autocorrelation, 1 in the middle, and which lie beyond its core
+    taper: NDArray[np.float64]
+    far: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=4)
-def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
-    """Hann window, |f|² and the band-sector number of each frequency (-1 outside)."""
-    hann = np.hanning(size + 2)[1:-1]
-    window = np.outer(hann, hann)
-    radius, number = _band_sectors(size, BAND_EDGES)
-    return window, (2.0 * np.pi * radius) ** 2, number
-
-
-def _band_sectors(size: int, edges: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Radius of each frequency, and the number of its band and sector (-1 outside)."""
+def _grids(size: int) -> _Grids:
     fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
     radius = np.hypot(fr, fc)
-    band = np.searchsorted(edges, radius, side="right") - 1
     sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
-    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
-    inside = (band >= 0) & (band < len(edges) - 1) & ((fc > 0.0) | (fr > 0.0))
-    return radius, np.where(inside, band * SECTORS + sector, -1)
+
+    def numbers(edges: tuple[float, ...]) -> NDArray[np.intp]:
+        band = np.searchsorted(edges, radius, side="right") - 1
+        # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
+        inside = (band >= 0) & (band < len(edges) - 1) & ((fc > 0.0) | (fr > 0.0))
+        return np.where(inside, band * SECTORS + sector, -1)
+
+    hann = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
+    square = (2.0 * np.pi * radius) ** 2
+    autocorrelation = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(hann))), s=(size, size)))
+    lag = np.hypot(*np.ogrid[-(size // 3) : size // 3 + 1, -(size // 3) : size // 3 + 1])
+    return _Grids(
+        slopes=np.linalg.qr(polynomials(size).reshape(-1, size * size).T)[0],
+        hann=hann,
+        bands=numbers(BAND_EDGES),
+        evidence=numbers(EVIDENCE_EDGES),
+        gradient=square * np.exp(-2.0 * square),
+        taper=_near_lags(autocorrelation) / autocorrelation[size // 2, size // 2],
+        far=lag >= _MAIN_LOBE_PX,
+    )
 
 
-def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Periodogram under a Hann window, scaled so that white noise gives its variance."""
-    window, _, _ = _grids(values.shape[0])
-    return np.square(np.abs(fft.rfft2(values * window))) / float(np.square(window).sum())
+def _near_lags(correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lags up to a third of the window to each side."""
+    middle, reach = len(correlation) // 2, len(correlation) // 3
+    return correlation[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
 
 
-@lru_cache(maxsize=4)
-def _evidence_bins(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Number of band and sector of each frequency (-1 outside), and how many frequencies each holds."""
-    _, number = _band_sectors(size, EVIDENCE_EDGES)
-    return number, np.bincount(number[number >= 0], minlength=(len(EVIDENCE_EDGES) - 1) * SECTORS)
+def _means(
+    power: NDArray[np.float64], number: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Mean power of each band and sector, and how many frequencies each holds."""
+    inside = number >= 0
+    count = np.bincount(number[inside])
+    return np.bincount(number[inside], power[inside]) / np.maximum(count, 1), count
 
 
 def _evidence(power: NDArray[np.float64], noise: float) -> float:
@@ -160,9 +175,7 @@ def _evidence(power: NDArray[np.float64], noise: float) -> float:
     presence of noise", Proc. IRE 37, 1949. A frequency with signal below the noise says next to nothing
     about what the lens did to it, one far above says it well.
     """
-    number, count = _evidence_bins(power.shape[0])
-    inside = number >= 0
-    mean = np.bincount(number[inside], power[inside], count.size) / np.maximum(count, 1)
+    mean, count = _means(power, _grids(power.shape[0]).evidence)
     signal = np.maximum(mean / max(noise, 1e-30) - 1.0, 0.0)
     return float(np.log2(1.0 + signal) @ count / count.sum())
 
@@ -173,27 +186,8 @@ def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64
     If the scene were known, the covariance of a least-squares kernel would be the noise over
     this power, frequency by frequency.
     """
-    _, _, number = _grids(power.shape[0])
-    inside = number >= 0
-    total = np.bincount(number[inside], power[inside], BANDS * SECTORS)
-    count = np.bincount(number[inside], minlength=BANDS * SECTORS)
-    mean = total / np.maximum(count, 1)
+    mean, _ = _means(power, _grids(power.shape[0]).bands)
     return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
-
-
-@lru_cache(maxsize=4)
-def _lags(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Weights of the power of gradients, autocorrelation of the window, and which lags lie beyond its core.
-
-    The last two reach a third of the window to each side; the second is 1 in the middle.
-    """
-    window, square_frequency, _ = _grids(size)
-    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
-    middle, reach = size // 2, size // 3
-    part = slice(middle - reach, middle + reach + 1)
-    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
-    weight = square_frequency * np.exp(-2.0 * square_frequency)
-    return weight, taper[part, part] / taper[middle, middle], lag >= _MAIN_LOBE_PX
 
 
 def _period(power: NDArray[np.float64], sigma: float) -> float:
@@ -204,29 +198,22 @@ def _period(power: NDArray[np.float64], sigma: float) -> float:
     the way from the origin the correlation must fall to half the peak's height.
     """
     size = power.shape[0]
-    weight, taper, far = _lags(size)
-    signal = np.maximum(power - sigma * sigma, 0.0) * weight
+    grids, middle, reach = _grids(size), size // 2, size // 3
+    signal = np.maximum(power - sigma * sigma, 0.0) * grids.gradient
     correlation = fft.fftshift(fft.irfft2(signal, s=(size, size)))
-    middle = size // 2
     if correlation[middle, middle] <= 0.0:
         return 0.0
     # The window's own autocorrelation takes weight from long lags; give it back up to a third.
-    correlation = correlation / correlation[middle, middle]
-    reach = size // 3
-    part = slice(middle - reach, middle + reach + 1)
-    correlation = correlation[part, part] / taper
-    peaks = np.argwhere((correlation == ndimage.maximum_filter(correlation, 3)) & far & (correlation > 0.0))
+    correlation = _near_lags(correlation / correlation[middle, middle]) / grids.taper
+    highest = ndimage.maximum_filter(correlation, 3)
+    peaks = np.argwhere((correlation == highest) & grids.far & (correlation > 0.0))
     heights = correlation[peaks[:, 0], peaks[:, 1]]
-    highest = 0.0
+    t = np.linspace(0.0, 1.0, _ON_THE_WAY)[:, None]
     for at in np.argsort(heights)[::-1][:6]:
-        (row, col), height = peaks[at], float(heights[at])
-        t = np.linspace(0.0, 1.0, _ON_THE_WAY)
-        way = correlation[
-            np.rint(reach + (row - reach) * t).astype(int), np.rint(reach + (col - reach) * t).astype(int)
-        ]
-        if height > highest and float(way.min()) < 0.5 * height:
-            highest = height
-    return min(highest, 1.0)
+        way = np.rint(reach + (peaks[at] - reach) * t).astype(int)
+        if float(correlation[way[:, 0], way[:, 1]].min()) < 0.5 * heights[at]:
+            return min(float(heights[at]), 1.0)
+    return 0.0
 
 
 def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
@@ -247,10 +234,7 @@ def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
 
 
 def _largest_blob(mask: NDArray[np.bool_]) -> int:
-    if not mask.any():
-        return 0
-    labels, _ = ndimage.label(mask)
-    return int(np.bincount(labels.ravel())[1:].max())
+    return int(np.bincount(ndimage.label(mask)[0].ravel())[1:].max(initial=0))
 
 
 def _kurtosis(values: NDArray[np.float64]) -> float:

@@ -139,8 +139,7 @@ def select(
         raise InvalidInputError(f"count must be at least 1, got {count}")
     chooser = selectors.create(selector) if isinstance(selector, str) else selector
     side = _block_side(frame, size)
-    blocks = measure_blocks(plane, noise, side, clip, on_step)
-    windows = windows_of(blocks, frame, noise)
+    windows = windows_of(measure_blocks(plane, noise, side, clip, on_step), frame, noise)
     reasons = first_reasons(windows)
     usable = np.flatnonzero(reasons == "")
     short = usable[spread.shortlist(windows.take(usable), edge_score(windows)[usable], SHORTLIST_A_SECTOR)]
@@ -148,7 +147,7 @@ def select(
     chosen: list[tuple[int, int]] = []
     score = np.zeros(len(windows))
     if short.size:
-        looked = checks.joined_details([_look(plane, windows, int(i), clip, coarse_noise) for i in short])
+        looked = checks.details_of(plane, windows.take(short), clip, coarse_noise)
         reasons[short] = second_reasons(looked)
         fine = reasons[short] == ""
         left = short[fine]
@@ -162,10 +161,14 @@ def select(
     reasons[np.setdiff1d(np.flatnonzero(reasons == ""), taken)] = "duplicate"
     reasons[taken] = ""
     weight = JPEG_WEIGHT if jpeg else 1.0
-    patches = tuple(_patch(windows, i, float(score[i]) * weight, cell) for i, cell in chosen)
+    patches = []
+    for i, cell in chosen:
+        position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
+        corner = int(windows.rows[i]), int(windows.cols[i])
+        patches.append(Patch(*corner, windows.size, position, float(score[i]) * weight, cell))
     counts = Counter(reason for reason in reasons.tolist() if reason)
     logger.info("chose %d of %d windows; rejected: %s", len(patches), len(windows), dict(counts))
-    return Selection(patches, _rejections(windows, reasons))
+    return Selection(tuple(patches), _rejections(windows, reasons))
 
 
 def _block_side(frame: Frame, size: int) -> int:
@@ -184,40 +187,29 @@ def _block_side(frame: Frame, size: int) -> int:
 def first_reasons(windows: Windows) -> NDArray[np.str_]:
     """Reason of each window from block sums alone, the first that holds; empty where none does."""
     small, large = windows.eigenvalues.T
-    tests: list[tuple[Reason, NDArray[np.bool_]]] = [
+    return _first(
         ("border", windows.missing > 0.0),
         ("clipped", windows.clipped > CLIPPED_LIMIT),
         ("dark", windows.dark > DARK_LIMIT),
         ("flat", (windows.contrast < FLAT_CONTRAST) | (large < FLAT_EIGENVALUE)),
         ("one-directional", small < ONE_DIRECTION_RATIO * large),
         ("flat", small < FLAT_EIGENVALUE),
-    ]
-    return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
+    )
 
 
 def second_reasons(looked: Details) -> NDArray[np.str_]:
     """Reason of each window from its own pixels; empty where none holds."""
-    tests: list[tuple[Reason, NDArray[np.bool_]]] = [
+    return _first(
         ("clipped", looked.blob > BLOB_LIMIT),
         ("flat", looked.evidence < EVIDENCE_FLOOR),
         ("periodic", looked.period > PERIOD_LIMIT),
         ("jpeg-blocks", looked.blockiness > BLOCKINESS_LIMIT),
         ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
-    ]
+    )
+
+
+def _first(*tests: tuple[Reason, NDArray[np.bool_]]) -> NDArray[np.str_]:
     return np.select([test for _, test in tests], [reason for reason, _ in tests], default="").astype("U16")
-
-
-def _look(plane: Plane, windows: Windows, i: int, clip: float, coarse: NoiseModel | None) -> Details:
-    row, col, size = int(windows.rows[i]), int(windows.cols[i]), windows.size
-    patch = np.array(plane[row : row + size, col : col + size])
-    level = float(windows.level[i])
-    coarse_sigma = None if coarse is None else float(np.sqrt(coarse.variance(np.array(level))))
-    return checks.look_at(patch, float(windows.sigma[i]), clip, (row, col), coarse_sigma)
-
-
-def _patch(windows: Windows, i: int, score: float, cell: int) -> Patch:
-    position = FieldPosition(min(float(windows.r[i]), 1.0), float(windows.phi[i]))
-    return Patch(int(windows.rows[i]), int(windows.cols[i]), windows.size, position, score, cell)
 
 
 def _rejections(windows: Windows, reasons: NDArray[np.str_]) -> tuple[Rejection, ...]:

@@ -8,8 +8,10 @@ patches.
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import Final, Literal
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +36,9 @@ MOST_STEPS: Final = 4
 """Distances to the nearest seed count in window sides up to this; beyond, the better one wins (chosen)."""
 
 
-def sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ring (of equal width in r) and octant of every window."""
-    ring = np.minimum((windows.r * RINGS).astype(np.intp), RINGS - 1)
-    octant = np.floor(windows.phi * (OCTANTS / (2.0 * math.pi))).astype(np.intp) % OCTANTS
-    return ring, octant
-
-
 def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) -> NDArray[np.intp]:
     """Best windows of every ring and octant that keep half a window's distance from each other."""
-    ring, octant = sector_of(windows)
+    ring, octant = _sector_of(windows)
     room = np.full((RINGS, OCTANTS), most_a_sector)
     chosen: list[int] = []
     free = np.ones(len(windows), dtype=bool)
@@ -56,7 +51,7 @@ def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) 
 
 
 def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
-    """Choose up to `count` windows in field cells.
+    """Choose up to `count` windows in field cells: their numbers, and those of their cells.
 
     First the seeds, one a cell: always from the ring and octant that has the fewest so far, so
     that the corners get their share, far from the other seeds, and there the best. Then
@@ -66,54 +61,57 @@ def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> 
     """
     order = _by_score(windows, score)
     # Half a window's distance between any two chosen; a whole one between the seeds, if there is room.
-    seeds = _seeds(windows, order, math.ceil(count / PATCHES_A_CELL), float(windows.size))
-    cells = [[seed] for seed in seeds]
-    free = _far_from(windows, seeds, windows.size / 2.0)
-    total = len(seeds)
-    for _ in range(MOST_A_CELL - 1):
-        for members in cells:
-            if total >= count:
-                break
-            near = _same_cell(windows, members[0])
-            pick = next((int(i) for i in order if free[i] and near[i]), None)
-            if pick is not None:
-                members.append(pick)
-                free &= _distance(windows, pick) >= windows.size / 2.0
-                total += 1
-    while total < count and free.any():
-        extra = next(int(i) for i in order if free[i])
-        home = next((m for m in cells if len(m) < MOST_A_CELL and _same_cell(windows, m[0])[extra]), None)
+    cells = [[seed] for seed in _seeds(windows, order, math.ceil(count / PATCHES_A_CELL))]
+    free = np.ones(len(windows), dtype=bool)
+    for (seed,) in cells:
+        free &= _distance(windows, seed) >= windows.size / 2.0
+
+    def best(among: NDArray[np.bool_]) -> int | None:
+        found = order[(free & among)[order]]
+        return int(found[0]) if found.size and sum(map(len, cells)) < count else None
+
+    def put(window: int, members: list[int]) -> None:
+        members.append(window)
+        np.logical_and(free, _distance(windows, window) >= windows.size / 2.0, out=free)
+
+    for members in cells * (MOST_A_CELL - 1):
+        window = best(_same_cell(windows, members[0]))
+        if window is not None:
+            put(window, members)
+    while (window := best(free)) is not None:  # one that is near no cell founds its own
+        near = (m for m in cells if len(m) < MOST_A_CELL and _same_cell(windows, m[0])[window])
+        home = next(near, None)
         if home is None:
-            cells.append([extra])
-        else:
-            home.append(extra)
-        free &= _distance(windows, extra) >= windows.size / 2.0
-        total += 1
+            cells.append(home := [])
+        put(window, home)
     return [(i, number) for number, members in enumerate(cells) for i in members]
 
 
-def _seeds(windows: Windows, order: NDArray[np.intp], count: int, distance: float) -> list[int]:
-    ring, octant = sector_of(windows)
+def _seeds(windows: Windows, order: NDArray[np.intp], count: int) -> list[int]:
+    ring, octant = _sector_of(windows)
     # The rings share by area, as far as the photo has anything there: the model needs the corners.
     share = (np.arange(RINGS) + 0.5) * (np.bincount(ring, minlength=RINGS) > 0)
     share /= share.sum()
     in_sector = np.zeros((RINGS, OCTANTS), dtype=np.intp)
     nearest = np.full(len(windows), np.inf)
-    free = np.ones(len(windows), dtype=bool)
     seeds: list[int] = []
-    while len(seeds) < count and free.any():
-        left = order[free[order]]
+    while len(seeds) < count and (nearest >= windows.size).any():
+        left = order[nearest[order] >= windows.size]
         fullness = in_sector.sum(axis=1) / np.maximum(share, 1e-9)
         steps = np.minimum(nearest[left] / (SPREAD_STEP * windows.size), MOST_STEPS).astype(np.intp)
-        key = np.lexsort(
-            (np.arange(left.size), -steps, fullness[ring[left]], in_sector[ring[left], octant[left]])
-        )
-        best = int(left[key[0]])
+        key = np.lexsort((-steps, fullness[ring[left]], in_sector[ring[left], octant[left]]))
+        best = int(left[key[0]])  # of equal ones the first, the best: the sort is stable
         seeds.append(best)
         in_sector[ring[best], octant[best]] += 1
         nearest = np.minimum(nearest, _distance(windows, best))
-        free &= _distance(windows, best) >= distance
     return seeds
+
+
+def _sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Ring (of equal width in r) and octant of every window."""
+    ring = np.minimum((windows.r * RINGS).astype(np.intp), RINGS - 1)
+    octant = np.floor(windows.phi * (OCTANTS / (2.0 * math.pi))).astype(np.intp) % OCTANTS
+    return ring, octant
 
 
 def _by_score(windows: Windows, score: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -121,17 +119,9 @@ def _by_score(windows: Windows, score: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.lexsort((windows.cols, windows.rows, -score))
 
 
-def _distance(windows: Windows, i: int) -> NDArray[np.float64]:
-    return np.maximum(np.abs(windows.rows - windows.rows[i]), np.abs(windows.cols - windows.cols[i])).astype(
-        np.float64
-    )
-
-
-def _far_from(windows: Windows, chosen: list[int], distance: float) -> NDArray[np.bool_]:
-    free = np.ones(len(windows), dtype=bool)
-    for i in chosen:
-        free &= _distance(windows, i) >= distance
-    return free
+def _distance(windows: Windows, i: int) -> NDArray[np.int64]:
+    """Pixels from one window to each, along the axis on which they are farther apart."""
+    return np.maximum(np.abs(windows.rows - windows.rows[i]), np.abs(windows.cols - windows.cols[i]))
 
 
 def _same_cell(windows: Windows, i: int) -> NDArray[np.bool_]:
@@ -157,28 +147,24 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
             f"the photo is {frame.width} x {frame.height} px, a patch needs {size}; "
             "use the photo in its full size"
         )
-    detail, noise, clipped = _blocks(developed)
-    rows, cols = _cells(frame, count, size)
+    ratio, clipped = _blocks(developed)
     patches: list[Patch] = []
     rejected: list[Rejection] = []
-    for row, row_room in rows:
-        for col, col_room in cols:
-            moved = [
-                (
-                    _even(row + a * row_room, frame.height - size),
-                    _even(col + b * col_room, frame.width - size),
-                )
-                for a in _MOVES
-                for b in _MOVES
-            ]
-            looked = [_look(detail, noise, clipped, place, size) for place in dict.fromkeys(moved)]
-            usable = [one for one in looked if one[1] == ""]
-            score, reason, (top, left) = max(usable or looked, key=lambda one: (one[0], one[2]))
-            if reason:
-                rejected.append(Rejection(top, left, size, reason))
-                continue
-            center = (top + (size - 1) / 2.0, left + (size - 1) / 2.0)
-            patches.append(Patch(top, left, size, frame.position(*center), min(score / 3.0, 1.0), 0))
+    for rows, cols in _cells(frame, count, size):
+        looked: list[tuple[bool, float, tuple[int, int], Reason]] = []
+        for top, left in itertools.product(rows, cols):
+            at = round(top / _BLOCK), round(left / _BLOCK)
+            part = tuple(slice(start, start + size // _BLOCK) for start in at)
+            score = float(np.log10(np.maximum(ratio[part], 1.0)).mean())
+            full = float(clipped[part].mean()) > _CLIPPED
+            usable = not full and float(ratio[part].mean()) >= _SIGNAL
+            looked.append((usable, score, (top, left), "clipped" if full else "flat"))
+        usable, score, (top, left), reason = max(looked)
+        if usable:
+            position = frame.position(top + (size - 1) / 2.0, left + (size - 1) / 2.0)
+            patches.append(Patch(top, left, size, position, min(score / 3.0, 1.0), 0))
+        else:
+            rejected.append(Rejection(top, left, size, reason))
     if not patches:
         reasons = sorted({rejection.reason for rejection in rejected})
         raise NoUsablePatchesError(
@@ -188,60 +174,35 @@ def spread_evenly(developed: LinearPhoto, *, count: int, size: int) -> Selection
     return Selection(tuple(patches), tuple(rejected))
 
 
-def _cells(
-    frame: Frame, count: int, size: int
-) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """First rows and columns of windows in the middle of their cells, with the room to either side."""
+def _cells(frame: Frame, count: int, size: int) -> Iterator[tuple[list[int], list[int]]]:
+    """Rows and columns of each equal cell at which a window may begin, of the same colour of a mosaic."""
     most = [max((side - size) // _LEAST_STEP + 1, 1) for side in (frame.height, frame.width)]
     down = min(max(round((count * frame.height / frame.width) ** 0.5), 1), most[0], count)
     across = min(max(count // down, 1), most[1])
 
-    def along(side: int, number: int) -> list[tuple[float, float]]:
-        step = (side - size) / number
-        return [((i + 0.5) * step, 0.5 * step) for i in range(number)]
+    def along(side: int, number: int) -> list[list[int]]:
+        step, last = (side - size) / number, (side - size) // 2 * 2
+        middles = [(i + 0.5) * step for i in range(number)]
+        return [[min(max(2 * round((m + a * 0.5 * step) / 2.0), 0), last) for a in _MOVES] for m in middles]
 
-    return along(frame.height, down), along(frame.width, across)
-
-
-def _even(value: float, most: int) -> int:
-    """Round to a pixel of the same colour as the first of a mosaic."""
-    return min(max(2 * round(value / 2.0), 0), most // 2 * 2)
+    return itertools.product(along(frame.height, down), along(frame.width, across))
 
 
-def _blocks(developed: LinearPhoto) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Power of the gradients of green, that of its noise, and the share of clipped pixels, by block."""
+def _blocks(developed: LinearPhoto) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power of the gradients of green over that of its noise, and the share of clipped pixels, by block."""
     height, width = (side // _BLOCK * _BLOCK for side in (developed.frame.height, developed.frame.width))
     shape = (height // _BLOCK, width // _BLOCK)
-    detail, level, clipped = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    model = developed.coarse_noise[1]
+    detail, level, clipped = np.zeros((3, *shape))
+    half, limits = _BLOCK // 2, np.array([_FULL * clip for clip in developed.clip], dtype=np.float32)
     for index in range(shape[0]):  # strips: a photo may be mapped from a file
         strip = developed.planes[:, index * _BLOCK : (index + 1) * _BLOCK, :width]
-        full = np.zeros(strip.shape[1:], dtype=bool)
-        for plane, clip in zip(strip, developed.clip, strict=True):
-            full |= plane >= _FULL * clip
+        full = (strip >= limits[:, None, None]).any(axis=0)
         green = np.asarray(strip[1, ::2, ::2], dtype=np.float32)
         power = np.zeros_like(green)
         power[:, :-1] += np.diff(green, axis=1) ** 2
         power[:-1] += np.diff(green, axis=0) ** 2
-        half = _BLOCK // 2
         detail[index] = power.reshape(half, -1, half).mean(axis=(0, 2))
         level[index] = green.reshape(half, -1, half).mean(axis=(0, 2))
         clipped[index] = full.reshape(_BLOCK, -1, _BLOCK).mean(axis=(0, 2))
-    return detail, 4.0 * model.variance(level), clipped  # two differences of two values each
-
-
-def _look(
-    detail: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    clipped: NDArray[np.float64],
-    place: tuple[int, int],
-    size: int,
-) -> tuple[float, Reason | Literal[""], tuple[int, int]]:
-    """Mean logarithm of signal over noise of a window's blocks, and why it is not used."""
-    top, left = (round(value / _BLOCK) for value in place)
-    part = (slice(top, top + size // _BLOCK), slice(left, left + size // _BLOCK))
-    ratio = detail[part] / np.maximum(noise[part], 1e-12)
-    score = float(np.log10(np.maximum(ratio, 1.0)).mean())
-    reason: Reason | Literal[""]
-    reason = "clipped" if clipped[part].mean() > _CLIPPED else "flat" if ratio.mean() < _SIGNAL else ""
-    return score, reason, place
+    noise = 4.0 * developed.coarse_noise[1].variance(level)  # two differences of two values each
+    return detail / np.maximum(noise, 1e-12), clipped

@@ -5,10 +5,9 @@ One pass over a plane sums over small blocks, from which any window is put toget
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +92,7 @@ _STRIP_PIXELS = 2_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockSums:
-    """Sums over blocks; every array starts with axes (block row, block column)."""
+    """Sums over blocks; every array but the last starts with axes (block row, block column)."""
 
     side: int  # side of a block in pixels
     row: int  # top-left pixel of block (0, 0)
@@ -104,9 +103,9 @@ class BlockSums:
     level: NDArray[np.float64]  # (n, m), sums of the values and of their squares
     square: NDArray[np.float64]
     # (n, m), pixels above 98 percent of the clip level, below `DARK_SNR`, and not finite
-    clipped: NDArray[np.int64]
-    dark: NDArray[np.int64]
-    missing: NDArray[np.int64]
+    clipped: NDArray[np.float64]
+    dark: NDArray[np.float64]
+    missing: NDArray[np.float64]
     widths: NDArray[np.int64]  # (n, m, WIDTH_BINS), histogram of local edge widths
     # (n, m, ORIENTATIONS, 2), count and sum of squared widths by gradient direction
     width_sums: NDArray[np.float64]
@@ -128,76 +127,73 @@ def measure_blocks(plane: Plane, noise: NoiseModel, side: int, clip: float, on_s
     """
     height, width = plane.shape
     n, m = height // side, width // side
-    row0, col0 = (height - n * side) // 2, (width - m * side) // 2
-    scale = intensity_scale(plane)
-    blocks = BlockSums(
-        side=side,
-        row=row0,
-        col=col0,
-        energy=np.zeros((n, m, ORIENTATIONS, R_BINS), np.float32),
-        tensor=np.zeros((n, m, 3)),
-        level=np.zeros((n, m)),
-        square=np.zeros((n, m)),
-        clipped=np.zeros((n, m), np.int64),
-        dark=np.zeros((n, m), np.int64),
-        missing=np.zeros((n, m), np.int64),
-        widths=np.zeros((n, m, WIDTH_BINS), np.int64),
-        width_sums=np.zeros((n, m, ORIENTATIONS, 2)),
-        histogram=np.zeros((GROUPS, R_BINS), np.int64),
-    )
-    for first, last in _strips(n, max(1, _STRIP_PIXELS // (side * width))):
-        _measure_strip(plane, blocks, slice(first, last), noise=noise, clip=clip, scale=scale)
+    row, col = (height - n * side) // 2, (width - m * side) // 2
+    cols, scale = slice(col, col + m * side), intensity_scale(plane)
+    step = max(1, _STRIP_PIXELS // (side * width))
+    strips = []
+    for first in range(0, n, step):
+        last = min(first + step, n)
+        rows = slice(row + first * side, row + last * side)
+        strips.append(_strip_sums(plane, rows, cols, side, noise=noise, clip=clip, scale=scale))
         on_step(last, n)
-    return blocks
+    histogram = sum(strip.pop("histogram") for strip in strips)
+    joined = {name: np.concatenate([strip[name] for strip in strips]) for name in strips[0]}
+    return BlockSums(side, row, col, **joined, histogram=np.asarray(histogram))
 
 
-def _strips(count: int, step: int) -> Iterator[tuple[int, int]]:
-    for first in range(0, count, step):
-        yield first, min(first + step, count)
-
-
-def _measure_strip(
-    plane: Plane, blocks: BlockSums, rows: slice, *, noise: NoiseModel, clip: float, scale: float
-) -> None:
-    side, m = blocks.side, blocks.level.shape[1]
-    top, bottom = blocks.row + rows.start * side, blocks.row + rows.stop * side
-    above, below = min(_MARGIN, top), min(_MARGIN, plane.shape[0] - bottom)
-    values = np.array(plane[top - above : bottom + below], dtype=np.float32)
+def _strip_sums(
+    plane: Plane, rows: slice, cols: slice, side: int, *, noise: NoiseModel, clip: float, scale: float
+) -> dict[str, NDArray[Any]]:
+    """Sums over the blocks of some rows, by the names of `BlockSums`."""
+    above, below = min(_MARGIN, rows.start), min(_MARGIN, plane.shape[0] - rows.stop)
+    values = np.array(plane[rows.start - above : rows.stop + below], dtype=np.float32)
     finite = np.isfinite(values)
-    if not finite.all():
-        values[~finite] = 0.0
+    values[~finite] = 0.0
     smooth, along_rows, along_cols = smoothed_gradients(values)
     size = np.hypot(along_rows, along_cols)
     r = r_of_gradients(along_rows, along_cols, size, FLAT_WINDOW, scale)
 
-    inner = (slice(above, values.shape[0] - below), slice(blocks.col, blocks.col + m * side))
-    level = values[inner]
-    blocks.missing[rows] = _block_sum(~finite[inner], side)
-    blocks.level[rows] = _block_sum(level, side)
-    blocks.square[rows] = _block_sum(np.square(level, dtype=np.float64), side)
-    blocks.clipped[rows] = _block_sum(level >= CLIP_SHARE * clip, side)
-    blocks.dark[rows] = _block_sum(smooth[inner] < _level_of_snr(noise, DARK_SNR), side)
+    inner = (slice(above, values.shape[0] - below), cols)
+    level, gr, gc, modulus = values[inner], along_rows[inner], along_cols[inner], size[inner]
+    n, m = level.shape[0] // side, level.shape[1] // side
+
+    def block_sum(what: NDArray[np.generic]) -> NDArray[np.float64]:
+        return what.reshape(n, side, m, side).sum(axis=(1, 3), dtype=np.float64)
+
+    def by_bin(
+        at: NDArray[np.intp], bins: NDArray[np.intp], count: int, weights: Plane | None = None
+    ) -> NDArray[Any]:
+        row, col = np.divmod(at, m * side)
+        number = (row // side) * m + col // side
+        return np.bincount(number * count + bins, weights, n * m * count).reshape(n, m, count)
 
     unit = np.sqrt(noise.variance(smooth[inner])).astype(np.float32) * np.float32(gradient_noise(1.0))
-    gr, gc, modulus = along_rows[inner], along_cols[inner], size[inner]
-    at = np.flatnonzero(modulus > EDGE_SIGMAS * unit)
-    where = _block_numbers(at, side, m)
-    gr_at, gc_at = gr.ravel()[at], gc.ravel()[at]
-    orientation = _orientation(gr_at, gc_at)
-    bins = r_bin(r[inner].ravel()[at])
-    power = modulus.ravel()[at] ** 2
-    shape = (rows.stop - rows.start, m)
-    count = shape[0] * m
-    key = (where * ORIENTATIONS + orientation) * R_BINS + bins
-    blocks.energy[rows] = np.bincount(key, power, count * ORIENTATIONS * R_BINS).reshape(
-        *shape, ORIENTATIONS, R_BINS
-    )
-    group = orientation // (ORIENTATIONS // GROUPS) * R_BINS + bins
-    blocks.histogram[:] += np.bincount(group, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS)
-    for i, product in enumerate((gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)):
-        blocks.tensor[rows, :, i] = np.bincount(where, product, count).reshape(shape)
-    ridge = _ridge(along_rows, along_cols, size)[inner] & (modulus > WIDTH_SIGMAS * unit)
-    _measure_widths(blocks, rows, smooth, (gr, gc, modulus), np.flatnonzero(ridge), inner)
+    edges = np.flatnonzero(modulus > EDGE_SIGMAS * unit)
+    gr_at, gc_at = gr.ravel()[edges], gc.ravel()[edges]
+    orientation, r_bins = _orientation(gr_at, gc_at), r_bin(r[inner].ravel()[edges])
+    energy = by_bin(edges, orientation * R_BINS + r_bins, ORIENTATIONS * R_BINS, modulus.ravel()[edges] ** 2)
+    groups = orientation // (ORIENTATIONS // GROUPS) * R_BINS + r_bins
+    products = (gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)
+    none = np.zeros_like(edges)
+
+    ridges = np.flatnonzero(_ridge(along_rows, along_cols, size)[inner] & (modulus > WIDTH_SIGMAS * unit))
+    square = _squared_widths(smooth, inner, modulus, ridges)
+    bins = (np.sqrt(square) / WIDTH_STEP_PX).astype(np.intp)
+    across = _orientation(gr.ravel()[ridges], gc.ravel()[ridges])
+    return {
+        "energy": energy.reshape(n, m, ORIENTATIONS, R_BINS).astype(np.float32),
+        "tensor": np.concatenate([by_bin(edges, none, 1, product) for product in products], axis=2),
+        "level": block_sum(level),
+        "square": block_sum(np.square(level, dtype=np.float64)),
+        "clipped": block_sum(level >= CLIP_SHARE * clip),
+        "dark": block_sum(smooth[inner] < _level_of_snr(noise, DARK_SNR)),
+        "missing": block_sum(~finite[inner]),
+        "widths": by_bin(ridges, bins, WIDTH_BINS),
+        "width_sums": np.stack(
+            [by_bin(ridges, across, ORIENTATIONS, weights) for weights in (None, square)], axis=-1
+        ),
+        "histogram": np.bincount(groups, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS),
+    }
 
 
 def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.bool_]:
@@ -212,15 +208,10 @@ def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.b
     return ridge
 
 
-def _measure_widths(
-    blocks: BlockSums,
-    rows: slice,
-    smooth: Plane,
-    gradients: tuple[Plane, Plane, Plane],
-    at: NDArray[np.intp],
-    inner: tuple[slice, slice],
-) -> None:
-    """Width of the blur at edge ridges by re-blurring.
+def _squared_widths(
+    smooth: Plane, inner: tuple[slice, slice], modulus: Plane, at: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Squared width of the blur at edge ridges by re-blurring.
 
     A step blurred by a Gaussian of s and smoothed by 1 px has its steepest gradient in
     proportion to 1/sqrt(s² + 1); smoothed once more by 1 px, to 1/sqrt(s² + 2). Hence
@@ -231,39 +222,17 @@ def _measure_widths(
     2011, eq. (3) to (5), with the smoothing taken into account. It holds on the ridge of the
     gradient only: `at` are the pixels of the inner part that lie there.
     """
-    gr, gc, modulus = gradients
-    side, m = blocks.side, blocks.level.shape[1]
     again = np.asarray(ndimage.gaussian_filter(smooth, 1.0, truncate=3.0), dtype=np.float32)
     second = np.hypot(*(np.asarray(part)[inner] for part in np.gradient(again)))
     excess = np.square(modulus.ravel()[at] / np.maximum(second.ravel()[at], 1e-12)) - 1.0
     square = 1.0 / np.maximum(excess, 1e-3) - 1.0
-    square = np.clip(square, 0.0, (WIDTH_BINS * WIDTH_STEP_PX) ** 2 - 1e-3)
-    where = _block_numbers(at, side, m)
-    shape = (rows.stop - rows.start, m)
-    count = shape[0] * m
-    key = where * WIDTH_BINS + (np.sqrt(square) / WIDTH_STEP_PX).astype(np.intp)
-    blocks.widths[rows] = np.bincount(key, minlength=count * WIDTH_BINS).reshape(*shape, WIDTH_BINS)
-    key = where * ORIENTATIONS + _orientation(gr.ravel()[at], gc.ravel()[at])
-    for i, weights in enumerate((None, square)):
-        blocks.width_sums[rows, :, :, i] = np.bincount(key, weights, count * ORIENTATIONS).reshape(
-            *shape, ORIENTATIONS
-        )
+    return np.clip(square, 0.0, (WIDTH_BINS * WIDTH_STEP_PX) ** 2 - 1e-3)
 
 
 def _orientation(along_rows: NDArray[np.float32], along_cols: NDArray[np.float32]) -> NDArray[np.intp]:
     """Bin of the gradient's direction over half a turn, 0 = along columns, growing downwards."""
     angle = np.arctan2(along_rows, along_cols) * (ORIENTATIONS / np.pi)
     return np.floor(angle + 0.5).astype(np.intp) % ORIENTATIONS
-
-
-def _block_numbers(at: NDArray[np.intp], side: int, m: int) -> NDArray[np.intp]:
-    row, col = np.divmod(at, m * side)
-    return (row // side) * m + col // side
-
-
-def _block_sum(values: NDArray[np.generic], side: int) -> NDArray[np.float64]:
-    n, m = values.shape[0] // side, values.shape[1] // side
-    return values.reshape(n, side, m, side).sum(axis=(1, 3), dtype=np.float64)
 
 
 def _level_of_snr(noise: NoiseModel, snr: float) -> float:
@@ -334,7 +303,9 @@ def windows_of(blocks: BlockSums, frame: Frame, noise: NoiseModel) -> Windows:
     kept = energy[..., lowest:].sum(axis=-1)
     by_r = energy.sum(axis=1)
     total = np.maximum(by_r.sum(axis=-1), 1e-12)
-    rows, cols = _corners(blocks)
+    down, along = (np.arange(count - BLOCKS_A_SIDE + 1) for count in blocks.level.shape)
+    rows = blocks.row + np.repeat(down, along.size) * blocks.side
+    cols = blocks.col + np.tile(along, down.size) * blocks.side
     half = (size - 1) / 2.0
     r, phi = frame.polar(rows + half, cols + half)
     return Windows(
@@ -360,12 +331,17 @@ def windows_of(blocks: BlockSums, frame: Frame, noise: NoiseModel) -> Windows:
     )
 
 
-def _window_sum(values: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Sum of every square of blocks, windows flattened: `(n, m, ...)` to `(windows, ...)`."""
+def _square_sum(values: NDArray[np.generic], side: int) -> NDArray[np.float64]:
+    """Sum of every square of `side` blocks, `(n, m, ...)` to `(n - side + 1, m - side + 1, ...)`."""
     out = np.asarray(values, dtype=np.float64)
     for axis in (0, 1):
-        view = np.lib.stride_tricks.sliding_window_view(out, BLOCKS_A_SIDE, axis=axis)
-        out = view.sum(axis=-1)
+        out = np.lib.stride_tricks.sliding_window_view(out, side, axis=axis).sum(axis=-1)
+    return out
+
+
+def _window_sum(values: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Sum over every window, windows flattened: `(n, m, ...)` to `(windows, ...)`."""
+    out = _square_sum(values, BLOCKS_A_SIDE)
     return out.reshape(-1, *out.shape[2:])
 
 
@@ -385,19 +361,17 @@ def _slope_variance(blocks: BlockSums) -> NDArray[np.float64]:
 @lru_cache(maxsize=4)
 def _slopes(side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     size = side * BLOCKS_A_SIDE
+    basis = np.stack([part - part.mean() for part in polynomials(size)[1:]])
+    averaged = basis.reshape(-1, BLOCKS_A_SIDE, side, BLOCKS_A_SIDE, side).mean(axis=(2, 4))
+    flat = basis.reshape(len(basis), -1)
+    return averaged.reshape(len(basis), -1).T, flat @ flat.T / size**2
+
+
+def polynomials(size: int) -> NDArray[np.float64]:
+    """Polynomials up to `SLOPE_ORDER` over a window, the constant first, shape (count, size, size)."""
     t = np.linspace(-1.0, 1.0, size)
     orders = range(SLOPE_ORDER + 1)
-    parts = [np.outer(t**i, t**j) for i in orders for j in orders if 0 < i + j <= SLOPE_ORDER]
-    basis = np.stack([part - part.mean() for part in parts])
-    averaged = basis.reshape(-1, BLOCKS_A_SIDE, side, BLOCKS_A_SIDE, side).mean(axis=(2, 4))
-    flat = basis.reshape(len(parts), -1)
-    return averaged.reshape(len(parts), -1).T, flat @ flat.T / size**2
-
-
-def _corners(blocks: BlockSums) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    n, m = (count - BLOCKS_A_SIDE + 1 for count in blocks.level.shape)
-    rows, cols = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
-    return blocks.row + rows.ravel() * blocks.side, blocks.col + cols.ravel() * blocks.side
+    return np.stack([np.outer(t**i, t**j) for i in orders for j in orders if i + j <= SLOPE_ORDER])
 
 
 def _eigenvalues(tensor: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -419,9 +393,7 @@ def _typical_width(histogram: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _widest_quarter(histograms: NDArray[np.int64]) -> NDArray[np.float64]:
     half = BLOCKS_A_SIDE // 2
-    sums = np.asarray(histograms, dtype=np.float64)
-    for axis in (0, 1):
-        sums = np.lib.stride_tricks.sliding_window_view(sums, half, axis=axis).sum(axis=-1)
+    sums = _square_sum(histograms, half)
     n, m = sums.shape[0] - half, sums.shape[1] - half
     quarters = [sums[i : i + n, j : j + m].reshape(n * m, -1) for i in (0, half) for j in (0, half)]
     widths = np.stack([_typical_width(part) for part in quarters])

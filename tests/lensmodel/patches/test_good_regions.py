@@ -9,8 +9,7 @@ from scipy import ndimage
 
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Plane, ignore_step
-from lensmodel.patches import select
-from lensmodel.patches.checks import Details, joined_details, look_at
+from lensmodel.patches.checks import Details, details_of
 from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
 from lensmodel.patches.windows import Windows, measure_blocks, windows_of
 
@@ -33,11 +32,7 @@ def plane_of(seed: int, height: int = 320, width: int = 384) -> Plane:
 def looked_at(plane: Plane) -> tuple[Windows, Details]:
     blocks = measure_blocks(plane, NOISE, 32, 1.0, ignore_step)
     windows = windows_of(blocks, Frame(*plane.shape), NOISE)
-    size = windows.size
-    corners = list(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True))
-    return windows, joined_details(
-        [look_at(plane[r : r + size, c : c + size], SIGMA, 1.0, (r, c)) for r, c in corners]
-    )
+    return windows, details_of(plane, windows, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +111,3 @@ def test_a_window_with_detail_scores_above_the_same_window_in_heavy_noise() -> N
     selector = GoodRegionsSelector()
 
     assert selector.score(windows, details).mean() > selector.score(loud, noisy).mean()
-
-
-def test_good_regions_can_be_asked_for_by_name() -> None:
-    plane = plane_of(5, 600, 800)
-    patches = select(plane, NOISE, Frame(*plane.shape), count=12, selector="good-regions").patches
-
-    assert len(patches) == 12
-    assert len({p.score for p in patches}) > 1

@@ -67,6 +67,7 @@ class PsfEstimator(Protocol):
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
+        green: PsfEstimate | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share.
@@ -79,6 +80,8 @@ class PsfEstimator(Protocol):
             One for each patch.
         size : int
             Odd side of the kernel, up to 55.
+        green : PsfEstimate, optional
+            What this method gave for the same windows in green, to start another color from.
         on_step : StepHook
             Progress; raising `CancelledError` there stops the work.
 
@@ -91,43 +94,6 @@ class PsfEstimator(Protocol):
         ------
         NotEnoughEvidenceError
             If no patch determines a kernel: flat, clipped, or noise only.
-        InvalidInputError
-            For values that no photo has.
-        """
-
-    def estimate_channel(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        reference: PsfEstimate,
-        reference_patches: Sequence[Plane],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
-    ) -> PsfEstimate:
-        """Estimate another channel of the same patches, starting from the result of the first.
-
-        Parameters
-        ----------
-        patches : sequence of Plane, float32, each of shape (h, w)
-            The windows in this channel, linear light.
-        noise : sequence of NoiseModel
-            One for each patch.
-        reference : PsfEstimate
-            What `estimate` gave for the first channel.
-        reference_patches : sequence of Plane, float32, each of shape (h, w)
-            The same windows in the first channel.
-        size, on_step
-            As of `estimate`.
-
-        Returns
-        -------
-        PsfEstimate
-
-        Raises
-        ------
-        NotEnoughEvidenceError
-            If no patch determines a kernel in this channel.
         InvalidInputError
             For values that no photo has.
         """

@@ -108,6 +108,7 @@ class LearnedEstimator:
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
+        green: PsfEstimate | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that patches of one plane share, as if all colors of a mosaic were that plane.
@@ -128,20 +129,6 @@ class LearnedEstimator:
         answer = network.query(memory, xy[0], conditions)
         on_step(1, 1)
         return finished(answer.kernels[1], size=size, error=float(answer.error[1]), diagnostics={})
-
-    def estimate_channel(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        reference: PsfEstimate,
-        reference_patches: Sequence[Plane],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
-    ) -> PsfEstimate:
-        """Estimate another channel for itself; see `PsfEstimator.estimate_channel`."""
-        del reference, reference_patches
-        return self.estimate(patches, noise, size=size, on_step=on_step)
 
 
 def _alone(

@@ -241,38 +241,19 @@ class PatchRecurrence:
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
+        green: PsfEstimate | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share; see `PsfEstimator`."""
-        return self._run(patches, noise, size, None, self.levels, on_step)
+        """Estimate the kernel that patches share: after green, the finest level alone, from its kernel on.
 
-    def estimate_channel(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        reference: PsfEstimate,
-        reference_patches: Sequence[Plane],
-        *,
-        size: int = 31,
-        on_step: StepHook = ignore_step,
-    ) -> PsfEstimate:
-        """Estimate another channel: the finest level alone, from the reference kernel on."""
-        return self._run(patches, noise, size, reference.kernel, 1, on_step)
-
-    def _run(
-        self,
-        patches: Sequence[Plane],
-        noise: Sequence[NoiseModel],
-        size: int,
-        start: Kernel | None,
-        levels: int,
-        on_step: StepHook,
-    ) -> PsfEstimate:
+        See `PsfEstimator`.
+        """
+        levels = self.levels if green is None else 1
         kept = usable(patches, noise, size)
         scaled = [_Scaled.of(patch, model) for patch, model in kept]
         while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
             levels -= 1
-        kernel = delta(_LEAST_SIDE) if start is None else start
+        kernel = delta(_LEAST_SIDE) if green is None else green.kernel
         latent = [view.y for view in (s.at(levels - 1) for s in scaled)]
         total, done = levels * self.iterations, 0
         for level in reversed(range(levels)):

@@ -8,10 +8,19 @@ from lensmodel.simulate.camera import (
     photograph,
     write_photo,
 )
-from lensmodel.simulate.charts import Chart, ChartEdge, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.lens import Aberrations, CameraLens, SimulatedField, SimulatedLens
-from lensmodel.simulate.scenes import DEMO_SCENES, demo_data_path, demo_scene, load_scene, srgb_to_linear
+from lensmodel.simulate.scenes import (
+    DEMO_SCENES,
+    Chart,
+    ChartEdge,
+    demo_data_path,
+    demo_scene,
+    edge_chart,
+    load_scene,
+    slanted_edge_scene,
+    srgb_to_linear,
+)
 
 __all__ = [
     "DEMO_SCENES",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -211,20 +210,38 @@ def blurred(
     options = options or BlurOptions()
     half = options.size // 2
     padded = _with_margin(scene, frame, half)
-    grid = _Grid.over(padded.shape[1:], frame, options.step)
+    spacing = max(round(options.step * frame.half_diagonal / _REFINED), 4)
+    rows, cols = (_nodes(length, spacing) for length in padded.shape[1:])
+    middle = (padded.shape[1] - 1) / 2.0, (padded.shape[2] - 1) / 2.0
+    hats = [
+        [_hat(node, spacing, n) for node in nodes]
+        for nodes, n in zip((rows, cols), padded.shape[1:], strict=True)
+    ]
     out = np.zeros((3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half), dtype=np.float32)
     for index, channel in enumerate(CHANNELS):
         own = settings.with_channel(channel)
-        kernels = [
-            [_kernel(lens, own, grid.field(row, col), frame, options) for col in grid.exact_cols]
-            for row in grid.exact_rows
+        # field vectors (right, up) of nodes; beyond the frame they are longer than 1
+        exact = [
+            [
+                _kernel(
+                    lens,
+                    own,
+                    ((col - middle[1]) / frame.half_diagonal, (middle[0] - row) / frame.half_diagonal),
+                    frame,
+                    options,
+                )
+                for col in cols[::_REFINED]
+            ]
+            for row in rows[::_REFINED]
         ]
-        spread = grid.spread(np.asarray(kernels, dtype=np.float32))
-        for i, row in enumerate(grid.rows):
-            for j, col in enumerate(grid.cols):
-                for top, left, light in grid.windowed(padded[index], row, col):
-                    image = _convolved(light, spread[i, j])
-                    out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
+        kernels = _between(np.asarray(exact, dtype=np.float32), len(rows), len(cols))
+        for i, (down, row_weights) in enumerate(hats[0]):
+            for j, (along, col_weights) in enumerate(hats[1]):
+                light = padded[index, down, along] * np.outer(row_weights, col_weights).astype(np.float32)
+                if light.size:
+                    image = _convolved(light, kernels[i, j])
+                    rest = out[index, down.start :, along.start :]
+                    rest[: image.shape[0], : image.shape[1]] += image
     inner = out[:, 2 * half : 2 * half + frame.height, 2 * half : 2 * half + frame.width]
     return np.ascontiguousarray(np.maximum(inner, 0.0))
 
@@ -248,66 +265,27 @@ def _with_margin(scene: Planes, frame: Frame, margin: int) -> Planes:
     return np.ascontiguousarray(padded, dtype=np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class _Grid:
-    """Nodes of the windows, in pixels of the padded scene; every `_REFINED`-th has an exact kernel."""
-
-    rows: tuple[int, ...]
-    cols: tuple[int, ...]
-    spacing: int
-    center: tuple[float, float]
-    half_diagonal: float
-
-    @classmethod
-    def over(cls, shape: tuple[int, ...], frame: Frame, step: float) -> _Grid:
-        spacing = max(round(step * frame.half_diagonal / _REFINED), 4)
-        rows, cols = _nodes(shape[0], spacing), _nodes(shape[1], spacing)
-        center = ((shape[0] - 1) / 2.0, (shape[1] - 1) / 2.0)
-        return cls(rows, cols, spacing, center, frame.half_diagonal)
-
-    @property
-    def exact_rows(self) -> tuple[int, ...]:
-        return self.rows[::_REFINED]
-
-    @property
-    def exact_cols(self) -> tuple[int, ...]:
-        return self.cols[::_REFINED]
-
-    def field(self, row: int, col: int) -> tuple[float, float]:
-        """Field vector (right, up) of a pixel; beyond the frame it is longer than 1."""
-        return (col - self.center[1]) / self.half_diagonal, (self.center[0] - row) / self.half_diagonal
-
-    def spread(self, exact: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Kernels of all nodes, `(rows, cols, k, k)`, by cubic splines through the exact ones."""
-        along_rows = _spline(exact.shape[0], len(self.rows))
-        along_cols = _spline(exact.shape[1], len(self.cols))
-        fine = np.tensordot(along_rows, exact, axes=(1, 0))
-        fine = np.tensordot(along_cols, fine, axes=(1, 1)).swapaxes(0, 1)
-        fine = np.maximum(fine, 0.0)
-        return np.asarray(fine / fine.sum(axis=(2, 3), keepdims=True), dtype=np.float32)
-
-    def windowed(
-        self, plane: NDArray[np.float32], row: int, col: int
-    ) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
-        """The part of a plane that belongs to a node, times its window, and its top left corner."""
-        reach = self.spacing - 1
-        top, left = max(row - reach, 0), max(col - reach, 0)
-        # nodes may lie beyond the plane: a negative end would count from its far side
-        tile = plane[top : max(row + reach + 1, 0), left : max(col + reach + 1, 0)]
-        if tile.size:
-            weights = [
-                1.0 - np.abs(np.arange(n) + start - node) / self.spacing
-                for n, start, node in zip(tile.shape, (top, left), (row, col), strict=True)
-            ]
-            yield top, left, tile * np.outer(*weights).astype(np.float32)
-
-
-def _nodes(length: int, spacing: int) -> tuple[int, ...]:
+def _nodes(length: int, spacing: int) -> list[int]:
     """Nodes symmetric about the middle, the outer ones on or beyond the edges, exact ones outermost."""
     middle = (length - 1) // 2
     unit = spacing * _REFINED
     before, after = -(-middle // unit), -(-(length - 1 - middle) // unit)
-    return tuple(middle + k * spacing for k in range(-before * _REFINED, after * _REFINED + 1))
+    return [middle + k * spacing for k in range(-before * _REFINED, after * _REFINED + 1)]
+
+
+def _hat(node: int, spacing: int, length: int) -> tuple[slice, NDArray[np.float64]]:
+    """Pixels that belong to a node, and its window there; none where it lies beyond the edge."""
+    pixels = np.arange(max(node - spacing + 1, 0), max(min(node + spacing, length), 0))
+    start = max(node - spacing + 1, 0)
+    return slice(start, start + pixels.size), 1.0 - np.abs(pixels - node) / spacing
+
+
+def _between(exact: NDArray[np.float32], rows: int, cols: int) -> NDArray[np.float32]:
+    """Kernels of all nodes, `(rows, cols, k, k)`, by cubic splines through the exact ones."""
+    fine = np.tensordot(_spline(exact.shape[0], rows), exact, axes=(1, 0))
+    fine = np.tensordot(_spline(exact.shape[1], cols), fine, axes=(1, 1)).swapaxes(0, 1)
+    fine = np.maximum(fine, 0.0)
+    return np.asarray(fine / fine.sum(axis=(2, 3), keepdims=True), dtype=np.float32)
 
 
 def _spline(known: int, wanted: int) -> NDArray[np.float32]:

@@ -34,8 +34,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -186,25 +187,16 @@ class SimulatedLens:
             raise InvalidInputError(f"size must be odd and at least 3, got {size}")
         if not 0.5 <= pitch_um <= 50.0:
             raise InvalidInputError(f"pixel pitch must lie in 0.5..50 um, got {pitch_um}")
-        optics, n = self.at_focal(settings.focal_mm), self.f_number(settings)
-        wavefront, aperture = WaveError.of(optics, h, n), CatsEye.of(optics, h, n)
-        (col, row), spread = ray_statistics(wavefront, aperture, WAVELENGTH_NM[settings.channel] / 1000.0, n)
+        n = self.f_number(settings)
+        pupil = Pupil.of(self.at_focal(settings.focal_mm), h, n)
+        (col, row), spread = pupil.ray_spot(WAVELENGTH_NM[settings.channel] / 1000.0, n)
         response = pixel_otf(
-            wavefront,
-            aperture,
-            spectrum(settings.channel),
-            size=size,
-            pitch_um=pitch_um,
-            f_number=n,
-            spread_um=spread,
+            pupil, spectrum(settings.channel), size=size, pitch_um=pitch_um, f_number=n, spread_um=spread
         )
         return response.centred(size, (-row / pitch_um, col / pitch_um), offset)
 
     def field(
-        self,
-        settings: LensSettings | None = None,
-        *,
-        pitch_um: float = DEFAULT_PITCH_UM,
+        self, settings: LensSettings | None = None, *, pitch_um: float = DEFAULT_PITCH_UM
     ) -> SimulatedField:
         """The exact PSF of every place and channel at these settings, remembering what was asked."""
         return SimulatedField(self, settings or LensSettings(), pitch_um)
@@ -223,19 +215,17 @@ class SimulatedField:
     lens: SimulatedLens
     settings: LensSettings
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch of the camera in micrometres
-    _known: dict[tuple[float, float, Channel, int], Kernel] = field(default_factory=dict, repr=False)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the exact kernel of odd side `size`; see `SimulatedLens.kernel`."""
-        key = (position.r, position.phi, channel, size)
-        if key not in self._known:
-            self._known[key] = self.lens.kernel(
-                position,
-                self.settings.with_channel(channel),
-                size,
-                pitch_um=self.pitch_um,
-            )
-        return self._known[key]
+        return _kernel(self.lens, position, self.settings.with_channel(channel), size, self.pitch_um)
+
+
+@lru_cache(maxsize=2048)  # 50 MB at most
+def _kernel(
+    lens: SimulatedLens, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float
+) -> Kernel:
+    return lens.kernel(position, settings, size, pitch_um=pitch_um)
 
 
 REFERENCE_UM: Final = 0.54
@@ -246,12 +236,6 @@ _MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
 _WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
 _CENTRED_PX: Final = 5e-4  # pixels: far below what any test asks
 _DETAILED_CUTOFF: Final = 3.5  # cycles/pixel
-
-Wavefront = Callable[[NDArray[np.float32], NDArray[np.float32], float], NDArray[np.float32]]
-"""`W(px, py, wavelength_um)` in reference waves on arrays that broadcast; px right, py up."""
-
-Amplitude = Callable[[NDArray[np.float32], NDArray[np.float32], float], NDArray[np.float32]]
-"""`A(px, py, step)`, transmission 0..1 of the pupil; `step` is the sample distance."""
 
 
 def disc(
@@ -318,8 +302,7 @@ class PixelOtf:
 
 
 def pixel_otf(
-    wavefront: Wavefront,
-    amplitude: Amplitude,
+    pupil: Pupil,
     spectrum: Sequence[tuple[float, float]],
     *,
     size: int,
@@ -346,13 +329,13 @@ def pixel_otf(
         step = 2.0 * wave * f_number / period_um
         samples = math.ceil(2.0 / step) + 1
         px, py = coordinates(samples, step)
-        angle = np.float32(2.0 * np.pi * REFERENCE_UM / wave) * wavefront(px, py, wave)
-        transmitted = amplitude(px, py, step)
-        pupil = np.empty(angle.shape, dtype=np.complex64)
-        np.multiply(transmitted, np.cos(angle), out=pupil.real)
-        np.multiply(transmitted, np.sin(angle), out=pupil.imag)
+        angle = np.float32(2.0 * np.pi * REFERENCE_UM / wave) * pupil.wavefront(px, py, wave)
+        transmitted = pupil.amplitude(px, py, step)
+        light = np.empty(angle.shape, dtype=np.complex64)
+        np.multiply(transmitted, np.cos(angle), out=light.real)
+        np.multiply(transmitted, np.sin(angle), out=light.imag)
         # the rows beyond the pupil are empty: transform the others first
-        field = fft.fft(fft.fft(pupil, n=grid, axis=1), n=grid, axis=0, overwrite_x=True)
+        field = fft.fft(fft.fft(light, n=grid, axis=1), n=grid, axis=0, overwrite_x=True)
         # Parseval: sum |E|^2 = grid^2 sum A^2; and sum A, not sum A^2, is the area of the pupil
         total = float(transmitted.sum(dtype=np.float64)) * grid**2
         image += np.float32(weight / total) * (np.square(field.real) + np.square(field.imag))
@@ -413,17 +396,21 @@ class Aberrations:
 
 
 @dataclass(frozen=True, slots=True)
-class WaveError:
-    """W(p) of one place, aperture and wavelength-dependent focus, as coefficients of a polynomial."""
+class Pupil:
+    """The pupil of one place and aperture: W(p) as coefficients of a polynomial, and what it lets through.
+
+    The stop is cut by a second circle far from the centre (cat's eye).
+    """
 
     quartic: float  # |p|^4
     cubic: tuple[float, float]  # (c.p) |p|^2
     quadratic: tuple[float, float, float]  # px^2, px py, py^2
     colour: tuple[float, float]  # c1 t + c2 t^2 on |p|^2
-    stop: float  # s = N0 / N
+    radius: float  # of the second circle and its centre, in units of the stop; 0 = none
+    center: tuple[float, float]
 
     @classmethod
-    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float) -> WaveError:
+    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float) -> Pupil:
         """Collect the terms at field vector `h` and aperture `f_number`."""
         s = optics.f_number / f_number
         x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
@@ -435,6 +422,7 @@ class WaveError:
         )
         a, b = optics.uniform_astigmatism
         w222, s2, s3 = optics.astigmatism, s * s, s * s * s
+        radius, shift = optics.vignetting
         return cls(
             quartic=optics.spherical * s2 * s2,
             cubic=(
@@ -447,76 +435,53 @@ class WaveError:
                 (focus + w222 * y * y - a) * s2,
             ),
             colour=(optics.colour_focus[0] * s2, optics.colour_focus[1] * s2),
-            stop=s,
+            radius=radius / s,
+            center=(shift * x / s, shift * y / s),
         )
 
-    def _focus(self, wavelength_um: float) -> float:
+    def _quadratic(self, wavelength_um: float) -> tuple[float, float, float]:
+        """Terms in px^2, px py, py^2 with those of the colour."""
         t = (wavelength_um - REFERENCE_UM) / 0.1
-        return self.colour[0] * t + self.colour[1] * t * t
+        focus = self.colour[0] * t + self.colour[1] * t * t
+        xx, xy, yy = self.quadratic
+        return xx + focus, xy, yy + focus
 
-    def __call__(
+    def wavefront(
         self, px: NDArray[np.float32], py: NDArray[np.float32], wavelength_um: float
     ) -> NDArray[np.float32]:
         """W in reference waves at pupil coordinates that broadcast together."""
-        focus = self._focus(wavelength_um)
-        cx, cy = self.cubic
-        xx, xy, yy = self.quadratic
+        cx, cy = (np.float32(c) for c in self.cubic)
+        xx, xy, yy = (np.float32(c) for c in self._quadratic(wavelength_um))
         radius2 = px * px + py * py
-        w = radius2 * (np.float32(self.quartic) * radius2 + np.float32(cx) * px + np.float32(cy) * py)
-        return (
-            w
-            + np.float32(xx + focus) * px * px
-            + np.float32(xy) * (px * py)
-            + np.float32(yy + focus) * py * py
-        )
+        w = radius2 * (np.float32(self.quartic) * radius2 + cx * px + cy * py)
+        return w + xx * px * px + xy * (px * py) + yy * py * py
 
     def gradient(
-        self, px: NDArray[np.float32], py: NDArray[np.float32], wavelength_um: float
+        self, px: NDArray[np.floating], py: NDArray[np.floating], wavelength_um: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(dW/dpx, dW/dpy): where the ray through p lands, over 2 lambda N."""
-        focus = self._focus(wavelength_um)
         cx, cy = self.cubic
-        xx, xy, yy = self.quadratic
+        xx, xy, yy = self._quadratic(wavelength_um)
         radius2, along = px * px + py * py, cx * px + cy * py
-        gx = 4 * self.quartic * radius2 * px + cx * radius2 + 2 * px * along + 2 * (xx + focus) * px + xy * py
-        gy = 4 * self.quartic * radius2 * py + cy * radius2 + 2 * py * along + 2 * (yy + focus) * py + xy * px
+        gx = 4 * self.quartic * radius2 * px + cx * radius2 + 2 * px * along + 2 * xx * px + xy * py
+        gy = 4 * self.quartic * radius2 * py + cy * radius2 + 2 * py * along + 2 * yy * py + xy * px
         return np.asarray(gx, dtype=np.float64), np.asarray(gy, dtype=np.float64)
 
-
-@dataclass(frozen=True, slots=True)
-class CatsEye:
-    """Transmission of the pupil: the stop, cut by a second circle far from the centre (cat's eye)."""
-
-    radius: float  # of the second circle, in units of the stop; 0 = none
-    center: tuple[float, float]
-
-    @classmethod
-    def of(cls, optics: Aberrations, h: tuple[float, float], f_number: float) -> CatsEye:
-        """Second circle at field vector `h`, in units of the stop at `f_number`."""
-        s = optics.f_number / f_number
-        radius, shift = optics.vignetting
-        x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
-        return cls(radius / s, (shift * x / s, shift * y / s))
-
-    def __call__(self, px: NDArray[np.float32], py: NDArray[np.float32], step: float) -> NDArray[np.float32]:
-        """Amplitude 0..1 at pupil coordinates that broadcast together, `step` apart."""
+    def amplitude(self, px: NDArray[np.float32], py: NDArray[np.float32], step: float) -> NDArray[np.float32]:
+        """Transmission 0..1 at pupil coordinates that broadcast together, `step` apart."""
         stop = disc(px, py, step)
-        reach = 1.0 + math.hypot(*self.center) + step
-        if self.radius <= 0.0 or self.radius >= reach:
+        if self.radius <= 0.0 or self.radius >= 1.0 + math.hypot(*self.center) + step:
             return stop
         return stop * disc(px, py, step, radius=self.radius, center=self.center)
 
-
-def ray_statistics(
-    wavefront: WaveError, aperture: CatsEye, wavelength_um: float, f_number: float
-) -> tuple[tuple[float, float], float]:
-    """Centre of the ray spot (right, up) and its largest radius, in micrometres."""
-    step = 2.0 / 48
-    px, py = coordinates(48, step)
-    light = aperture(px, py, step).astype(np.float64) ** 2
-    scale = 2.0 * REFERENCE_UM * f_number  # W counts reference waves
-    gx, gy = wavefront.gradient(px, py, wavelength_um)
-    total = light.sum()
-    x, y = float((light * gx).sum() / total), float((light * gy).sum() / total)
-    radius = float((np.hypot(gx - x, gy - y) * (light > 0)).max())
-    return (scale * x, scale * y), scale * radius
+    def ray_spot(self, wavelength_um: float, f_number: float) -> tuple[tuple[float, float], float]:
+        """Centre of the ray spot (right, up) and its largest radius, in micrometres."""
+        step = 2.0 / 48
+        px, py = coordinates(48, step)
+        light = self.amplitude(px, py, step).astype(np.float64) ** 2
+        scale = 2.0 * REFERENCE_UM * f_number  # W counts reference waves
+        gx, gy = self.gradient(px, py, wavelength_um)
+        total = light.sum()
+        x, y = float((light * gx).sum() / total), float((light * gy).sum() / total)
+        radius = float((np.hypot(gx - x, gy - y) * (light > 0)).max())
+        return (scale * x, scale * y), scale * radius

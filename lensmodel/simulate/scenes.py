@@ -1,23 +1,34 @@
-"""Scenes for the simulated camera: photographs that come with the source tree, or any other.
+"""What a simulated camera looks at: photographs, and slanted-edge charts.
 
-Every scene is `Planes` in white-balanced linear light. Charts are in `charts`.
+Every scene is `Planes` in white-balanced linear light. The edges of a chart are exact: every pixel holds the
+area that the edge leaves it.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
-from lensmodel.core.types import Planes
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.types import FieldPosition, Planes, Zone
+from lensmodel.quality.edge import edge_area
 
 DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 """Names of the photographs that come with the library, see lensmodel/demo_data/README.md."""
+
+Direction = Literal["tangential", "sagittal"]
+
+# Degrees: about the 5 of ISO 12233, both ways
+_SLANTS_DEG: Final = (5.0, -5.0, 7.0, -7.0, 4.0, -4.0, 9.0, -9.0)
+_MIN_TILE: Final = 72  # pixels: the crop of an edge and the blur around it
 
 
 def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -57,3 +68,109 @@ def demo_scene(name: str) -> Planes:
     if name not in DEMO_SCENES:
         raise InvalidInputError(f"no demo scene {name!r}; known: {', '.join(DEMO_SCENES)}")
     return load_scene(demo_data_path(f"{name}.jpg"))
+
+
+@dataclass(frozen=True, slots=True)
+class ChartEdge:
+    """One slanted edge of a chart."""
+
+    row: int  # box in the frame that holds the edge and flat ground on both sides, nothing else
+    col: int
+    height: int
+    width: int
+    normal: float  # angle of the edge's normal from dark to bright, radians, counter-clockwise from the right
+    position: FieldPosition  # of the middle of the box
+    direction: Direction  # contrast along u (tangential) or v (sagittal)
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """(row, col, height, width)."""
+        return self.row, self.col, self.height, self.width
+
+    @property
+    def zone(self) -> Zone:
+        """Zone of the field."""
+        return zone_of(self.position.r)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """A chart and where its edges are."""
+
+    scene: Planes  # (3, H + 2 margin, W + 2 margin), linear light
+    edges: tuple[ChartEdge, ...]  # in coordinates of the frame, margin not counted
+
+
+def slanted_edge_scene(
+    height: int, width: int, normal: float, *, dark: float = 0.2, bright: float = 0.8
+) -> NDArray[np.float32]:
+    """One plane with one edge through its middle; see `edge_area`."""
+    rows = (np.arange(height) - (height - 1) / 2.0)[:, None]
+    cols = (np.arange(width) - (width - 1) / 2.0)[None, :]
+    return (dark + (bright - dark) * edge_area(rows, cols, normal)).astype(np.float32)
+
+
+def edge_chart(
+    frame: Frame, *, margin: int = 40, guard: int = 27, dark: float = 0.15, bright: float = 0.75
+) -> Chart:
+    """Chart with edges in the centre, half way out and in all four corners, of both directions.
+
+    Notes
+    -----
+    A tile of the chart MTF of exactly one pixel box: sinc(f cos) sinc(f sin) along the normal.
+    """
+    tile = min(frame.height // 6, frame.width // 8)
+    box = tile - 2 * guard
+    if tile < _MIN_TILE or box < _MIN_TILE // 3:
+        raise InvalidInputError(
+            f"the chart needs a frame of at least {6 * _MIN_TILE} x {8 * _MIN_TILE} pixels and tiles larger "
+            f"than twice the guard, got {frame.height} x {frame.width} and a guard of {guard}"
+        )
+    plane = np.full(
+        (frame.height + 2 * margin, frame.width + 2 * margin), (dark + bright) / 2.0, dtype=np.float32
+    )
+    edges = []
+    for up, right, direction in _places(frame, tile):
+        row = round(frame.center[0] - up - (tile - 1) / 2.0)
+        col = round(frame.center[1] + right - (tile - 1) / 2.0)
+        position = frame.position(row + (tile - 1) / 2.0, col + (tile - 1) / 2.0)
+        normal = _slanted(position.phi + (math.pi / 2.0 if direction == "sagittal" else 0.0))
+        top, left = row + margin, col + margin
+        plane[top : top + tile, left : left + tile] = slanted_edge_scene(
+            tile, tile, normal, dark=dark, bright=bright
+        )
+        edges.append(ChartEdge(row + guard, col + guard, box, box, normal, position, direction))
+    return Chart(np.ascontiguousarray(np.broadcast_to(plane, (3, *plane.shape))), tuple(edges))
+
+
+def _places(frame: Frame, tile: int) -> list[tuple[float, float, Direction]]:
+    """Middles of the tiles as (up, right) from the centre, with their direction."""
+    half_h, half_w = frame.height / 2.0, frame.width / 2.0
+    places: list[tuple[float, float, Direction]] = [
+        (0.0, -0.55 * tile, "tangential"),
+        (0.0, 0.55 * tile, "sagittal"),
+    ]
+    for up in (1.0, -1.0):
+        for right in (1.0, -1.0):
+            places += [
+                (up * (half_h - 0.5 * tile), right * (half_w - 0.5 * tile), "tangential"),
+                (up * (half_h - 1.5 * tile), right * (half_w - 0.5 * tile), "sagittal"),
+                (up * (half_h - 1.5 * tile), right * half_w / 2.0, "tangential"),
+                (up * (half_h - 2.5 * tile), right * half_w / 2.0, "sagittal"),
+            ]
+    return places
+
+
+def _slanted(angle: float) -> float:
+    """Turn an angle a little, so that the edge crosses the pixel grid at many phases.
+
+    An edge whose slope is p / q with a small q meets only q phases, and the edge profile would
+    have holes.
+    """
+    for slant in _SLANTS_DEG:
+        turned = angle + math.radians(slant)
+        slope = abs(math.tan(turned))
+        slope = min(slope, 1.0 / slope)
+        if all(abs(slope - p / q) > 0.03 for q in range(1, 4) for p in range(q + 1)):
+            return turned
+    return angle + math.radians(_SLANTS_DEG[0])

@@ -310,18 +310,12 @@ def estimate_cell(
             for sample in samples
         ]
     order = sorted(channels, key=lambda c: c != "g")
-    views = {c: [_view(developed, patch, c) for patch in group] for c in order}
     results: list[CellSample] = []
     green: blind.PsfEstimate | None = None
     for done, channel in enumerate(order):
-        planes = [view[0] for view in views[channel]]
-        noises = [view[1] for view in views[channel]]
+        planes, noises = zip(*(_view(developed, patch, channel) for patch in group), strict=True)
         try:
-            if green is None or "g" not in views:
-                estimate = method.estimate(planes, noises, size=size)
-            else:
-                reference = [view[0] for view in views["g"]]
-                estimate = method.estimate_channel(planes, noises, green, reference, size=size)
+            estimate = method.estimate(planes, noises, size=size, green=green)
         except NotEnoughEvidenceError:
             if channel == "g":
                 raise

@@ -36,9 +36,6 @@ class Careful:
         found = lensmodel.estimators.create("default").estimate(patches, noise, **options)
         return type(found)(found.kernel, found.confidence / 2, found.predicted_error, {})
 
-    def estimate_channel(self, patches, noise, reference, reference_patches, **options):
-        return self.estimate(patches, noise, **options)
-
 
 class Everywhere:
     """Takes every window for as good as any other."""

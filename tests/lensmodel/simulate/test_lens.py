@@ -16,7 +16,7 @@ from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import centroid, distance, rms_width, second_moments
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.simulate import LENS_KINDS, Aberrations, SimulatedLens, draw_lens
-from lensmodel.simulate.lens import PixelOtf, WaveError, disc, pixel_otf
+from lensmodel.simulate.lens import PixelOtf, Pupil, pixel_otf
 
 PITCH = 4.5
 ANGLES = (0.0, 0.7, 1.9, -2.6, -1.2)
@@ -34,8 +34,8 @@ def diffraction_mtf(frequency: NDArray[np.float64], cutoff: float) -> NDArray[np
 
 def otf_of(f_number: float, wavelength_um: float, size: int = 55, **terms: object) -> PixelOtf:
     optics = Aberrations(f_number=f_number, **terms)  # type: ignore[arg-type]
-    wavefront = WaveError.of(optics, (0.0, 0.0), f_number)
-    return pixel_otf(wavefront, disc, [(wavelength_um, 1.0)], size=size, pitch_um=PITCH, f_number=f_number)
+    pupil = Pupil.of(optics, (0.0, 0.0), f_number)
+    return pixel_otf(pupil, [(wavelength_um, 1.0)], size=size, pitch_um=PITCH, f_number=f_number)
 
 
 def third_moment(kernel: Kernel, phi: float) -> tuple[float, float]:
@@ -178,8 +178,8 @@ def test_stopped_down_wavefront_is_the_inner_part_of_the_open_one() -> None:
         f_number=2.0, spherical=2.0, coma=1.0, astigmatism=0.7, defocus=-1.0, tilt=(0.2, 0.1)
     )
     h = (0.5, -0.4)
-    open_wave = WaveError.of(optics, h, 2.0)
-    closed = WaveError.of(optics, h, 4.0)
+    open_wave = Pupil.of(optics, h, 2.0).wavefront
+    closed = Pupil.of(optics, h, 4.0).wavefront
     px = np.linspace(-1, 1, 9, dtype=np.float32)[None, :]
     py = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
 
@@ -190,13 +190,13 @@ def test_ray_gradient_is_the_derivative_of_the_wavefront() -> None:
     optics = Aberrations(
         f_number=2.0, spherical=2.0, coma=1.5, astigmatism=0.7, uniform_astigmatism=(0.3, 0.4)
     )
-    wave = WaveError.of(optics, (0.6, 0.3), 2.0)
+    pupil = Pupil.of(optics, (0.6, 0.3), 2.0)
     x, y, e = 0.4, -0.3, 1e-3
 
     def w(px: float, py: float) -> float:
-        return float(wave(np.float64(px), np.float64(py), 0.54))  # type: ignore[arg-type]
+        return float(pupil.wavefront(np.float64(px), np.float64(py), 0.54))  # type: ignore[arg-type]
 
-    gx, gy = wave.gradient(np.float64(x), np.float64(y), 0.54)  # type: ignore[arg-type]
+    gx, gy = pupil.gradient(np.float64(x), np.float64(y), 0.54)  # type: ignore[arg-type]
     assert gx == pytest.approx((w(x + e, y) - w(x - e, y)) / (2 * e), rel=1e-3)
     assert gy == pytest.approx((w(x, y + e) - w(x, y - e)) / (2 * e), rel=1e-3)
 

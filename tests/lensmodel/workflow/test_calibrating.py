@@ -127,13 +127,10 @@ class Round:
     name: str = "round"
     version: int = 1
 
-    def estimate(self, patches: Sequence[Plane], noise: object, *, size: int) -> lensmodel.PsfEstimate:
-        return lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3, {})
-
-    def estimate_channel(
-        self, patches: object, noise: object, reference: lensmodel.PsfEstimate, first: object, *, size: int
+    def estimate(
+        self, patches: Sequence[Plane], noise: object, *, size: int, green: lensmodel.PsfEstimate | None
     ) -> lensmodel.PsfEstimate:
-        return reference
+        return green or lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3, {})
 
 
 def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(

@@ -18,7 +18,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.traced import draw
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork
-from lensmodel.neural.network import WEIGHTS, adjusted
+from lensmodel.neural.network import WEIGHTS
 
 
 def _arguments() -> argparse.Namespace:
@@ -114,11 +114,11 @@ def _publish(asked: argparse.Namespace) -> None:
     apart = sets.load_library(asked.folder / "held-out", set())
     drawn = [sets.draw_set(lens, 64, 8, rng, varied=False) for lens in apart]
     powers = sets.best_powers(FieldNetwork.from_bytes(data), drawn)
-    data = adjusted(data, powers=powers)
+    data = sets.adjusted(data, powers=powers)
     shift = sets.understated(FieldNetwork.from_bytes(data), drawn)
-    data = adjusted(data, raised=shift)
+    data = sets.adjusted(data, raised=shift)
     figures = sets.judge(FieldNetwork.from_bytes(data), sets.load_sets(asked.fixed))
-    published = adjusted(
+    published = sets.adjusted(
         data,
         fixed_set={name: round(value, 4) for name, value in figures.items()},
         errors_raised=round(shift, 4),

@@ -73,8 +73,8 @@ class _Group:
 class LearnedField:
     """Encoded patches, ready to be attended to: samples with `encoded`, one of each patch."""
 
-    def __init__(self, samples: Sequence[PsfSample], network: FieldNetwork | None = None) -> None:
-        self.network = network or FieldNetwork.load()
+    def __init__(self, samples: Sequence[PsfSample]) -> None:
+        self.network = FieldNetwork.load()
         self._conditions = _conditions(samples)
         self._tokens = _tokens(samples, self._conditions, self.network)
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up

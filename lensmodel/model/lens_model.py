@@ -244,15 +244,8 @@ class ModelField:
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
-        return np.asarray(self.kernels_at([position], channel, size)[0])
-
-    def kernels_at(
-        self, positions: Sequence[FieldPosition], channel: Channel, size: int
-    ) -> NDArray[np.float64]:
-        """Return the kernels of many places, shape (n, size, size)."""
-        return self.model.kernels(
-            positions, self.settings.with_channel(channel), size, pitch_um=self.pitch_um
-        )
+        settings = self.settings.with_channel(channel)
+        return np.asarray(self.model.kernels([position], settings, size, pitch_um=self.pitch_um)[0])
 
     def answer_at(self, position: FieldPosition, channel: Channel, size: int) -> PsfAnswer:
         """Return the kernel of odd side `size` at a field position, with what is expected of its error."""

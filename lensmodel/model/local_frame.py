@@ -103,15 +103,13 @@ class LocalKernels:
         Non-negative, sum 1, centre of mass on the middle pixel. Centring moves the points at which the
         splines are read: kernels are not resampled again.
         """
-        from lensmodel.model import loops  # noqa: PLC0415 - Numba takes a while to load
-
         shifts = np.zeros((len(angles), 2))
         light = np.empty((len(angles), size, size))
         t = np.arange(size, dtype=np.float64) - size // 2
         left = np.arange(len(angles))
         for _ in range(_STEPS):
             kernels = self._sums(answers.part(left), angles[left], widths[left], shifts[left], size)
-            loops.without_negatives(kernels.reshape(len(left), -1))
+            kernels = without_negatives(kernels.reshape(len(left), -1)).reshape(kernels.shape)
             light[left] = kernels
             total = kernels.sum(axis=(1, 2))
             row, col = kernels.sum(axis=2) @ t / total, kernels.sum(axis=1) @ t / total
@@ -136,7 +134,7 @@ class LocalKernels:
         size: int,
     ) -> NDArray[np.float64]:
         """Weighted sums of the samples of each answer, which may be negative and off the centre."""
-        from lensmodel.model import loops  # noqa: PLC0415 - as above
+        from lensmodel.model import loops  # noqa: PLC0415 - Numba takes a while to load
 
         rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
         scale = self.widths[rows] / widths[asked]
@@ -146,6 +144,22 @@ class LocalKernels:
         out = np.zeros((len(angles), size, size))
         loops.sums(self.splines, self.radii, rows, factors, maps, starts, shifts, out)
         return out
+
+
+def without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest values that are not negative and have the same sum, of each row of (q, n).
+
+    They are lower by one amount, or zero. Clipping alone would keep the crests of a spline's ripples round a
+    sharp kernel and drop their troughs. Source: J. Duchi et al., "Efficient projections onto the l1-ball for
+    learning in high dimensions", ICML 2008, fig. 1.
+    """
+    lowered = values.copy()
+    for row in np.flatnonzero((values.min(axis=1) < 0.0) & (values.max(axis=1) > 0.0)):
+        falling, total = np.sort(values[row])[::-1], values[row].sum()
+        excess = np.cumsum(falling) - (total if total > 0.0 else falling[0])
+        count = np.flatnonzero(falling * np.arange(1, falling.size + 1) > excess)[-1] + 1
+        lowered[row] = np.maximum(values[row] - excess[count - 1] / count, 0.0)
+    return lowered
 
 
 def _frames(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -101,36 +101,3 @@ def sums(
                 else:
                     for j in range(first, last):
                         out[answer, i, j] += weight * _anywhere(spline, side, y + j * dy, x + j * dx)
-
-
-@jit
-def without_negatives(values: NDArray[np.float64]) -> None:
-    """Replace each row of `values` (q, n) by the nearest one of its sum that is not negative.
-
-    Michelot's way: take the values above t for those that stay, until t = (their sum - total) / their number
-    no longer rises. Source: C. Michelot, "A finite algorithm for finding the projection of a point onto the
-    canonical simplex of R^n", Journal of Optimization Theory and Applications 50, 1986. Clipping alone would
-    keep the crests of a spline's ripples round a sharp kernel and drop their troughs.
-    """
-    for q in range(len(values)):
-        row = values[q]
-        least, largest, total = math.inf, -math.inf, 0.0
-        for x in row:
-            least, largest, total = min(least, x), max(largest, x), total + x
-        if least >= 0.0 or largest <= 0.0:
-            continue
-        total = total if total > 0.0 else largest
-        # below this the one largest value would already hold more than all of the sum
-        t, count = largest - total, 0
-        while True:
-            above, number = 0.0, 0
-            for x in row:
-                if x > t:
-                    above += x
-                    number += 1
-            t = (above - total) / number
-            if number == count:
-                break
-            count = number
-        for i in range(len(row)):
-            row[i] = max(row[i] - t, 0.0)

@@ -76,10 +76,6 @@ class Memory:
     keys: Array  # (blocks, heads, n, width)
     values: Array
 
-    def part(self, index: NDArray[np.int64]) -> Memory:
-        """Return some of the samples."""
-        return Memory(self.xy[index], self.settings[index], self.keys[:, :, index], self.values[:, :, index])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldAnswer:
@@ -264,26 +260,3 @@ def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
 @cache
 def _packaged() -> FieldNetwork:
     return FieldNetwork.from_bytes(WEIGHTS.read_bytes())
-
-
-def adjusted(
-    data: bytes, *, powers: Sequence[float] = (1.0, 1.0, 1.0), raised: float = 0.0, **facts: object
-) -> bytes:
-    """Weights that differ a little in what they answer, with more facts in their provenance.
-
-    Kernels of red, green and blue are raised to powers, as all their logits are scaled; told errors are
-    exp(`raised`) times as large.
-    """
-    with np.load(BytesIO(data)) as stored:
-        arrays: dict[str, Any] = dict(stored)
-    for name in ("kernel.2.weight", "kernel.2.bias"):
-        colours = np.split(arrays[name].astype(np.float32), 3)
-        arrays[name] = np.concatenate([p * part for p, part in zip(powers, colours, strict=True)]).astype(
-            np.float16
-        )
-    arrays["error.1.bias"] = (arrays["error.1.bias"].astype(np.float32) + raised).astype(np.float16)
-    told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
-    arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
-    out = BytesIO()
-    np.savez_compressed(out, **arrays)
-    return out.getvalue()

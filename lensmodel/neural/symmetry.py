@@ -72,19 +72,7 @@ def relative_octant(query: NDArray[np.int64], sample: NDArray[np.int64]) -> NDAr
     return _RELATIVE[query, sample]
 
 
-def _matrix(octant: int) -> NDArray[np.int64]:
-    mirror = np.diag([-1 if octant & 1 else 1, -1 if octant & 2 else 1])
-    return np.array([[0, 1], [1, 0]]) @ mirror if octant & 4 else mirror
-
-
-def _relative() -> NDArray[np.int64]:
-    matrices = [_matrix(octant) for octant in range(OCTANTS)]
-    table = np.empty((OCTANTS, OCTANTS), np.int64)
-    for q in range(OCTANTS):
-        for p in range(OCTANTS):
-            wanted = matrices[q] @ matrices[p].T
-            table[q, p] = next(i for i, m in enumerate(matrices) if np.array_equal(m, wanted))
-    return table
-
-
-_RELATIVE: Final = _relative()
+# to_octant_place as matrices; the inverse of one is its transpose
+_MATRICES: Final = to_octant_place(np.arange(OCTANTS)[:, None], np.eye(2)).mT
+_PRODUCTS: Final = _MATRICES[:, None] @ _MATRICES.mT[None]
+_RELATIVE: Final = (_PRODUCTS[:, :, None] == _MATRICES).all(axis=(-1, -2)).argmax(axis=-1)

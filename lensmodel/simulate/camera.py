@@ -173,7 +173,6 @@ class BlurOptions:
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
     size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
     step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
-    lateral: bool = True  # whether to simulate lateral colour
 
     def __post_init__(self) -> None:
         if self.size < 3 or self.size % 2 == 0:
@@ -183,11 +182,7 @@ class BlurOptions:
 
 
 def blurred(
-    scene: Planes,
-    lens: CameraLens,
-    settings: LensSettings,
-    frame: Frame,
-    options: BlurOptions | None = None,
+    scene: Planes, lens: CameraLens, settings: LensSettings, frame: Frame, options: BlurOptions | None = None
 ) -> Planes:
     """Blur a scene `(3, H + 2 m, W + 2 m)` as the lens does: every point becomes the kernel of its place.
 
@@ -301,7 +296,7 @@ def _kernel(
 ) -> NDArray[np.float64]:
     channel: Channel = settings.channel
     offset, r = (0.0, 0.0), math.hypot(*h)
-    if options.lateral and channel != "g" and r > 0:
+    if channel != "g" and r > 0:
         outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
         offset = (-outwards * h[1] / r, outwards * h[0] / r)
     return lens.kernel_at_field(h, settings, options.size, pitch_um=options.pitch_um, offset=offset)

@@ -105,7 +105,7 @@ def test_point_light_becomes_the_kernel_of_its_place() -> None:
     lens, frame = GridLens(linear_field()), Frame(120, 160)
     scene = np.zeros((3, 134, 174), dtype=np.float32)
     scene[:, 7 + 30, 7 + 120] = 1.0
-    options = BlurOptions(size=15, step=0.25, lateral=False)
+    options = BlurOptions(size=15, step=0.25)
     image = blurred(scene, lens, LensSettings(), frame, options)
     expected = lens.field().kernel_at(frame.position(30, 120), "g", 15)
 

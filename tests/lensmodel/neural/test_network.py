@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from lab.population.sets import judge, load_sets
+from lab.population.sets import adjusted, judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
-from lensmodel.neural.network import WEIGHTS, adjusted
+from lensmodel.neural.network import WEIGHTS
 from lensmodel.neural.statistics import LENGTH, WINDOW
 from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place
 
@@ -97,7 +97,7 @@ def test_a_new_photo_leaves_the_tokens_of_others_as_they_are(sharp: np.ndarray) 
     both = np.concatenate([alone, network.encode(photo(0.8, seed=5), PLACES, WIDE_OPEN)])
     memory = network.memory(both, np.tile(PLACES, (2, 1)), [WIDE_OPEN] * len(both))
     part = network.memory(alone, PLACES, [WIDE_OPEN] * len(alone))
-    np.testing.assert_allclose(memory.part(np.arange(len(alone))).keys, part.keys, atol=1e-5)
+    np.testing.assert_allclose(memory.keys[:, :, : len(alone)], part.keys, atol=1e-5)
 
 
 def test_softer_photos_give_wider_kernels() -> None:

@@ -115,7 +115,7 @@ def test_strange_planes_have_no_edges_and_no_errors(plane: NDArray[np.float64]) 
 def test_edges_behind_a_lens_are_as_sharp_as_those_in_known_boxes() -> None:
     lens, settings = draw_lens(5, "soft-fast"), LensSettings()
     noise = NoiseModel(1 / 50000, 1e-6)
-    options = BlurOptions(size=41, step=0.3, lateral=False)
+    options = BlurOptions(size=41, step=0.3)
     planes = noisy(blurred(CHART.scene, lens, settings, FRAME, options), noise)
 
     found = find_edges(planes[1], noise=noise)

@@ -224,7 +224,7 @@ def comatic() -> SimulatedLens:
 def test_photographed_chart_agrees_with_the_kernels_own_mtf(comatic: SimulatedLens) -> None:
     frame = Frame(720, 960)
     chart = edge_chart(frame, margin=16, guard=16)
-    options = BlurOptions(size=31, step=0.16, lateral=False)
+    options = BlurOptions(size=31, step=0.16)
     image = blurred(chart.scene, comatic, LensSettings(), frame, options)[1]
     measured = measure_edges(image, [edge.box for edge in chart.edges])
 

@@ -40,7 +40,7 @@ from lensmodel.simulate import (
 FRAME = Frame(240, 360)
 SIZE = 31
 HALF = SIZE // 2
-COARSE = BlurOptions(size=SIZE, step=0.5, lateral=False)
+COARSE = BlurOptions(size=SIZE, step=0.5)
 
 
 class Grey(SimulatedLens):
@@ -84,7 +84,7 @@ def lights(comatic: SimulatedLens) -> tuple[Planes, list[tuple[int, int]]]:
         for r, c in places
         if 2 * HALF <= r < FRAME.height and 2 * HALF <= c < FRAME.width
     ]
-    image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.12, lateral=False))
+    image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.12))
     return image, inside
 
 
@@ -137,7 +137,7 @@ def test_photo_of_a_constant_is_constant() -> None:
     # defocused, since the centre of mass of a kernel much sharper than a pixel jumps between
     # places by a tenth of a pixel, and that distortion is brightness
     soft = Grey((Aberrations(f_number=2.8, astigmatism=1.0, coma=1.0, defocus=2.0),))
-    options = BlurOptions(size=SIZE, step=0.25, lateral=False)
+    options = BlurOptions(size=SIZE, step=0.25)
     image = blurred(constant(FRAME.height, FRAME.width, 0.5), soft, LensSettings(), FRAME, options)
 
     assert np.abs(image / 0.5 - 1.0).max() < 1e-3

@@ -60,10 +60,7 @@ def resized_image(image: Image, shape: tuple[int, int]) -> Image:
     ratios = [have / want for have, want in zip(image.shape, shape, strict=True)]
     sigma = [max(ratio - 1.0, 0.0) / 2.0 for ratio in ratios]
     smooth = ndimage.gaussian_filter(image, sigma, mode="mirror") if max(sigma) > 0 else image
-    places = [(np.arange(want) + 0.5) * ratio - 0.5 for want, ratio in zip(shape, ratios, strict=True)]
-    coefficients = ndimage.spline_filter(smooth, order=3, mode="mirror")
-    grid = np.meshgrid(*places, indexing="ij")
-    return ndimage.map_coordinates(coefficients, grid, order=3, mode="mirror", prefilter=False)
+    return ndimage.zoom(smooth, [1.0 / ratio for ratio in ratios], mode="mirror", grid_mode=True)
 
 
 def level_shape(shape: tuple[int, int], level: int) -> tuple[int, int]:

@@ -73,22 +73,14 @@ def _bins() -> tuple[NDArray[np.int32], NDArray[np.float32]]:
 
 
 _BIN, _COUNT = _bins()
+_INSIDE: Final = _BIN >= 0
 _HANN: Final = np.outer(np.hanning(WINDOW), np.hanning(WINDOW)).astype(np.float32)
 
 
-@jit
-def _ring_means(
-    spectrum: NDArray[np.complex64], index: NDArray[np.int32], count: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _ring_means(spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Mean of |F|^2 in each bin."""
-    total = np.zeros(count.size, np.float64)
-    for i in range(index.shape[0]):
-        for j in range(index.shape[1]):
-            k = index[i, j]
-            if k >= 0:
-                value = spectrum[i, j]
-                total[k] += value.real * value.real + value.imag * value.imag
-    return (total / count).astype(np.float32)
+    power = spectrum.real**2 + spectrum.imag**2
+    return (np.bincount(_BIN[_INSIDE], power[_INSIDE]) / _COUNT).astype(np.float32)
 
 
 @jit
@@ -227,7 +219,7 @@ def patch_statistics(
         middle = float((mosaic * weight).sum() / max(float(weight.sum()), _TINY))
         spectrum = scipy.fft.rfft2((mosaic - np.float32(middle)) * weight)
         noise = float((_HANN * weight).sum()) * (read * read + shot * max(mean, 0.0)) + _TINY
-        power = np.maximum(_ring_means(spectrum, _BIN, _COUNT) - noise, 0.0) + _FLOOR * noise
+        power = np.maximum(_ring_means(spectrum) - noise, 0.0) + _FLOOR * noise
         log_power = np.log(power)
         low = float(np.log(power[: _LOW_RINGS * _HALF].mean()))
         powers.append(log_power[: rings * _HALF] - low)

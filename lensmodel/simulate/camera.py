@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import signal
 from scipy.interpolate import CubicSpline
 
 from lensmodel.core.errors import InvalidInputError
@@ -234,7 +234,7 @@ def blurred(
             for j, (along, col_weights) in enumerate(hats[1]):
                 light = padded[index, down, along] * np.outer(row_weights, col_weights).astype(np.float32)
                 if light.size:
-                    image = _convolved(light, kernels[i, j])
+                    image = signal.fftconvolve(light, kernels[i, j])
                     rest = out[index, down.start :, along.start :]
                     rest[: image.shape[0], : image.shape[1]] += image
     inner = out[:, 2 * half : 2 * half + frame.height, 2 * half : 2 * half + frame.width]
@@ -300,14 +300,6 @@ def _kernel(
         outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
         offset = (-outwards * h[1] / r, outwards * h[0] / r)
     return lens.kernel_at_field(h, settings, options.size, pitch_um=options.pitch_um, offset=offset)
-
-
-def _convolved(light: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Full convolution, larger than `light` by the side of the kernel less one."""
-    shape = (light.shape[0] + kernel.shape[0] - 1, light.shape[1] + kernel.shape[1] - 1)
-    grid = [int(fft.next_fast_len(n, real=True)) for n in shape]
-    product = fft.rfft2(light, s=grid) * fft.rfft2(kernel, s=grid)
-    return fft.irfft2(product, s=grid, overwrite_x=True)[: shape[0], : shape[1]]
 
 
 _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100

@@ -19,7 +19,7 @@ from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
 from lensmodel.photo.arrays import photo_from_array
-from lensmodel.photo.tags.location import gps_directory
+from lensmodel.photo.location import gps_directory
 from lensmodel.workflow.calibrating import Calibration, LensStore
 from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
@@ -294,7 +294,7 @@ def correct(
         color_space=color_space,
         quality=quality,
         description=description,
-        gps=gps_directory(source) if keep_location and source is not None else None,
+        gps=gps_directory(source) if keep_location and source is not None else {},
     )
     return corrected
 

@@ -39,7 +39,7 @@ from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch, selectors
 from lensmodel.patches.windows import Rejection
 from lensmodel.photo.lateral import LateralColour
-from lensmodel.photo.tags.location import find_location
+from lensmodel.photo.location import find_location
 from lensmodel.report import lens_report
 from lensmodel.workflow import correcting, sampling
 

@@ -1,9 +1,9 @@
 """Photo files in and out: RAW, DNG, TIFF, PNG, JPEG; EXIF, ICC; which lens it was."""
 
+from lensmodel.photo.containers import HEAD_BYTES, sniff
 from lensmodel.photo.development import develop, inspect
-from lensmodel.photo.headers.opening import HEAD_BYTES, sniff
+from lensmodel.photo.metadata import is_placeholder, read_metadata
 from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.tags.metadata import is_placeholder, read_metadata
 from lensmodel.photo.values import (
     ColorSpace,
     Encoding,

@@ -316,12 +316,11 @@ def profile_by_chunks(icc: bytes | None, chunks: Mapping[bytes, bytes]) -> bytes
 
 
 def profile_by_tags(
-    colour_space: int | None,
+    colour_space: float | None,
     interoperability: str | None,
     white: Sequence[float],
     primaries: Sequence[float],
     gamma: float | None,
-    transfer: Sequence[float],
 ) -> bytes | None:
     """Profile of a TIFF or JPEG by its tags; None is sRGB, or nothing that can be used."""
     if colour_space == 1:
@@ -329,9 +328,5 @@ def profile_by_tags(
     if interoperability == "R03" or colour_space == 2:
         return named_profile("adobergb")
     curve: DeclaredCurve = gamma if gamma is not None and 0.1 < gamma < 10.0 else None
-    if len(transfer) in {256, 768, 65536, 196608}:
-        table = np.reshape(transfer, (-1, 256 if len(transfer) < 1000 else 65536)) / 65535.0
-        curve = np.stack([row[np.rint(np.linspace(0, len(row) - 1, 4096)).astype(int)] for row in table])
-        curve = curve if len(curve) == 3 else curve[0]
     space = ColourSpace.of(white, primaries) if len(white) or len(primaries) else BT709
     return None if space is None else space.profile(curve)

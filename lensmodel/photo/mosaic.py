@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.types import BayerPattern, Plane
+from lensmodel.photo.containers import require_known_mosaic
 from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_defects, suspects
 
 _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
@@ -30,22 +31,6 @@ _EDGE: Final = 0.02
 
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""
-
-
-def require_known_mosaic(rows: Sequence[str]) -> None:
-    """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6."""
-    # the shorter of the rows counts: a damaged file may name fewer colours than it says
-    height, width = len(rows), min(map(len, rows), default=0)
-    if (height, width) == (6, 6):
-        return
-    if (height, width) == (2, 2):
-        diagonals = {"".join(sorted(rows[0][k] + rows[1][1 - k])) for k in (0, 1)}
-        if diagonals == {"GG", "BR"}:
-            return
-    raise UnsupportedFormatError(
-        f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only Bayer "
-        "mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.core.types import NoiseModel, Plane
+from lensmodel.core.types import NoiseModel, Plane, Planes
 
 BLOCK: Final = 8
 """Side of the blocks in pixels: flat places of this size exist in almost any photo."""
@@ -59,17 +60,28 @@ def estimate_noise(
     return NoiseModel(model.shot, max(model.read, step * step / 12.0))
 
 
-def coding_noise(coarseness: float, codes: NDArray[np.floating]) -> NoiseModel:
+def coding_noise(coarseness: float, curve: NDArray[np.floating]) -> NoiseModel | None:
     """Noise that a JPEG's rounding of cosine coefficients makes: a uniform error of step^2 / 12 in each.
 
     It is not seen in flat places, where the coefficients are zero before and after, but where detail is.
-    The middle one of the steps speaks for all: the coarsest are those of frequencies of which a lens
-    leaves little.
+    The middle one of the steps, `coarseness`, speaks for all: the coarsest are those of frequencies of which
+    a lens leaves little. 0 is no such rounding; `curve` is the light of the codes of 16 bits.
     """
+    if not coarseness:
+        return None
+    codes = curve[::257]
     levels, widths = codes[1:-1].astype(np.float64), np.gradient(codes)[1:-1]
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
     design = np.stack([levels, np.ones_like(levels)], axis=1) / variances[:, None]
     return NoiseModel(*_non_negative(design, np.ones_like(levels)))
+
+
+def grain_of(
+    planes: Planes, noise: Sequence[NoiseModel], clip: Sequence[float]
+) -> tuple[float, float, float]:
+    """`graininess` of each plane."""
+    r, g, b = (graininess(*of_plane) for of_plane in zip(planes, noise, clip, strict=True))
+    return r, g, b
 
 
 def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:

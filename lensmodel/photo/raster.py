@@ -1,4 +1,4 @@
-"""TIFF, PNG and JPEG pixels in full precision, as `(row, col, channel)` of the file's numbers."""
+"""TIFF, PNG and JPEG: their numbers in full precision, and developed to linear light."""
 
 from __future__ import annotations
 
@@ -19,9 +19,16 @@ from lensmodel.core.errors import (
     LensModelError,
     NotAnImageError,
     TruncatedImageError,
+    UnreadablePhotoError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.headers.header import Header
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import Planes
+from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
+from lensmodel.photo.containers import Header
+from lensmodel.photo.metadata import Said
+from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
+from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, Transfer
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col)` or `(row, col, channel)`."""
@@ -30,6 +37,66 @@ UNDECODABLE: Final = (Image.DecompressionBombError, OSError, SyntaxError, ValueE
 """What Pillow raises at pictures that are damaged or hostile."""
 
 _PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
+
+
+_TURNED: Final = (
+    "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
+    "and the more these differ, the less is corrected"
+)
+
+
+def develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
+    """Decode a picture and turn its numbers into linear light by its transfer curve."""
+    header, (pixels, transparent) = said.header, read_pixels(path, said.header)
+    pixels = np.ascontiguousarray(np.rot90(pixels, info.turns or 0))
+    height, width = pixels.shape[:2]
+    if (height, width) != (info.height, info.width):
+        raise UnreadablePhotoError(
+            f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
+        )
+    transfer, icc = _transfer_of(said, pixels)
+    curves = curves_of(transfer, icc)
+    planes: Planes = np.empty((3, height, width), dtype=np.float32)
+    for k, curve in enumerate(curves):
+        numbers = pixels[:, :, k]
+        planes[k] = numbers if numbers.dtype.kind == "f" and transfer == "linear" else decode(numbers, curve)
+    green, code = curves[1], {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
+    codes = green[::code] if pixels.dtype.itemsize == 1 else None
+    clip = max(1.0, float(planes.max())) if pixels.dtype.kind == "f" else 1.0
+    r, g, b = (estimate_noise(plane, clip, float(green[code] - green[0]), codes) for plane in planes)
+    return LinearPhoto(
+        planes=planes,
+        frame=Frame(height, width),
+        noise=(r, g, b),
+        clip=(clip,) * 3,
+        info=info,
+        encoding=Encoding(
+            bit_depth=8 * pixels.dtype.itemsize,
+            transfer=transfer,
+            icc=icc,
+            metadata=info.metadata.without_serials(),
+        ),
+        pipeline=f"{info.kind}/{transfer}/1",
+        grain=grain_of(planes, (r, g, b), (clip,) * 3),
+        coding_noise=coding_noise(header.coarseness, green),
+        chroma_step=header.chroma_step[::-1] if info.turns else header.chroma_step,
+        remarks=(
+            *(("its transparency is dropped",) if transparent else ()),
+            *((_TURNED,) if info.turns is None else ()),
+        ),
+    )
+
+
+def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None]:
+    """Which curve the file's numbers follow, and the profile that goes back into the output."""
+    icc = said.header.icc
+    if icc is not None and matrix_profile(icc) is not None:
+        return "icc", icc
+    if pixels.dtype.kind == "f":
+        return "linear", None
+    if icc is None and (declared := said.profile()) is not None:
+        return "icc", declared
+    return "srgb", icc if icc is not None and icc_space(icc) == "RGB" else None
 
 
 def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:

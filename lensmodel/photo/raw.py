@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import rawpy
 from numpy.typing import NDArray
+from PIL import Image
 
 from lensmodel.core.errors import (
     LensModelError,
@@ -20,13 +22,30 @@ from lensmodel.core.errors import (
     TruncatedImageError,
     UnsupportedFormatError,
 )
-from lensmodel.core.types import BayerPattern, NoiseModel, Planes
-from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import NoiseModel, Planes
+from lensmodel.photo import opcodes
+from lensmodel.photo.colour import (
+    SRGB_TO_XYZ_D65,
+    Matrix,
+    camera_to_srgb,
+    curves_of,
+    matrix3,
+    srgb_to_linear,
+)
 from lensmodel.photo.defects import Suspects
+from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
-from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.rendition import balance_of_rendition
-from lensmodel.photo.values import LensIdentity, Matrix3, PhotoMetadata, PlaneNoise
+from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
+from lensmodel.photo.raster import UNDECODABLE, unwarned
+from lensmodel.photo.values import (
+    Encoding,
+    LensIdentity,
+    LinearPhoto,
+    PhotoInfo,
+    PhotoMetadata,
+    PlaneNoise,
+)
 
 log = logging.getLogger(__name__)
 
@@ -45,23 +64,6 @@ _ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}
 
 _LEAST_SHARE: Final = 0.25
 """No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
-
-
-@dataclass(frozen=True, slots=True)
-class DevelopedRaw:
-    """What LibRaw made of a file, once its defective pixels were replaced; fields as in `LinearPhoto`."""
-
-    planes: Planes
-    noise: PlaneNoise
-    sensor_noise: PlaneNoise | None
-    clip: tuple[float, float, float]
-    white_balance: tuple[float, float, float]
-    to_srgb: Matrix3 | None
-    xyz_to_camera: Matrix3 | None
-    bits: int
-    pipeline: str
-    cfa: BayerPattern | None
-    defects: int
 
 
 _KNOWN_WHOLE: Final = ((6, b"HEAPCCDR"), (8, b"CR\x02"), (0, b"\0MRM"))
@@ -115,52 +117,66 @@ def exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
 
 
 def develop_raw(
-    raw: rawpy.RawPy,
-    linear_white: tuple[int, ...] = (),
-    others: Sequence[Suspects] = (),
-) -> DevelopedRaw:
-    """Develop an open RAW file to linear camera RGB.
+    raw: rawpy.RawPy, said: Said, info: PhotoInfo, others: Sequence[Suspects] = ()
+) -> LinearPhoto:
+    """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced.
 
     No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
-    1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
-    states, of all channels or of each; `others` tell what other photos of the body show of its defects.
+    1.0 is the level at which the sensor saturates. `others` tell what other photos of the body show of its
+    defects.
     """
-    mosaic = Mosaic.of(raw)
+    header, mosaic = said.header, Mosaic.of(raw)
     white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
     if mosaic is not None:
         white, clip = mosaic.saturation()
     sensor_noise = _sensor_noise(mosaic, white)
     defects = 0 if mosaic is None else mosaic.repair(others)
     balance = _white_balance(raw, mosaic)
-    spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
-    planes = _developed(raw, white, balance, spans)
+    planes = _developed(raw, white, balance, _spans(raw, header.white) if mosaic is None else None)
+    _, height, width = planes.shape
+    noise = _plane_noise(planes, sensor_noise, balance)
+    cfa = None if mosaic is None else mosaic.bayer_pattern()
+    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
+    steps = [] if header.coarseness else opcodes.read(header.opcodes_2)
+    kept, lost = (steps, []) if mosaic is None else opcodes.demosaiced(steps, cfa)
     to_srgb, xyz_to_camera = _colour(raw, balance)
-    return DevelopedRaw(
+    return LinearPhoto(
         planes=planes,
-        noise=_plane_noise(planes, sensor_noise, balance),
-        sensor_noise=sensor_noise,
+        frame=Frame(height, width),
+        noise=noise,
         clip=clip,
+        info=replace(info, width=width, height=height),
+        encoding=Encoding(
+            bit_depth=max(1, white.bit_length()),
+            metadata=info.metadata.without_serials(),
+            white_balance=balance,
+            to_srgb=None if to_srgb is None else matrix3(to_srgb),
+            xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
+            baseline_exposure=said.baseline_exposure(),
+            opcodes_2=opcodes.written(kept),
+            opcodes_3=opcodes.written(opcodes.read(header.opcodes_3)),
+        ),
+        pipeline=f"raw/{'none' if mosaic is None else 'ahd' if mosaic.is_bayer else 'xtrans'}/1",
         white_balance=balance,
-        to_srgb=None if to_srgb is None else matrix3(to_srgb),
-        xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
-        bits=max(1, white.bit_length()),
-        pipeline=f"raw/{_pipeline_step(mosaic)}/1",
-        cfa=None if mosaic is None else mosaic.bayer_pattern(),
-        defects=defects,
+        sensor_noise=sensor_noise,
+        coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1]),
+        cfa=cfa,
+        grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
+        remarks=(
+            *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
+            *(("1 defective pixel of its sensor is replaced",) if defects == 1 else ()),
+            *((f"{defects} defective pixels of its sensor are replaced",) if defects > 1 else ()),
+        ),
     )
 
 
-def _pipeline_step(mosaic: Mosaic | None) -> str:
-    if mosaic is None:
-        return "none"
-    return "ahd" if mosaic.is_bayer else "xtrans"
-
-
 def _spans(raw: rawpy.RawPy, white: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Levels from black to white of each channel without a mosaic; None where they make no sense.
+    """Levels from black to the white that a DNG states, of channels without a mosaic; None if they are wrong.
 
     LibRaw takes the black of such files off their values, but not off their white.
     """
+    if not white:
+        return None
     colours = min(raw.num_colors, 3)
     spans = np.resize(np.resize(white, colours) - np.array(raw.black_level_per_channel[:colours], float), 3)
     return spans if spans.min() > 0.0 else None
@@ -272,3 +288,105 @@ def _colour(
         return None, None
     balanced = np.linalg.inv(SRGB_TO_XYZ_D65 @ of_file)
     return of_file, balanced / np.asarray(white_balance)[:, None]
+
+
+# --- white balance as the camera applied it, out of its own JPEG of the photo ---------------------
+
+_Grid: TypeAlias = NDArray[np.float64]
+"""Means over blocks, `(row, col, colour)`."""
+
+_BLOCKS: Final = 96
+"""Blocks along the longer side: a few pixels of misplacement do not matter then, and 6,000 are enough."""
+
+_SMALLEST_JPEG: Final = 2 * _BLOCKS  # pixels; the shorter side may have half, one to a block (chosen)
+_MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory: so many take 200 MB (chosen)
+_ASPECT: Final = 0.03
+"""How much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs."""
+
+_LIKENESS: Final = 0.8
+"""Least correlation of the lightness of both; a JPEG of something else stays far below."""
+
+_MIDTONES: Final = (0.15, 0.8)
+"""Numbers of the JPEG, full is 1, in which a camera's tone curve is nearest to sRGB."""
+
+_UNCLIPPED: Final = 0.5  # largest mean of a block, full is 1 (chosen): leaves brighter pixels room
+_NEUTRAL: Final = 1.6
+"""Largest over smallest of the linear colours: curves and saturation settings change strong colours more."""
+
+_LEAST_BLOCKS: Final = 24
+"""Fewer near-neutral blocks than this may all be of one object that is not grey."""
+
+
+def balance_of_rendition(
+    raw: rawpy.RawPy, mosaic: Mosaic | None, to_srgb: Matrix | None
+) -> tuple[float, float] | None:
+    """Estimate the white balance from the JPEG that the camera put beside its RAW data.
+
+    Some cameras (the EOS D30 with automatic white balance) write no multipliers into their RAW files. What
+    they chose stands in that JPEG.
+
+    With J the JPEG in linear light, C the matrix from balanced camera colours to sRGB, and s the means of
+    the sensor over the same block, the multipliers of red and blue relative to green are::
+
+        m_k = median over near-neutral blocks of (C^-1 J)_k s_g / ((C^-1 J)_g s_k)
+    """
+    if mosaic is None or not mosaic.is_bayer or (picture := _jpeg_of(raw)) is None:
+        return None
+    sites = mosaic.sites(mosaic.white)
+    if len(sites) != 3:
+        return None
+    height, width = sites[0].shape
+    rows, cols = round(_BLOCKS * height / max(height, width)), round(_BLOCKS * width / max(height, width))
+    if min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
+        return None
+    if abs(np.log(picture.width * height / (picture.height * width))) > _ASPECT:
+        return None
+    numbers = np.asarray(picture.resize((4 * cols, 4 * rows), Image.Resampling.BOX), dtype=np.float64) / 255.0
+    sensor = np.stack([_block_means(site[:, :, None], rows, cols)[..., 0] for site in sites], axis=-1)
+    shown = _block_means(srgb_to_linear(numbers), rows, cols)
+    return _balance(_block_means(numbers, rows, cols), shown, sensor, to_srgb)
+
+
+def _balance(
+    numbers: _Grid, shown: _Grid, sensor: _Grid, to_srgb: Matrix | None
+) -> tuple[float, float] | None:
+    picture, values = (np.sqrt(np.maximum(grid[..., 1], 0.0)).ravel() for grid in (shown, sensor))
+    if min(float(picture.std()), float(values.std())) < 1e-6:
+        return None
+    if float(np.corrcoef(picture, values)[0, 1]) < _LIKENESS:
+        return None
+    most = numbers.max(axis=-1)
+    used = (most > _MIDTONES[0]) & (most < _MIDTONES[1]) & (sensor.max(axis=-1) < _UNCLIPPED)
+    used &= (shown.max(axis=-1) < _NEUTRAL * shown.min(axis=-1)) & (sensor.min(axis=-1) > 0.0)
+    balanced = shown[used] if to_srgb is None else shown[used] @ np.linalg.inv(to_srgb).T
+    part = sensor[used][balanced.min(axis=-1) > 0.0]
+    balanced = balanced[balanced.min(axis=-1) > 0.0]
+    if len(part) < _LEAST_BLOCKS:
+        return None
+    red, green, blue = (balanced / part).T
+    return float(np.median(red / green)), float(np.median(blue / green))
+
+
+def _jpeg_of(raw: rawpy.RawPy) -> Image.Image | None:
+    """Decode the embedded JPEG, scaled down where it is large; `None` without a sound one."""
+    try:
+        thumb = raw.extract_thumb()
+        if thumb.format != rawpy.ThumbFormat.JPEG or not isinstance(thumb.data, bytes):
+            return None
+        with unwarned():
+            picture = Image.open(io.BytesIO(thumb.data), formats=("JPEG",))
+            if picture.width * picture.height > _MOST_JPEG_PIXELS or min(picture.size) < _SMALLEST_JPEG // 2:
+                return None
+            picture.draft("RGB", (4 * _BLOCKS, 4 * _BLOCKS))
+            return picture.convert("RGB") if picture.mode in {"RGB", "L"} else None
+    except (rawpy.LibRawError, *UNDECODABLE):
+        return None
+
+
+def _block_means(values: NDArray[np.floating], rows: int, cols: int) -> _Grid:
+    """Means over `rows` x `cols` blocks that cover the whole, none of them empty."""
+    height, width = values.shape[:2]
+    tops, lefts = np.arange(rows) * height // rows, np.arange(cols) * width // cols
+    sums = np.add.reduceat(np.add.reduceat(values.astype(np.float64), tops, axis=0), lefts, axis=1)
+    counts = np.diff(np.append(tops, height))[:, None] * np.diff(np.append(lefts, width))[None, :]
+    return np.asarray(sums / counts[:, :, None])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.core.errors import TurnedPixelsError
-from lensmodel.photo.headers.header import Header
+from lensmodel.photo.containers import Header
 from lensmodel.photo.raster import UNDECODABLE, unwarned
 from lensmodel.photo.values import PhotoInfo, PhotoMetadata
 
@@ -65,12 +65,9 @@ def require_known_turn(info: PhotoInfo) -> None:
 def _thumbnail(header: Header) -> Image.Image | None:
     for reader in header.tiff:
         tags, _ = reader.directory(reader.directory(reader.first)[1])
-        if _OFFSET in tags and _LENGTH in tags:
-            start, length = tags[_OFFSET].integer(), tags[_LENGTH].integer()
-            if start is None or length is None:
-                continue
+        if start := tags.integer(_OFFSET):
             begin = reader.base + start
-            data = bytes(reader.buffer[begin : begin + min(length, _MOST_BYTES)])
+            data = bytes(reader.buffer[begin : begin + min(tags.integer(_LENGTH), _MOST_BYTES)])
             try:
                 with unwarned():
                     image = Image.open(io.BytesIO(data), formats=("JPEG",))

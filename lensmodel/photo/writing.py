@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
@@ -32,19 +32,11 @@ from lensmodel.photo.colour import (
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.dng import write_linear_dng, write_strip
-from lensmodel.photo.tags.exif_block import (
-    BYTE,
-    EXIF_POINTER,
-    GPS_POINTER,
-    UNDEFINED,
-    Directory,
-    exif_block,
-    exif_directory,
-    main_directory,
-)
-from lensmodel.photo.tags.xmp import xmp_packet
-from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
+from lensmodel.photo.dng import NONE, write_linear_dng
+from lensmodel.photo.metadata import exif_tags, main_tags
+from lensmodel.photo.tiff import BYTE, EXIF, GPS, UNDEFINED, Written, laid_out, shorts, write_strip
+from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, PhotoMetadata, remarks_log
+from lensmodel.photo.xmp import xmp_packet
 
 _ROWS: Final = 256
 """Rows that are encoded at a time: bounds the memory of the conversion."""
@@ -79,7 +71,7 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
-    gps: Directory | None = None,
+    gps: Written = NONE,
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
@@ -102,68 +94,78 @@ def write_image(
         )
     if not 1 <= quality <= 100:
         raise InvalidInputError(f"JPEG quality must lie in 1..100, got {quality}")
-    xmp = xmp_packet(encoding.metadata, description, lens)
+    path = Path(path)
+    carried = _Carried(encoding.metadata.without_serials(), description, lens, gps)
     if format == "dng":
-        _write_dng(Path(path), planes, encoding, description, xmp, gps)
+        _write_dng(path, planes, encoding, carried)
         return
-    if encoding.opcodes_2 or encoding.opcodes_3:
+    steps = [step.name for block in (encoding.opcodes_2, encoding.opcodes_3) for step in opcodes.read(block)]
+    if steps:
         remarks_log.warning(
             "%s: the corrections that the DNG leaves to raw converters (%s) are not in it; only DNG output "
             "keeps them",
-            Path(path).name,
-            ", ".join(
-                step.name
-                for block in (encoding.opcodes_2, encoding.opcodes_3)
-                for step in opcodes.read(block)
-            ),
+            path.name,
+            ", ".join(steps),
         )
     if encoding.bit_depth == 32 and format != "tiff32" and (beyond := float((planes > 1.0).mean())) > 0.0:
         remarks_log.warning(
             "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
-            Path(path).name,
+            path.name,
             100.0 * beyond,
         )
     if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
         color_space = "camera-linear"
     target = _target(encoding, color_space)
-    carried = _Carried(encoding, description, xmp, gps, target.icc)
     top = {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535)
-    with atomic(Path(path)) as file:
+    with atomic(path) as file:
         pixels = _encoded(planes, target, top)
         if format == "jpeg":
-            _write_jpeg(file, pixels, carried, quality)
+            Image.fromarray(pixels).save(
+                file,
+                "JPEG",
+                quality=quality,
+                subsampling=0,
+                optimize=True,
+                icc_profile=target.icc,
+                exif=b"Exif\0\0" + carried.exif(encoding.orientation),
+                xmp=carried.xmp,
+            )
         elif format.startswith("tiff"):
-            _write_tiff(file, pixels, carried)
+            _write_tiff(file, pixels, carried, target.icc)
         else:
-            _write_png(file, pixels, carried)
+            _write_png(file, np.ascontiguousarray(upright(pixels, encoding.orientation)), carried, target.icc)
 
 
 # --- colour ------------------------------------------------------------------------------------
 
 
 def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
-    rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
+    rgb_icc = _rgb_profile(encoding)
     if color_space == "camera-linear":
-        profile = linear_profile(_to_xyz_d50(encoding, rgb_icc), "lensmodel linear")
+        profile = linear_profile(_to_xyz_d50(encoding), "lensmodel linear")
         return _Target((1.0, 1.0, 1.0), None, curves_of("linear"), profile)
     if encoding.to_srgb is None and rgb_icc is not None and color_space == "same":
-        curves = curves_of(encoding.transfer, rgb_icc)
-        return _Target((1.0, 1.0, 1.0), None, curves, rgb_icc)
+        return _Target((1.0, 1.0, 1.0), None, curves_of(encoding.transfer, rgb_icc), rgb_icc)
     # White must stay white: where all channels clip, no multiplier may be below 1.
     r, g, b = (float(w) / min(encoding.white_balance) for w in encoding.white_balance)
-    return _Target((r, g, b), _to_srgb(encoding, rgb_icc), curves_of("srgb"), named_profile("srgb"))
+    return _Target((r, g, b), _to_srgb(encoding), curves_of("srgb"), named_profile("srgb"))
 
 
-def _to_srgb(encoding: Encoding, rgb_icc: bytes | None) -> Matrix | None:
+def _rgb_profile(encoding: Encoding) -> bytes | None:
+    return encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
+
+
+def _to_srgb(encoding: Encoding) -> Matrix | None:
     if encoding.to_srgb is not None:
         return np.asarray(encoding.to_srgb)
+    rgb_icc = _rgb_profile(encoding)
     profile = None if rgb_icc is None else matrix_profile(rgb_icc)
     return None if profile is None else np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ profile.to_xyz
 
 
-def _to_xyz_d50(encoding: Encoding, rgb_icc: bytes | None) -> Matrix:
+def _to_xyz_d50(encoding: Encoding) -> Matrix:
     """Planes to XYZ under D50, white balance included."""
-    to_srgb = _to_srgb(encoding, rgb_icc)
+    to_srgb = _to_srgb(encoding)
     balanced = D65_TO_D50 @ SRGB_TO_XYZ_D65 @ (np.eye(3) if to_srgb is None else to_srgb)
     matrix: Matrix = balanced * np.asarray(encoding.white_balance)
     return matrix
@@ -199,50 +201,37 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 class _Carried:
     """What a file carries beside its pixels."""
 
-    encoding: Encoding
+    metadata: PhotoMetadata
     description: str
-    xmp: bytes
-    gps: Directory | None
-    icc: bytes
+    lens: str
+    gps: Written
+
+    @property
+    def xmp(self) -> bytes:
+        return xmp_packet(self.metadata, self.description, self.lens)
 
     def exif(self, orientation: int) -> bytes:
-        return exif_block(self.encoding.metadata, orientation, self.description, self.gps)
+        below = {EXIF: exif_tags(self.metadata), GPS: self.gps}
+        return laid_out(main_tags(self.metadata, orientation, self.description), below)
 
 
-def _write_tiff(file: BinaryIO, pixels: Pixels, carried: _Carried) -> None:
-    metadata = carried.encoding.metadata
-    tags = main_directory(metadata, metadata.orientation, carried.description)
-    tags.shorts(258, *(8 * pixels.dtype.itemsize,) * 3)
-    tags.shorts(259, 1)  # not compressed
-    tags.shorts(262, 2)  # RGB
-    tags.shorts(277, 3)
-    tags.shorts(284, 1)  # interleaved
-    tags.shorts(339, *(3 if pixels.dtype.kind == "f" else 1,) * 3)  # SampleFormat
-    tags.raw(XMP_TAG, BYTE, carried.xmp)
-    tags.raw(ICC_TAG, UNDEFINED, carried.icc)
-    below = {EXIF_POINTER: exif_directory(metadata), GPS_POINTER: carried.gps or Directory()}
-    write_strip(file, tags, below, pixels)
+def _write_tiff(file: BinaryIO, pixels: Pixels, carried: _Carried, icc: bytes) -> None:
+    metadata = carried.metadata
+    tags = {
+        **main_tags(metadata, metadata.orientation, carried.description),
+        262: shorts(2),  # RGB
+        339: shorts(*(3 if pixels.dtype.kind == "f" else 1,) * 3),  # SampleFormat
+        XMP_TAG: (BYTE, carried.xmp),
+        ICC_TAG: (UNDEFINED, icc),
+    }
+    write_strip(file, tags, {EXIF: exif_tags(metadata), GPS: carried.gps}, pixels)
 
 
-def _write_jpeg(file: BinaryIO, pixels: Pixels, carried: _Carried, quality: int) -> None:
-    Image.fromarray(pixels).save(
-        file,
-        "JPEG",
-        quality=quality,
-        subsampling=0,
-        optimize=True,
-        icc_profile=carried.icc,
-        exif=b"Exif\0\0" + carried.exif(carried.encoding.orientation),
-        xmp=carried.xmp,
-    )
-
-
-def _write_png(file: BinaryIO, pixels: Pixels, carried: _Carried) -> None:
-    turned = np.ascontiguousarray(upright(pixels, carried.encoding.orientation))
-    data = imagecodecs.png_encode(turned, **_PNG_OPTIONS)
+def _write_png(file: BinaryIO, pixels: Pixels, carried: _Carried, icc: bytes) -> None:
+    data = imagecodecs.png_encode(pixels, **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
-    file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(carried.icc)))
+    file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
     file.write(_chunk(b"eXIf", carried.exif(1)))
     file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + carried.xmp))
     if carried.description:
@@ -250,14 +239,11 @@ def _write_png(file: BinaryIO, pixels: Pixels, carried: _Carried) -> None:
     file.write(data[header_end:])
 
 
-def _write_dng(
-    path: Path, planes: Planes, encoding: Encoding, description: str, xmp: bytes, gps: Directory | None
-) -> None:
-    rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
+def _write_dng(path: Path, planes: Planes, encoding: Encoding, carried: _Carried) -> None:
     to_camera = encoding.xyz_to_camera
     if to_camera is None:
         # To XYZ under D50, and back from D65, which is what the DNG tag means.
-        to_xyz = np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding, rgb_icc)
+        to_xyz = np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding)
         to_camera = matrix3(np.linalg.inv(to_xyz).astype(np.float64))
     r, g, b = encoding.white_balance
     numbers = np.empty(planes.shape, dtype=np.uint16)
@@ -269,13 +255,15 @@ def _write_dng(
         numbers,
         color_matrix=to_camera,
         as_shot_neutral=(1 / r, 1 / g, 1 / b),
-        metadata=replace(encoding.metadata.without_serials(), orientation=encoding.orientation),
-        description=description,
+        metadata=carried.metadata,
+        description=carried.description,
         baseline_exposure=encoding.baseline_exposure,
-        xmp=xmp,
-        opcodes_2=encoding.opcodes_2,
-        opcodes_3=encoding.opcodes_3,
-        gps=gps,
+        more={
+            XMP_TAG: (BYTE, carried.xmp),
+            51009: (UNDEFINED, encoding.opcodes_2) if encoding.opcodes_2 else None,  # OpcodeList2
+            51022: (UNDEFINED, encoding.opcodes_3) if encoding.opcodes_3 else None,
+        },
+        gps=carried.gps,
     )
 
 

@@ -19,10 +19,9 @@ from PIL import Image
 
 from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError
+from lensmodel.photo import read_metadata
 from lensmodel.photo.mosaic import Mosaic
-from lensmodel.photo.raw import opened_raw
-from lensmodel.photo.rendition import balance_of_rendition
-from lensmodel.photo.tags.metadata import read_metadata
+from lensmodel.photo.raw import balance_of_rendition, opened_raw
 
 DATA = Path(os.environ.get("LENSMODEL_TEST_DATA", "no data"))
 Value = bytes | dict[int, "Value"]

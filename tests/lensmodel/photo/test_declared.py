@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from PIL import Image, ImageCms
 from PIL.TiffImagePlugin import IFDRational
 
@@ -173,18 +172,6 @@ def test_jpegs_are_shown_as_their_exif_says(case: str, tmp_path: Path) -> None:
     expected = PIXELS.astype(float) if gamma is None else srgb_of(space, gamma)
     assert np.abs(shown - expected).max() < 8.0
     assert np.abs(shown - expected).mean() < 1.0
-
-
-def test_a_tiff_of_primaries_and_a_transfer_function_is_shown_as_they_say(tmp_path: Path) -> None:
-    table = tuple(int(v) for v in np.rint(65535 * np.linspace(0, 1, 256) ** 1.8))
-    tags = [
-        (318, 5, 2, tuple(n for v in ADOBE[:2] for n in (round(v * 10_000), 10_000)), True),
-        (319, 5, 6, tuple(n for v in ADOBE[2:] for n in (round(v * 10_000), 10_000)), True),
-        (301, 3, 256, table, True),
-    ]
-    tifffile.imwrite(tmp_path / "x.tif", PIXELS, photometric="rgb", metadata=None, extratags=tags)
-
-    assert np.abs(shown_in_srgb(written(tmp_path / "x.tif", tmp_path)) - srgb_of(ADOBE, 1.8)).max() < 3.0
 
 
 def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:

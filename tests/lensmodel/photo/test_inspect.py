@@ -27,7 +27,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
-from lensmodel.photo.headers.ifd import IfdEntry
+from lensmodel.photo.tiff import Tag, Tags
 
 
 def chunk(name: bytes, body: bytes) -> bytes:
@@ -205,9 +205,9 @@ def test_a_tiff_whose_directories_form_a_loop_is_read_once(tmp_path: Path) -> No
 
 
 def test_one_number_of_a_huge_tag_unpacks_no_other() -> None:
-    entry = IfdEntry(kind=5, count=1 << 20, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 20))
+    entry = Tag(kind=5, count=1 << 20, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 20))
     tracemalloc.start()
-    found = entry.number()
+    found = Tags({1: entry}).number(1)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from lensmodel.photo.tags.location import LocationTraces, find_location
+from lensmodel.photo.location import LocationTraces, find_location
 
 LATITUDE = (47.0, 13.0, 14.159)
 SECRET = struct.pack(">II", 14159, 1000), struct.pack("<II", 14159, 1000)

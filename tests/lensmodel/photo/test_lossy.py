@@ -13,8 +13,8 @@ from PIL import Image
 from scipy import ndimage
 
 from lensmodel import photo
+from lensmodel.photo.containers import opened_header
 from lensmodel.photo.dng import write_linear_dng
-from lensmodel.photo.headers.opening import opened_header
 
 SIDE = 256
 

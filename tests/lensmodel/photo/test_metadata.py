@@ -18,7 +18,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.photo.tags.xmp import read_xmp
+from lensmodel.photo.xmp import read_xmp
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
 _LOOKED_UP = {"61182", "Unknown (00 77 48 5C 80 24 24 0E)"}

@@ -26,7 +26,7 @@ from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.photo.tags.xmp import xmp_packet
+from lensmodel.photo.xmp import xmp_packet
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",

@@ -1,0 +1,510 @@
+"""What a photo file says of its picture, before a pixel is decoded: kind, size, and where its metadata lie.
+
+Sources: ITU-T T.81, annex B (JPEG); "Portable Network Graphics, third edition", W3C, 2025, sections 5 and 11;
+"TIFF Revision 6.0", Aldus, 1992; Adobe, "Digital Negative (DNG) Specification" 1.6, 2021; CIFF 1.0, 1997.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import re
+import statistics
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from lensmodel.core.errors import (
+    DecompressionBombError,
+    ImageTooLargeError,
+    NotAnImageError,
+    TruncatedImageError,
+    UnsupportedFormatError,
+)
+from lensmodel.photo.colour import profile_by_chunks
+from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
+from lensmodel.photo.values import FileKind, Limits
+
+HEAD_BYTES: Final = 64
+"""Bytes that `sniff` wants to see."""
+
+MAX_BLOCK_BYTES: Final = 8 << 20
+"""Largest ICC profile or XMP packet that is read."""
+
+BOMB_MEGAPIXELS: Final = 4.0
+"""Below this a false claim costs nothing worth refusing."""
+
+BOMB_PIXELS_PER_BYTE: Final = 200.0
+"""An evenly grey JPEG reaches about 100 pixels a byte, and a photograph is never evenly grey."""
+
+MAX_SEGMENTS: Final = 4096
+"""Segments of a JPEG or chunks of a PNG that are looked at; image data do not count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the container says: kind, size and the blocks in which metadata lie."""
+
+    kind: FileKind  # kind of file
+    width: int = 0  # size as stored; 0 where only LibRaw can tell
+    height: int = 0
+    channels: int = 0  # samples of a pixel; 0 unknown
+    bits: int = 0  # bits of a sample; 0 unknown
+    compression: int = 1  # TIFF tag 259; 1 is none
+    directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
+    tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
+    camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
+    xmp: bytes | None = None  # XMP packet, and ICC profile: of a PNG also one made of what its chunks declare
+    icc: bytes | None = None
+    # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
+    # 8-bit numbers; 0 unknown, or not compressed so
+    coarseness: float = 0.0
+    # WhiteLevel of a DNG, of all channels or of each; empty where it does not say
+    white: tuple[int, ...] = ()
+    opcodes_2: bytes = b""  # OpcodeList2 and 3 of a DNG
+    opcodes_3: bytes = b""
+    # rows and columns of pixels that share one value of a JPEG's chroma
+    chroma_step: tuple[int, int] = (1, 1)
+    whole: bool = True  # false where the file ends before its picture does
+
+
+def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None:
+    """Refuse what would be too large to decode."""
+    megapixels = width * height / 1e6
+    if megapixels > BOMB_MEGAPIXELS and width * height > BOMB_PIXELS_PER_BYTE * max(file_bytes, 1):
+        raise DecompressionBombError(
+            f"{file_bytes} bytes claim to be {width} x {height} pixels; no photograph is packed like that"
+        )
+    if megapixels > limits.max_megapixels:
+        raise ImageTooLargeError(
+            f"{width} x {height} pixels are {megapixels:.0f} MP; "
+            f"the limit is {limits.max_megapixels:g} MP, scale or crop it"
+        )
+
+
+# --- which kind --------------------------------------------------------------------------------
+
+_KINDS: Final[tuple[tuple[int, bytes, FileKind], ...]] = (
+    (0, b"FUJIFILMCCD-RAW", "raw"),
+    (0, b"IIU\0", "raw"),  # Panasonic
+    (0, b"IIRO", "raw"), (0, b"IIRS", "raw"), (0, b"MMOR", "raw"),  # Olympus
+    (8, b"CR\x02", "raw"),  # Canon CR2
+    (6, b"HEAPCCDR", "raw"),  # Canon CRW
+    (4, b"ftypcrx ", "raw"),  # Canon CR3
+    (0, b"\0MRM", "raw"),  # Minolta
+    (0, b"FOVb", "raw"),  # Sigma
+    (0, b"II*\0", "tiff"), (0, b"MM\0*", "tiff"), (0, b"II+\0", "tiff"), (0, b"MM\0+", "tiff"),
+    (0, b"\x89PNG\r\n\x1a\n", "png"),
+    (0, b"\xff\xd8\xff", "jpeg"),
+)  # fmt: skip
+_REFUSED: Final[tuple[tuple[int, bytes, str], ...]] = (
+    (0, b"GIF8", "GIF"), (8, b"WEBP", "WebP"), (0, b"BM", "BMP"), (0, b"8BPS", "Photoshop"),
+    (4, b"ftypheic", "HEIC"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavif", "AVIF"),
+    (0, b"\xff\x0a", "JPEG XL"), (4, b"JXL ", "JPEG XL"), (4, b"jP  ", "JPEG 2000"),
+    (0, b"%PDF", "PDF"), (0, b"v/1\x01", "OpenEXR"), (0, b"PGF", "PGF"),
+)  # fmt: skip
+_READABLE: Final = "give RAW, DNG, TIFF, PNG or JPEG"
+
+
+def sniff(head: bytes) -> FileKind:
+    """Tell the kind of file by its first bytes alone; names and declared types are not trusted.
+
+    RAW files that look like TIFF up to their directories (NEF, ARW, PEF, DNG) are "tiff" here;
+    `inspect` looks into the directories and tells them apart.
+    """
+    for at, magic, kind in _KINDS:
+        if head[at : at + len(magic)] == magic:
+            return kind
+    for at, magic, name in _REFUSED:
+        if head[at : at + len(magic)] == magic:
+            raise UnsupportedFormatError(f"{name} files are not read; {_READABLE}")
+    if not head:
+        raise NotAnImageError(f"the file is empty; {_READABLE}")
+    raise NotAnImageError(f"the first bytes ({head[:8].hex(' ')}) belong to no photo format; {_READABLE}")
+
+
+@contextlib.contextmanager
+def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
+    """Map a file and parse its header; the header is valid inside the `with` only."""
+    with path.open("rb") as file:
+        read = _PARSERS[sniff(file.read(HEAD_BYTES))]
+        size = file.seek(0, 2)
+        if size > limits.max_bytes:
+            raise ImageTooLargeError(f"the file has {size} bytes; the limit is {limits.max_bytes}")
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
+            header = read(buffer, limits)
+            check_size(header.width, header.height, size, limits)
+            yield header
+
+
+# --- JPEG --------------------------------------------------------------------------------------
+
+# Second bytes of markers: ITU-T T.81, table B.1.
+_START_OF_SCAN, _END_OF_IMAGE, _TABLES = 0xDA, 0xD9, 0xDB
+_BARE: Final = {0x00, 0x01, *range(0xD0, 0xD9), 0xFF}
+"""What is no segment: a stuffed byte, markers without a length, and fill bytes."""
+
+_FRAMES: Final = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of frame headers; the others of the range are tables and an extension."""
+
+
+def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
+    """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation."""
+    header, icc = Header("jpeg"), dict[int, bytes]()
+    for at, code, body in _segments(buffer):
+        if code in _FRAMES:
+            if len(body) < 6:
+                raise TruncatedImageError("the JPEG's frame header is cut off")
+            bits, height, width, channels = struct.unpack(">BHHB", body[:6])
+            header = replace(
+                header,
+                width=width,
+                height=height,
+                channels=channels,
+                bits=bits,
+                chroma_step=_chroma_step(body[6:]),
+            )
+        elif code == _START_OF_SCAN:  # in which a zero follows a byte of 0xFF
+            header = replace(header, whole=buffer.find(bytes((0xFF, _END_OF_IMAGE)), at) >= 0)
+        elif code == _TABLES:
+            header = replace(header, coarseness=_coarseness(body) or header.coarseness)
+        elif body.startswith(b"Exif\0") and (reader := TiffReader.open(body, 6)):
+            header = replace(header, tiff=(*header.tiff, reader))
+        elif body.startswith(b"http://ns.adobe.com/xap/1.0/\0"):
+            header = replace(header, xmp=body[29:])
+        elif body.startswith(b"ICC_PROFILE\0") and len(body) > 14:
+            icc[body[12]] = body[14:]
+    if not header.width or not header.height:
+        raise NotAnImageError("the JPEG has no frame header, or one without a size")
+    return replace(header, icc=b"".join(icc[part] for part in sorted(icc)) or None)
+
+
+def _chroma_step(components: bytes) -> tuple[int, int]:
+    """Rows and columns of pixels that share a value of chroma: luma's sampling factors over chroma's."""
+    if len(components) < 9:
+        return 1, 1  # grey
+    luma, chroma = components[1], components[4]
+    # a factor that is no power of two occurs in no camera's file, and is none of chroma's business here
+    rows, cols = (
+        own // other if other else 1 for own, other in ((luma & 15, chroma & 15), (luma >> 4, chroma >> 4))
+    )
+    return (rows, cols) if {rows, cols} <= {1, 2, 4} else (1, 1)
+
+
+def _coarseness(tables: bytes) -> float:
+    """Median step of the first quantisation table, which cameras give to luma; 0 where it is not there."""
+    at = 0
+    while at < len(tables):
+        size = 128 if tables[at] >> 4 else 64
+        steps = tables[at + 1 : at + 1 + size]
+        if tables[at] & 15 == 0 and len(steps) == size:
+            return statistics.median(struct.unpack(">64H" if size == 128 else "64B", steps))
+        at += 1 + size
+    return 0.0
+
+
+def _segments(buffer: Buffer) -> Iterator[tuple[int, int, bytes]]:
+    """Yield place, marker code and content of each segment up to the first scan, which has none.
+
+    Stray bytes between them are passed over, as viewers do (libjpeg, `next_marker`).
+    """
+    at = 2
+    for _ in range(MAX_SEGMENTS):
+        at = buffer.find(b"\xff", at)
+        marker = b"" if at < 0 else bytes(buffer[at : at + 4])
+        if len(marker) < 4:
+            raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off")
+        code, length = marker[1], struct.unpack(">H", marker[2:])[0]
+        if code == _START_OF_SCAN:
+            yield at, code, b""
+        if code in {_START_OF_SCAN, _END_OF_IMAGE}:
+            return
+        if code in _BARE:
+            at += 1
+            continue
+        yield at, code, bytes(buffer[at + 4 : at + 2 + length])
+        at += 2 + length
+
+
+# --- PNG ---------------------------------------------------------------------------------------
+
+
+def _read_png(buffer: Buffer, limits: Limits) -> Header:
+    """Read the chunks; image data are skipped, not read."""
+    first = bytes(buffer[8:33])
+    if len(first) < 25:
+        raise TruncatedImageError("the PNG ends inside its header; the upload was cut off")
+    if first[4:8] != b"IHDR" or zlib.crc32(first[4:21]) != struct.unpack(">I", first[21:])[0]:
+        raise NotAnImageError("the PNG's header chunk is damaged")
+    width, height, bits, colour = struct.unpack(">IIBB", first[8:18])
+    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
+    if not (width and height and channels and bits in {1, 2, 4, 8, 16}):
+        raise NotAnImageError(
+            f"the PNG's header is impossible: {width} x {height}, {bits} bits, type {colour}"
+        )
+    check_size(width, height, len(buffer), limits)  # before a bomb's end is missed
+    header, has_data, declared = Header("png", width, height, channels, bits), False, dict[bytes, bytes]()
+    for name, start, length in png_chunks(buffer):
+        has_data = has_data or name == b"IDAT"
+        body = b"" if name == b"IDAT" else bytes(buffer[start : start + min(length, MAX_BLOCK_BYTES)])
+        if name == b"eXIf" and (reader := TiffReader.open(body)):
+            header = replace(header, tiff=(*header.tiff, reader))
+        elif name == b"iCCP":
+            header = replace(header, icc=_inflated(body.partition(b"\0")[2][1:]))
+        elif name == b"iTXt" and body.startswith(b"XML:com.adobe.xmp\0"):
+            text = body[20:].partition(b"\0")[2].partition(b"\0")[2]
+            header = replace(header, xmp=_inflated(text) if body[18:19] == b"\1" else text)
+        elif name in {b"cICP", b"sRGB", b"gAMA", b"cHRM"} and length <= 32:
+            declared[name] = body
+    if not has_data:
+        raise TruncatedImageError("the PNG has no image data")
+    return replace(header, icc=profile_by_chunks(header.icc, declared))
+
+
+def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
+    """Yield name, start and length of the chunks; of a run of image data only the first."""
+    at, count, before = 33, 0, b"IHDR"
+    while count < MAX_SEGMENTS:
+        head = bytes(buffer[at : at + 8])
+        if len(head) < 8:
+            raise TruncatedImageError("the PNG ends before its end chunk; the upload was cut off")
+        length, name = struct.unpack(">I4s", head)
+        if at + 12 + length > len(buffer):
+            raise TruncatedImageError(f"the PNG ends inside chunk {name!r}; the upload was cut off")
+        if name == b"IEND":
+            return
+        if not name == before == b"IDAT":
+            count += 1
+            yield name, at + 8, length
+        before, at = name, at + 12 + length
+
+
+def _inflated(packed: bytes) -> bytes | None:
+    """Decompress at most `MAX_BLOCK_BYTES`; `None` where there is more, or damage."""
+    inflater = zlib.decompressobj()
+    try:
+        data = inflater.decompress(packed, MAX_BLOCK_BYTES)
+    except zlib.error:
+        return None
+    return data if inflater.eof else None
+
+
+# --- TIFF, DNG and RAW files that look like TIFF -----------------------------------------------
+
+_DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
+
+_RAW_PHOTOMETRIC: Final = {32803, 34892}
+"""PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3)."""
+
+_READ_COLOURS: Final = {0, 1, 2, 3, 6}
+"""PhotometricInterpretation: two kinds of grey, RGB, palette and YCbCr (TIFF 6.0, sections 3 to 6 and 21)."""
+
+_OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
+_JPEG: Final = {6, 7}  # Compression, of TIFF 6.0 and of its technical note 2
+_FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
+
+_LOSSY: Final = 34892
+"""Compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"."""
+
+_RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}
+"""Of Sony, Epson, Samsung, Nikon, Kodak and Pentax."""
+
+
+def _read_tiff(buffer: Buffer, limits: Limits) -> Header:
+    """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF."""
+    reader = TiffReader.open(buffer)
+    if reader is None:
+        raise TruncatedImageError("the TIFF ends inside its header; the upload was cut off")
+    chain = list(reader.chain())
+    if not chain:
+        raise TruncatedImageError("the TIFF has no readable directory; the upload was cut off")
+    first, every = chain[0][1], list(_with_children(reader, chain))
+    header = Header("tiff", tiff=(reader,), xmp=_block(first, 700), icc=_block(first, 34675))
+    if _DNG_VERSION in first:
+        return _read_dng(replace(header, kind="dng"), max(every, key=_pixels)[1], buffer, limits)
+    if any(
+        tags.integer(262) in _RAW_PHOTOMETRIC or tags.integer(259) in _RAW_COMPRESSION for _, tags in every
+    ):
+        _, largest = max(every, key=_pixels)
+        header = _sized(replace(header, kind="raw"), largest)
+        check_size(header.width, header.height, len(buffer), limits)
+        _check_mosaic(largest)
+        return header
+    place, photo = max(every, key=lambda at: (not _is_derived(at[1]), _pixels(at)))
+    header = replace(_sized(header, photo), directory=place, icc=_block(photo, 34675))
+    check_size(header.width, header.height, len(buffer), limits)
+    if len(chain) >= MAX_DIRECTORIES:
+        raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
+    _check_strips(photo, len(buffer))
+    _check_colours(photo)
+    return header
+
+
+def _read_dng(header: Header, photo: Tags, buffer: Buffer, limits: Limits) -> Header:
+    """Take from the directory of its largest picture what is to be done with the numbers of a DNG."""
+    header = _sized(header, photo)
+    check_size(header.width, header.height, len(buffer), limits)
+    _check_mosaic(photo)
+    lossy = header.compression == _LOSSY
+    return replace(
+        header,
+        opcodes_2=_block(photo, 51009) or b"",
+        opcodes_3=_block(photo, 51022) or b"",
+        whole=_ends_inside(photo, len(buffer)),
+        coarseness=_coarseness_of_tiles(buffer, photo) if lossy else 0.0,
+        white=() if lossy else photo.integers(50717, 3),  # LibRaw stretches those itself
+    )
+
+
+def _block(tags: Tags, tag: int) -> bytes | None:
+    return tags.raw(tag)[:MAX_BLOCK_BYTES] or None
+
+
+def _sized(header: Header, tags: Tags) -> Header:
+    return replace(
+        header,
+        width=tags.integer(256),
+        height=tags.integer(257),
+        channels=tags.integer(277, 1),
+        bits=tags.integer(258, 1),
+        compression=tags.integer(259, 1),
+    )
+
+
+def _with_children(reader: TiffReader, chain: Sequence[tuple[int, Tags]]) -> Iterator[tuple[int, Tags]]:
+    for offset, tags in chain:
+        yield offset, tags
+        for below in tags.integers(SUB_DIRECTORIES, 16):
+            yield below, reader.directory(below)[0]
+
+
+def _pixels(at: tuple[int, Tags]) -> int:
+    return at[1].integer(256) * at[1].integer(257)
+
+
+def _is_derived(tags: Tags) -> bool:
+    """Whether a picture is a reduced one or a mask of another: NewSubfileType, or SubfileType before it."""
+    return bool(tags.integer(254) & 0b101) or tags.integer(255, 1) == 2
+
+
+def require_known_mosaic(rows: Sequence[str]) -> None:
+    """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6."""
+    # the shorter of the rows counts: a damaged file may name fewer colours than it says
+    height, width = len(rows), min(map(len, rows), default=0)
+    if (height, width) == (6, 6):
+        return
+    if (height, width) == (2, 2):
+        diagonals = {"".join(sorted(rows[0][k] + rows[1][1 - k])) for k in (0, 1)}
+        if diagonals == {"GG", "BR"}:
+            return
+    raise UnsupportedFormatError(
+        f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only Bayer "
+        "mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
+    )
+
+
+def _check_mosaic(tags: Tags) -> None:
+    """Refuse a colour filter array that no demosaicing here is made for: LibRaw would take it for another."""
+    if 33422 in tags and len(shape := tags.integers(33421, 2)) == 2:
+        filters = tags.raw(33422)[:256]
+        letters = "".join(_FILTERS[number] if number < len(_FILTERS) else "?" for number in filters)
+        require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
+
+
+def _coarseness_of_tiles(buffer: Buffer, tags: Tags) -> float:
+    """Step of the quantised coefficients of a DNG by its first JPEG tile, which speaks for all; 0 unknown."""
+    at, size = (tags.integer(tile) or tags.integer(strip) for tile, strip in ((324, 273), (325, 279)))
+    with contextlib.suppress(NotAnImageError, TruncatedImageError):
+        return _read_jpeg(bytes(buffer[at : at + min(size, MAX_BLOCK_BYTES)]), Limits()).coarseness
+    return 0.0
+
+
+def _ends_inside(tags: Tags, file_bytes: int) -> bool:
+    """Whether no strip or tile that a directory lists goes beyond the file's end."""
+    starts, lengths = _strips(tags)
+    return all(start + length <= file_bytes for start, length in zip(starts, lengths, strict=False))
+
+
+def _strips(tags: Tags) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Places and lengths of the strips, else the tiles, of a picture."""
+    places, lengths = (strip if strip in tags else tile for strip, tile in ((273, 324), (279, 325)))
+    return tags.integers(places), tags.integers(lengths)
+
+
+def _check_strips(tags: Tags, file_bytes: int) -> None:
+    """Refuse a picture whose strips or tiles do not lie in the file."""
+    width, height = tags.integer(256), tags.integer(257)
+    if width <= 0 or height <= 0:
+        raise NotAnImageError(f"the TIFF gives no size ({width} x {height}); it holds no picture")
+    if not ({273, 324} & tags.keys() and {279, 325} & tags.keys()):
+        raise NotAnImageError("the TIFF has no strips or tiles; it holds no picture")
+    starts, lengths = _strips(tags)
+    if not starts or len(starts) != len(lengths):
+        raise TruncatedImageError(
+            f"the TIFF's table of strips, {len(starts)} with {len(lengths)} lengths, is damaged or cut off"
+        )
+    if not _ends_inside(tags, file_bytes):
+        raise TruncatedImageError("the TIFF's pixel data go beyond the file's end; the upload was cut off")
+    stored = width * height * tags.integer(277, 1) * max(tags.integer(258, 1), 1) / 8
+    if tags.integer(259, 1) == 1 and tags.integer(262, 1) != 6 and sum(lengths) < 0.999 * stored:
+        raise TruncatedImageError(
+            f"the TIFF holds {sum(lengths)} bytes of pixels where {stored:.0f} are needed"
+        )
+
+
+def _check_colours(tags: Tags) -> None:
+    """Refuse numbers that stand for other things than light of three colours, before they are stored."""
+    kind, samples = tags.integer(262, 1), tags.integer(277, 1)
+    if kind not in _READ_COLOURS:
+        named = _OTHER_COLOURS.get(kind, f"kind {kind}")
+        raise UnsupportedFormatError(f"the TIFF's colours are {named}; convert it to RGB")
+    if samples > 4 or (kind == 2 and samples < 3):
+        raise UnsupportedFormatError(f"a picture of {samples} channels is no photo; give RGB")
+    if tags.integer(339, 1) not in {1, 3, 4}:
+        raise UnsupportedFormatError("the TIFF's numbers are signed or complex; save it with 8 or 16 bits")
+    steps = tags.integers(530, 2) if 530 in tags else (2, 2)
+    if kind == 6 and tags.integer(259, 1) not in _JPEG and steps != (1, 1):
+        raise UnsupportedFormatError(
+            f"the TIFF stores one colour (YCbCr) for {' x '.join(map(str, steps))} pixels; convert it to RGB"
+        )
+
+
+# --- RAW files that are not plain TIFF ---------------------------------------------------------
+
+_CIFF_CAMERA: Final = re.compile(rb"Canon\0([ -~]{1,60})\0")
+"""Record 0x080A of a CRW file: maker and model (CIFF 1.0, 1997)."""
+
+
+def _read_raw(buffer: Buffer, limits: Limits) -> Header:
+    """Find the TIFF structures of RAW files that are not plain TIFF; LibRaw tells their size."""
+    head = bytes(buffer[: 1 << 16])
+    if head[4:12] == b"ftypcrx ":
+        boxes = (head.find(name) for name in (b"CMT1", b"CMT2"))  # camera and EXIF of a CR3
+        readers = (TiffReader.open(buffer, at + 4) for at in boxes if at > 0)
+        return Header("raw", tiff=tuple(reader for reader in readers if reader is not None))
+    if head[6:].startswith(b"HEAPCC"):
+        named = _CIFF_CAMERA.search(buffer)
+        return Header("raw", camera=("Canon", "" if named is None else named[1].decode("ascii")))
+    if head.startswith(b"FUJIFILMCCD"):
+        at = int.from_bytes(head[84:88], "big")  # of a JPEG
+        with contextlib.suppress(NotAnImageError, TruncatedImageError):
+            preview = _read_jpeg(bytes(buffer[at : at + MAX_BLOCK_BYTES]), limits)
+            return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
+        return Header("raw")
+    reader = TiffReader.open(buffer)
+    chain = [] if reader is None else list(reader.chain())
+    if reader is None or not chain:
+        return Header("raw", tiff=() if reader is None else (reader,))
+    _, largest = max(_with_children(reader, chain), key=_pixels)
+    return _sized(Header("raw", tiff=(reader,), xmp=_block(chain[0][1], 700)), largest)
+
+
+_PARSERS: Final[Mapping[FileKind, Callable[[Buffer, Limits], Header]]] = {
+    "raw": _read_raw,
+    "tiff": _read_tiff,
+    "png": _read_png,
+    "jpeg": _read_jpeg,
+}

@@ -1,1 +1,0 @@
-"""What a photo file says before a pixel is decoded: kind, size, directories of tags."""

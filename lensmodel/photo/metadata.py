@@ -1,0 +1,330 @@
+"""What a file says about camera, lens and exposure: read from EXIF, maker note and XMP, and written as EXIF.
+
+CRW files, which are older than all three, name their camera here; LibRaw tells the rest.
+
+The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
+one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
+
+Source: CIPA DC-008-2023 (Exif 3.0), section 4.6.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from lensmodel.photo.colour import profile_by_tags
+from lensmodel.photo.containers import Header, opened_header
+from lensmodel.photo.makernote import MakerNote, read_maker_note
+from lensmodel.photo.tiff import EXIF, UNDEFINED, Tags, Value, rationals, shorts, text
+from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
+from lensmodel.photo.xmp import read_xmp
+
+_PLACEHOLDER: Final = re.compile(
+    r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
+)
+_NO_LENS: Final = re.compile(
+    r"(?<![\d.])0+(\.0+)?(-0+(\.0+)?)?\s*mm|-{2,}\s*mm"
+    r"|\b(no (cpu|lens|data)|not attached|(unknown|manual) lens)\b"
+    r"|^\W*(none|n/?a|unknown|null|undefined)\b[\W\d]*$|^\W*lens\W*$|^65535$",
+    re.IGNORECASE,
+)
+"""Focal lengths of zero, and the words in which cameras say that they know no lens."""
+
+_SENSOR_WIDTHS_MM: Final = (
+    (12.8, 13.4),
+    (17.2, 18.1),
+    (22.0, 24.1),
+    (27.5, 29.0),
+    (35.4, 36.4),
+    (43.0, 54.1),
+)
+"""One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
+
+_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm
+_CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
+_PITCHES_UM: Final = (0.3, 60.0)  # micrometres: what sensors have, with room on either side
+_APERTURES: Final = (0.5, 128.0)  # what lenses have, with room on either side
+_FOCALS_MM: Final = (0.1, 20000.0)  # the same
+_SPEEDS: Final = (1.0, 1e7)  # the same
+_EXPOSURES_S: Final = (1e-7, 1e6)  # the same, seconds
+
+
+def read_metadata(path: Path | str) -> PhotoMetadata:
+    """Read what a photo file says, without decoding it.
+
+    Unreadable metadata are unknown metadata; only a file that is no photo raises.
+    """
+    with opened_header(Path(path), Limits()) as header:
+        return Said.of(header).metadata()
+
+
+def is_placeholder(serial: str) -> bool:
+    """Tell whether a serial is only what a camera writes when it knows none."""
+    return _PLACEHOLDER.fullmatch(serial.strip()) is not None
+
+
+def names_no_lens(model: str) -> bool:
+    """Tell whether a lens's name is only what a camera writes when it knows none, such as "DT 0mm F0 SAM"."""
+    return is_placeholder(model) or _NO_LENS.search(model) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What a file says of itself, read once."""
+
+    header: Header
+    tags: Tags  # of IFD0 and the EXIF directory together; the latter win
+    xmp: Mapping[str, str]
+    note: MakerNote
+
+    @classmethod
+    def of(cls, header: Header) -> Said:
+        """Read the directories, the maker note and the XMP packet that a header tells of."""
+        tags, note_in = Tags(), None
+        for reader in header.tiff:
+            main, _ = reader.directory(reader.first)
+            if header.directory:  # a preview may stand before the photo
+                main.update(reader.directory(header.directory)[0])
+            main.update(reader.below(main, EXIF))
+            if 0x927C in main:
+                note_in = reader
+            tags = Tags({**main, **tags})
+        note = (
+            MakerNote()
+            if note_in is None
+            else read_maker_note(tags.text(0x010F) or "", tags[0x927C], note_in)
+        )
+        return cls(header, tags, read_xmp(header.xmp), note)
+
+    def metadata(self) -> PhotoMetadata:
+        """Put it together; see `read_metadata`."""
+        tags, xmp, note = self.tags, self.xmp, self.note
+        if self.header.camera is not None:
+            return PhotoMetadata(self.header.camera[0], self.header.camera[1] or None)
+        direct, apex = tags.number(0x829D), tags.number(0x9202)  # N = 2^(A_v / 2)
+        if not direct and apex is not None and 0 < apex < 14:
+            direct = round(2.0 ** (apex / 2.0), 1)
+        speed = tags.number(0x8827)
+        # The tag has 16 bits; above them cameras say 65535 and use the newer ones.
+        if not speed or speed >= 65535:
+            speed = tags.number(0x8832) or tags.number(0x8831) or speed
+        turned = tags.number(0x0112)
+        stars = _quotient(xmp.get("xmp:Rating"))  # -1 is rejected; the tag is Windows's
+        stars = tags.number(0x4746) if stars is None else stars
+        return PhotoMetadata(
+            camera_maker=tags.text(0x010F) or xmp.get("tiff:Make"),
+            camera_model=tags.text(0x0110) or xmp.get("tiff:Model"),
+            body_serial=_first(
+                is_placeholder,
+                *(tags.text(0xA431), tags.text(0xC62F), note.body_serial),
+                *(xmp.get("aux:SerialNumber"), xmp.get("exifEX:BodySerialNumber")),
+            ),
+            lens=self._lens(),
+            aperture=_first_within(*_APERTURES, direct, _quotient(xmp.get("exif:FNumber"))),
+            focal_mm=_first_within(*_FOCALS_MM, tags.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
+            focus_m=self._focus_m(),
+            iso=_first_within(*_SPEEDS, speed, note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
+            exposure_s=_first_within(
+                *_EXPOSURES_S, tags.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))
+            ),
+            taken_at=self._taken_at(),
+            orientation=int(turned) if turned is not None and 1 <= turned <= 8 else 1,
+            pixel_pitch_um=self._pixel_pitch_um(),
+            artist=tags.text(0x013B) or ", ".join(_lines(xmp.get("dc:creator"))) or self._wide_text(0x9C9D),
+            copyright=tags.text(0x8298) or xmp.get("dc:rights"),
+            rating=int(stars) if stars is not None and -1 <= stars <= 5 else None,
+            keywords=tuple(_lines(xmp.get("dc:subject")) or _lines(self._wide_text(0x9C9E), ";")),
+        )
+
+    def is_centred(self, metadata: PhotoMetadata) -> bool:
+        """Tell whether a picture shows its whole sensor or the middle of it, not what a program cut.
+
+        Cameras leave widths of common sensors (DX, APS-C, 16:9), a square of the full height, or a digital
+        zoom.
+        """
+        pitch, width, height = metadata.pixel_pitch_um, self.header.width, self.header.height
+        if self.header.kind in {"raw", "dng"} or pitch is None:
+            return True
+        if self._is_cut:
+            return False
+        width_mm = max(width, height) * pitch / 1000.0
+        film = self._film_pitch_um()
+        whole = film is not None and abs(pitch / film - 1.0) < 0.05
+        square = abs(width / height - 1.0) < 0.01
+        widths = [width_mm, *((width_mm * 3.0 / 2.0, width_mm * 4.0 / 3.0) if square else ())]
+        return whole or any(map(_is_width_of_sensor, widths)) or self._zoom > 1.01
+
+    def baseline_exposure(self) -> float | None:
+        """Stops by which a DNG asks to be brightened, None where it does not say or is absurd."""
+        return _first_within(-10.0, 10.0, self.tags.number(0xC62A))
+
+    def profile(self) -> bytes | None:
+        """Profile of the colour space that a TIFF or JPEG declares by its tags; None is sRGB."""
+        tags = self.tags
+        below = (reader.below(tags, 0xA005).text(1) for reader in self.header.tiff)
+        return profile_by_tags(
+            tags.number(0xA001),
+            next(filter(None, below), None),
+            tags.numbers(318),
+            tags.numbers(319),
+            tags.number(0xA500),
+        )
+
+    @property
+    def _is_cut(self) -> bool:
+        return self.xmp.get("crs:HasCrop") == "True"
+
+    @property
+    def _zoom(self) -> float:
+        """How much of the picture is enlarged from the middle of the sensor: DigitalZoomRatio."""
+        return _first_within(1.0, 20.0, self.tags.number(0xA404)) or 1.0
+
+    def _wide_text(self, tag: int) -> str | None:
+        """Text in two bytes a sign, as Windows writes it."""
+        return self.tags.raw(tag).decode("utf-16-le", "replace").strip("\0 ") or None
+
+    def _taken_at(self) -> datetime | None:
+        for tag in (0x9003, 0x9004, 0x0132):
+            try:
+                return datetime.strptime((self.tags.text(tag) or "")[:19], "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007  the camera's clock has no zone
+            except ValueError:
+                continue
+        return None
+
+    def _lens(self) -> LensIdentity:
+        tags, xmp = self.tags, self.xmp
+        makers = tags.text(0xA433), xmp.get("exifEX:LensMake")
+        models = tags.text(0xA434), self.note.lens_model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
+        return LensIdentity(_first(is_placeholder, *makers), _first(names_no_lens, *models), *self._serial())
+
+    def _serial(self) -> tuple[str | None, SerialSource]:
+        declared, noted = self.tags.text(0xA435), self.note.lens_serial
+        # A camera that fills the EXIF tag with zeros has looked and found no serial; what its maker
+        # note holds beside it (seen: 1c00000000) is no serial either.
+        sources: tuple[tuple[str | None, SerialSource], ...] = (
+            (declared, "exif"),
+            (None if declared else noted, "makernote"),
+            (self.xmp.get("aux:LensSerialNumber"), "xmp"),
+            (self.xmp.get("exifEX:LensSerialNumber"), "xmp"),
+        )
+        known = ((serial, source) for serial, source in sources if serial and not is_placeholder(serial))
+        return next(known, (None, "none"))
+
+    def _focus_m(self) -> float | None:
+        # 0xffffffff is EXIF's word for infinity; as a plain number it also stands in XMP.
+        infinite = self.tags.raw(0x9206)[:4] == b"\xff\xff\xff\xff"
+        subject = math.inf if infinite else self.tags.number(0x9206)
+        values = subject, self.note.focus_m, _quotient(self.xmp.get("aux:ApproximateFocusDistance"))
+        plain = (math.inf if value is not None and value >= 4294967295 else value for value in values)
+        return next((value for value in plain if value is not None and value > 0), None)
+
+    def _pixel_pitch_um(self) -> float | None:
+        """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
+
+        Programs that scale a photo down rarely correct the former; then width times pitch is the
+        width of no common sensor, and it says nothing. A mosaic was never scaled, only cut.
+
+        Source: CIPA DC-008-2023, tags FocalPlaneXResolution and FocalLengthIn35mmFilm.
+        """
+        per_unit, unit = self.tags.number(0xA20E), self.tags.number(0xA210) or 2.0
+        unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit, 0.0)
+        pitch = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None)
+        header = self.header
+        if pitch is not None:
+            pitch /= self._zoom
+            longer, shorter = max(header.width, header.height), min(header.width, header.height)
+            width_mm = longer * pitch / 1000.0
+            mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
+            # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
+            whole = any(abs(longer / max(shorter, 1) / shape - 1.0) < 0.01 for shape in (1.5, 4.0 / 3.0))
+            unscaled = mosaic or self._is_cut or not whole
+            if _is_width_of_sensor(width_mm) or (width_mm <= _LARGEST_SENSOR_MM and unscaled):
+                return pitch
+        film = self._film_pitch_um()
+        return None if film is None else film / self._zoom
+
+    def _film_pitch_um(self) -> float | None:
+        """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
+        focal, film = self.tags.number(0x920A), self.tags.number(0xA405)
+        diagonal_px = math.hypot(self.header.width, self.header.height)
+        if not focal or not film or focal <= 0 or film <= 0 or diagonal_px <= 0:
+            return None
+        crop = _first_within(*_CROP_FACTORS, film / focal)
+        return crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
+
+
+def _is_width_of_sensor(width_mm: float) -> bool:
+    return any(low <= width_mm <= high for low, high in _SENSOR_WIDTHS_MM)
+
+
+def _lines(text: str | None, separator: str = "\n") -> list[str]:
+    return [word for part in (text or "").split(separator) if (word := part.strip())]
+
+
+def _quotient(text: str | None) -> float | None:
+    """Value of an XMP rational such as "71/10"."""
+    over, _, under = (text or "").partition("/")
+    try:
+        return float(over) / float(under or 1)  # a Fraction would write 1e1000000000 out
+    except (ValueError, ZeroDivisionError):
+        return None
+
+
+def _first_within(low: float, high: float, *candidates: float | None) -> float | None:
+    return next((c for c in candidates if c is not None and low <= c <= high), None)
+
+
+def _first(refused: Callable[[str], bool], *candidates: str | None) -> str | None:
+    return next((c for c in candidates if c and not refused(c)), None)
+
+
+# --- as EXIF tags of a written file -------------------------------------------------------------
+
+
+def main_tags(metadata: PhotoMetadata, orientation: int, description: str = "") -> dict[int, Value | None]:
+    """Tags of the main directory; names of people are UTF-8, as most programs read them."""
+    stars = metadata.rating
+    return {
+        0x010E: text(description),
+        0x010F: text(metadata.camera_maker),
+        0x0110: text(metadata.camera_model),
+        0x0112: shorts(orientation),
+        0x0131: text(SOFTWARE),
+        0x0132: _date(metadata.taken_at),
+        0x013B: text(metadata.artist, "utf-8"),
+        0x8298: text(metadata.copyright, "utf-8"),
+        0x4746: None if stars is None or stars < 0 else shorts(stars),
+    }
+
+
+def exif_tags(metadata: PhotoMetadata) -> dict[int, Value | None]:
+    """Tags of the EXIF directory; no maker notes, and serials only where the metadata have them."""
+    pitch = metadata.pixel_pitch_um
+    per_cm = None if pitch is None else rationals(10_000.0 / pitch)
+    return {
+        0x829A: rationals(metadata.exposure_s),
+        0x829D: rationals(metadata.aperture),
+        0x8827: None if metadata.iso is None else shorts(min(round(metadata.iso), 65535)),
+        0x9000: (UNDEFINED, b"0232"),  # ExifVersion
+        0x9003: _date(metadata.taken_at),
+        0x9206: rationals(metadata.focus_m),
+        0x920A: rationals(metadata.focal_mm),
+        0xA20E: per_cm,  # FocalPlaneXResolution
+        0xA20F: per_cm,
+        0xA210: per_cm and shorts(3),  # per centimetre
+        0xA431: text(metadata.body_serial),
+        0xA433: text(metadata.lens.maker),
+        0xA434: text(metadata.lens.model),
+        0xA435: text(metadata.lens.serial),
+    }
+
+
+def _date(value: datetime | None) -> Value | None:
+    return text(None if value is None else value.strftime("%Y:%m:%d %H:%M:%S"))

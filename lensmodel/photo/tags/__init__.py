@@ -1,1 +1,0 @@
-"""What a photo file says about camera, lens, exposure and place."""

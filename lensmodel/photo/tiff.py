@@ -1,0 +1,288 @@
+"""Directories of TIFF tags, read with bounds and written: the skeleton of TIFF, DNG, EXIF and most RAW files.
+
+Reading, every offset is checked against the buffer, loops end, and no count makes us allocate more
+than `MAX_VALUE_BYTES`. A directory that is damaged half-way gives what came before.
+
+Written here rather than by an image library: those that write 16 bits a colour write no EXIF directory, and
+doubles, as others write, are empty tags to some readers.
+
+Source: "TIFF Revision 6.0", Aldus, 1992, section 2; "The BigTIFF file format", 2004.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import BinaryIO, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError
+
+Buffer: TypeAlias = bytes | mmap.mmap
+
+MAX_ENTRIES: Final = 1024
+"""Entries read of one directory: cameras write below 150, and a false count must not cost time (chosen)."""
+
+MAX_DIRECTORIES: Final = 64
+"""Directories followed: cameras write a dozen, and a tree must not cost time (chosen)."""
+
+MAX_VALUE_BYTES: Final = 16 << 20
+"""Bytes read of one value: honest ones are smaller, a false size must not fill the memory (chosen)."""
+
+# Tags that point to directories: Exif 3.0, section 4.6.3, and TIFF/EP.
+EXIF, GPS, SUB_DIRECTORIES = 0x8769, 0x8825, 0x014A
+
+# Types of TIFF 6.0, section 2.
+BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+
+# Type -> format of `struct`: TIFF 6.0, section 2, and from 16 on BigTIFF; 13 is an offset of a directory.
+_FORMATS: Final[Mapping[int, str]] = {
+    1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h",
+    9: "i", 10: "ii", 11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q",
+}  # fmt: skip
+_SIZES: Final = {kind: struct.calcsize("=" + code) for kind, code in _FORMATS.items()}
+_VERSIONS: Final = {42, 43, 0x55, 0x4F52, 0x5352}
+"""TIFF, BigTIFF, Panasonic RW2, and two of Olympus ORF."""
+
+_MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG; as a distance, infinity
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """One tag of a directory; the value is read from the buffer when asked for."""
+
+    kind: int
+    count: int
+    offset: int
+    order: str
+    buffer: Buffer = field(repr=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes that the value claims to have."""
+        return self.count * _SIZES[self.kind]
+
+    def raw(self) -> bytes:
+        """Bytes of the value; empty if it lies outside the buffer or is too large."""
+        end = self.offset + self.size
+        if self.offset < 0 or self.size > MAX_VALUE_BYTES or end > len(self.buffer):
+            return b""
+        return bytes(self.buffer[self.offset : end])
+
+    def numbers(self, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
+        """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
+        code, raw = _FORMATS[self.kind], self.raw()
+        if code == "s":
+            return ()
+        raw = raw[: most * _SIZES[self.kind]]
+        values = struct.unpack(f"{self.order}{len(raw) // struct.calcsize('=' + code[0])}{code[0]}", raw)
+        if len(code) == 1:
+            return values
+        pairs = zip(values[::2], values[1::2], strict=True)
+        return tuple(float(Fraction(a, b)) if b else float("nan") for a, b in pairs)
+
+
+class Tags(dict[int, Tag]):
+    """The tags of a directory; one that is not there gives an empty value, or `None`."""
+
+    def raw(self, tag: int) -> bytes:
+        """Bytes of a value."""
+        return self[tag].raw() if tag in self else b""
+
+    def numbers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
+        """The first `most` values as numbers."""
+        return self[tag].numbers(most) if tag in self else ()
+
+    def number(self, tag: int) -> float | None:
+        """The first value; `None` also where it is not finite."""
+        return next((value for value in self.numbers(tag, 1) if math.isfinite(value)), None)
+
+    def integers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[int, ...]:
+        """The first `most` values where they are whole numbers by their type; others give none."""
+        whole = tag in self and _FORMATS[self[tag].kind] in "BHIbhiQq"
+        return tuple(int(value) for value in self.numbers(tag, most)) if whole else ()
+
+    def integer(self, tag: int, default: int = 0) -> int:
+        """The first value where it is a whole number by its type."""
+        return next(iter(self.integers(tag, 1)), default)
+
+    def text(self, tag: int) -> str | None:
+        """Text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1, nothing as `None`."""
+        raw = self.raw(tag).split(b"\0", 1)[0]
+        try:
+            return raw.decode("utf-8").strip() or None
+        except UnicodeDecodeError:
+            return raw.decode("latin-1").strip() or None
+
+
+@dataclass(frozen=True, slots=True)
+class TiffReader:
+    """Directories of a TIFF structure inside a buffer."""
+
+    buffer: Buffer = field(repr=False)  # the bytes; offsets count from `base`
+    base: int  # where the structure starts in the buffer
+    order: str  # byte order
+    first: int  # offset of the first directory from `base`
+    big: bool = False  # BigTIFF: 64-bit offsets
+
+    @classmethod
+    def open(cls, buffer: Buffer, base: int = 0) -> TiffReader | None:
+        """Read the header at `base`; `None` if it is no TIFF structure."""
+        head = bytes(buffer[base : base + 16])
+        order = {b"II": "<", b"MM": ">"}.get(head[:2])
+        if order is None or len(head) < 8:
+            return None
+        version = struct.unpack(order + "H", head[2:4])[0]
+        big = version == 43
+        if version not in _VERSIONS or (big and len(head) < 16):
+            return None
+        first = struct.unpack(order + "Q", head[8:16]) if big else struct.unpack(order + "I", head[4:8])
+        return cls(buffer, base, order, first[0], big)
+
+    def directory(self, offset: int) -> tuple[Tags, int]:
+        """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""
+        count_size, entry_size, word = (8, 20, "Q") if self.big else (2, 12, "I")
+        word_size = struct.calcsize("=" + word)
+        start, tags = self.base + offset, Tags()
+        head = bytes(self.buffer[start : start + count_size]) if offset > 0 and start > 0 else b""
+        if len(head) < count_size:
+            return tags, 0
+        count = struct.unpack(self.order + ("Q" if self.big else "H"), head)[0]
+        at = start + count_size
+        for _ in range(min(count, MAX_ENTRIES)):
+            raw = bytes(self.buffer[at : at + entry_size])
+            if len(raw) < entry_size:
+                return tags, 0
+            number, kind, values = struct.unpack(f"{self.order}HH{word}", raw[: 4 + word_size])
+            if kind in _FORMATS:
+                inside = values * _SIZES[kind] <= word_size
+                far = self.base + struct.unpack(self.order + word, raw[-word_size:])[0]
+                place = at + 4 + word_size if inside else far
+                tags.setdefault(number, Tag(kind, values, place, self.order, self.buffer))
+            at += entry_size
+        tail = bytes(self.buffer[at : at + word_size])
+        complete = count <= MAX_ENTRIES and len(tail) == word_size
+        return tags, struct.unpack(self.order + word, tail)[0] if complete else 0
+
+    def chain(self) -> Iterator[tuple[int, Tags]]:
+        """Yield place and tags of the directories linked from the first one; a loop ends the chain."""
+        offset, seen = self.first, set[int]()
+        while offset and offset not in seen and len(seen) < MAX_DIRECTORIES:
+            seen.add(offset)
+            tags, following = self.directory(offset)
+            if tags:
+                yield offset, tags
+            offset = following
+
+    def below(self, tags: Tags, pointer: int) -> Tags:
+        """Read the directory that a tag (EXIF, GPS, part of a maker note) points to; empty without one."""
+        return self.directory(tags.integer(pointer))[0]
+
+
+# --- writing -----------------------------------------------------------------------------------
+
+Value: TypeAlias = tuple[int, bytes]
+"""Type and bytes of a tag to be written, little-endian."""
+
+Written: TypeAlias = Mapping[int, Value | None]
+"""Tags of a directory to be written; what is `None` is left out."""
+
+
+def shorts(*values: int) -> Value:
+    """Numbers of 16 bits."""
+    return SHORT, struct.pack(f"<{len(values)}H", *values)
+
+
+def longs(*values: int) -> Value:
+    """Numbers of 32 bits."""
+    return LONG, struct.pack(f"<{len(values)}I", *values)
+
+
+def text(value: str | None, encoding: str = "ascii") -> Value | None:
+    """A text; ASCII by the standard, what does not fit becomes a question mark."""
+    return (ASCII, value.encode(encoding, "replace") + b"\0") if value else None
+
+
+def rationals(*values: float | None) -> Value | None:
+    """Positive numbers as quotients; nothing unless all of them are known."""
+    parts = [_rational(value) for value in values if value is not None]
+    packed = b"".join(struct.pack("<2I", *part) for part in parts)
+    return (RATIONAL, packed) if len(parts) == len(values) else None
+
+
+def signed_rationals(values: Sequence[float]) -> Value:
+    """Numbers as signed quotients."""
+    parts = [Fraction(float(value)).limit_denominator(1_000_000) for value in values]
+    return SRATIONAL, b"".join(struct.pack("<2i", part.numerator, part.denominator) for part in parts)
+
+
+def laid_out(main: Written, below: Mapping[int, Written]) -> bytes:
+    """Lay out a TIFF structure: its header, the main directory, and those that its tags point to."""
+    start = 8  # behind the header
+    children = {tag: directory for tag, directory in below.items() if any(directory.values())}
+    whole = {**main, **dict.fromkeys(children, longs(0))}
+    end, parts = start + len(_packed(whole, start)), []
+    for tag, directory in children.items():
+        parts.append(bytes(end % 2) + _packed(directory, end + end % 2))
+        whole[tag] = longs(end + end % 2)
+        end += len(parts[-1])
+    return struct.pack("<2sHI", b"II", 42, start) + _packed(whole, start) + b"".join(parts)
+
+
+def write_strip(
+    file: BinaryIO, tags: Written, below: Mapping[int, Written], pixels: NDArray[np.generic]
+) -> None:
+    """Write a TIFF structure and the pixels `(row, col[, channel])`, as one strip that is not compressed."""
+    height, width = pixels.shape[:2]
+    samples = pixels.shape[2] if pixels.ndim == 3 else 1
+    whole = {
+        **tags,
+        256: longs(width),
+        257: longs(height),
+        258: shorts(*(8 * pixels.dtype.itemsize,) * samples),
+        259: shorts(1),  # not compressed
+        273: longs(0),
+        277: shorts(samples),
+        278: longs(height),
+        279: longs(pixels.nbytes),
+        284: shorts(1),  # interleaved
+    }
+    at = len(laid_out(whole, below))
+    at += -at % 16
+    whole[273] = longs(at)
+    file.write(laid_out(whole, below).ljust(at, b"\0"))
+    file.write(np.ascontiguousarray(pixels).astype(pixels.dtype.newbyteorder("<"), copy=False).data)
+
+
+def _packed(directory: Written, offset: int) -> bytes:
+    """Lay a directory out to stand at `offset` of the file, its longer values right behind it."""
+    values = sorted((tag, value) for tag, value in directory.items() if value is not None)
+    position = offset + 2 + 12 * len(values) + 4
+    head, tail = [struct.pack("<H", len(values))], b""
+    for tag, (kind, data) in values:
+        place = data.ljust(4, b"\0")
+        if len(data) > 4:
+            tail += bytes(len(tail) % 2)  # values begin on a word boundary
+            place = struct.pack("<I", position + len(tail))
+            tail += data
+        head.append(struct.pack("<HHI", tag, kind, len(data) // _SIZES[kind]) + place)
+    return b"".join(head) + bytes(4) + tail
+
+
+def _rational(value: float) -> tuple[int, int]:
+    """Quotient of a positive number, at most a millionth off; infinity as EXIF writes it."""
+    if math.isinf(value):
+        return _MAX_UINT32, 1
+    for largest in (1_000_000, 10_000, 100, 1):
+        part = Fraction(value).limit_denominator(largest)
+        if 0 < part.numerator <= _MAX_UINT32:
+            return part.numerator, part.denominator
+    if 0.0 <= value < 1e-6:
+        return 0, 1
+    raise InvalidInputError(f"{value} does not fit a TIFF rational")

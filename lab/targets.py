@@ -28,9 +28,6 @@ MARGIN: Final = 28
 SKY: Final = 0.003
 """Light between points: a night sky over a suburb takes so much of a full well where stars do not clip."""
 
-LIFT: Final = 0.5
-"""Light that no lobe of a point goes below, with a minus sign."""
-
 
 @dataclass(frozen=True, slots=True)
 class Setup:
@@ -79,8 +76,7 @@ def light_scene(
     """Draw points of light anywhere between pixels, of different brightness, over a dark sky.
 
     A point between pixels is the sinc that a point is to whoever sees no finer than pixels. Its lobes are
-    negative here and gone behind a lens; where a scene must not be negative, `LIFT` is to be added before
-    the blur and taken off after it.
+    negative here and gone behind a lens.
     """
     height, width = (n + 2 * MARGIN for n in shape)
     plane = np.zeros((height, width))

@@ -4,13 +4,10 @@ Each pixel p of each sample i is a training point with input (u, v, r, phi, Phi)
 
     f(x) = sum_i sum_p P_i[p] K(x, x_ip) / sum_i sum_p K(x, x_ip)            (paper, eq. 4-7)
 
-`all_pairs` sums over every point. `factorised` gives the same numbers in far fewer operations:
-K = W_i G(u, v) with one W_i for all pixels of a sample, and with h_u = h_v the Gaussian in (u, v)
-does not see the rotation of the local frame, so it is a product of one in rows and one in columns
-of the sample's own grid. `PaperModel` is what the paper runs: bandwidths of eq. (8) taken to the
-letter over a flat cloud of pixels, and the nearest k of them from a kd-tree. With a million pixels
-its bandwidth in u and v is some three pixels, which is wider than most PSFs: it is here to be
-compared with, not to be used.
+`all_pairs` sums over every point. `PaperModel` is what the paper runs: bandwidths of eq. (8) taken to
+the letter over a flat cloud of pixels, and the nearest k of them from a kd-tree. With a million pixels
+its bandwidth in u and v is some three pixels, which is wider than most PSFs: it is here to be compared
+with, not to be used.
 """
 
 from __future__ import annotations
@@ -45,15 +42,6 @@ def pixel_to_local(
     return a * c + b * s, b * c - a * s
 
 
-def local_to_pixel(
-    u: NDArray[np.floating] | float, v: NDArray[np.floating] | float, phi: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Turn local `(u, v)` into pixel offsets `(drow, dcol)`; the inverse of `pixel_to_local`."""
-    u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
-    c, s = math.cos(phi), math.sin(phi)
-    return -(u * s + v * c), u * c - v * s
-
-
 PAD = 4
 """Rows and columns of zeros round each sample: a PSF is zero outside its support, not unknown."""
 
@@ -80,30 +68,6 @@ def all_pairs(
         above += near @ kernel.ravel()
         below += near.sum(axis=1)
     return (above / below).reshape(size, size)
-
-
-def factorised(
-    samples: Sequence[PsfSample],
-    position: FieldPosition,
-    settings: LensSettings,
-    size: int,
-    *,
-    pixel: float,
-    widths: Mapping[str, float],
-) -> NDArray[np.float64]:
-    """Same as `all_pairs`, factorised; cost of each sample size^2 k instead of size^2 k^2."""
-    t = np.arange(size, dtype=np.float64) - size // 2
-    u, v = pixel_to_local(t[:, None], t[None, :], position.phi)
-    above, below = np.zeros((size, size)), np.zeros((size, size))
-    for sample, weight in zip(samples, _weights(samples, position, settings, widths), strict=True):
-        kernel = np.pad(sample.kernel, PAD)
-        p = np.arange(kernel.shape[0], dtype=np.float64) - kernel.shape[0] // 2
-        drow, dcol = local_to_pixel(u, v, sample.position.phi)
-        rows = np.exp(-0.5 * ((drow[..., None] - p) / pixel) ** 2)
-        cols = np.exp(-0.5 * ((dcol[..., None] - p) / pixel) ** 2)
-        above += weight * ((rows @ kernel) * cols).sum(axis=-1)
-        below += weight * rows.sum(axis=-1) * cols.sum(axis=-1)
-    return above / below
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from lab.model.exact import PaperModel, all_pairs, factorised
+from lab.model.exact import PaperModel, all_pairs
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, distance, gaussian, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
@@ -214,22 +214,10 @@ def test_trees_and_a_look_at_every_sample_give_the_same_neighbours(monkeypatch: 
     assert len(around.within(va.point(asked[1], GREEN), 1.5)) < 300
 
 
-def test_factorised_sum_equals_the_sum_over_all_pairs() -> None:
-    rng = np.random.default_rng(0)
-    samples = [
-        PsfSample(rng.random((9, 9)), p, GREEN, weight=float(w))
-        for p, w in zip(places(5, 4), rng.random(5), strict=True)
-    ]
-    for where in places(3, 8):
-        flat = all_pairs(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
-        fast = factorised(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
-        assert np.abs(flat - fast).max() <= 1e-12 * flat.max()
-
-
 def test_answer_is_within_eight_hundredths_of_the_exact_sum() -> None:
     model = fit(photo("a", 0, count=16), "paper", r=0.1, phi=0.5, stops=0.5)
     for where in places(4, 5):
-        exact = factorised(model.samples, where, GREEN, SIZE, pixel=0.3, widths=WIDTHS)
+        exact = all_pairs(model.samples, where, GREEN, SIZE, pixel=0.3, widths=WIDTHS)
         exact /= exact.sum()
         fast = model.query(where, GREEN, SIZE).kernel
         # the exact sum smooths by h_u^2 = 0.09 px^2 and by the pixel grid; the spline does not

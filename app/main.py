@@ -27,8 +27,8 @@ from app.store import Store
 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application; the database is opened when it starts and closed when it stops."""
-    # The schema is not changed here: the supervisor migrates before it starts the API, and until then
-    # `/readyz` says what is missing
+    # The schema is not changed here: `app.runtime.supervisor` migrates before it starts the API, and until
+    # then `/readyz` says what is missing
     chosen = Settings() if settings is None else settings
 
     @asynccontextmanager

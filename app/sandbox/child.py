@@ -69,10 +69,7 @@ class Order:
 
 def main(order: Order, line: Connection) -> None:
     """Run one order."""
-    printed = os.open(order.folder / PRINTED, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-    for stream in (1, 2):
-        os.dup2(printed, stream)
-    os.close(printed)
+    _print_to(order.folder / PRINTED)
     tasks = importlib.import_module(order.module)  # our own code, not readable after this
     _save_nothing_compiled()
     vars(files)["replacing"] = _in_place
@@ -103,8 +100,19 @@ def main(order: Order, line: Connection) -> None:
         end = _ENDINGS.get(number, "bug")
         _tell(line, end=end, code=type(error).__name__, text=traceback.format_exc())
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):  # what it printed is not worth an outcome
+            sys.stdout.flush()
+
+
+def _print_to(path: Path) -> None:
+    """Lead standard output and error to a file; to nothing where the disk is full."""
+    try:
+        printed = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    except OSError:
+        printed = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(printed, stream)
+    os.close(printed)
 
 
 @contextlib.contextmanager

@@ -218,7 +218,7 @@ class Sandbox:
             elif ready:  # it has ended, and all messages are read
                 with self._alone:
                     process.join()
-                    return outcome_of(last, process.exitcode or 0, folder, limits)
+                return outcome_of(last, process.exitcode or 0, folder, limits)
             if time.monotonic() > next_look:
                 next_look = time.monotonic() + POLL_S
                 if not wanted():

@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from scipy import fft, ndimage
+from scipy import ndimage, signal
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
@@ -85,12 +85,10 @@ class TargetPage:
     @property
     def marks(self) -> NDArray[np.float64]:
         """Middles of the discs `(4, 2)`: top left, top right, bottom right, bottom left."""
-        height, width = self.shape
         near = self.border + self.mark_side / 2.0 - 0.5
-        rows, cols = (near, height - 1 - near), (near, width - 1 - near)
-        return np.array(
-            [(rows[0], cols[0]), (rows[0], cols[1]), (rows[1], cols[1]), (rows[1], cols[0])], dtype=np.float64
-        )
+        top, left = near, near
+        bottom, right = (length - 1 - near for length in self.shape)
+        return np.array([(top, left), (top, right), (bottom, right), (bottom, left)], dtype=np.float64)
 
     @cached_property
     def samples(self) -> NDArray[np.float32]:
@@ -125,10 +123,10 @@ class TargetPage:
 
     def at(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> NDArray[np.float32]:
         """Reflectance at places of the page, in samples; white beyond it."""
-        places = np.stack([np.asarray(rows), np.asarray(cols)]) * DOTS
         reflectance = ndimage.map_coordinates(
-            self._spline, places, order=3, prefilter=False, mode="constant", cval=PAPER, output=np.float32
-        )
+            self._spline, np.stack([rows, cols]) * DOTS,
+            order=3, prefilter=False, mode="constant", cval=PAPER, output=np.float32,
+        )  # fmt: skip
         return np.asarray(reflectance, dtype=np.float32)
 
     def holds_noise(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> bool:
@@ -150,15 +148,10 @@ def _slice(middle: float, half: float, length: int) -> slice:
 
 
 def _finer(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Band-limited interpolation to `DOTS` dots a sample, by zeros beyond the highest frequency."""
-    height, width = samples.shape
-    spectrum = fft.rfft2(samples)
-    whole = np.zeros((height * DOTS, width * DOTS // 2 + 1), dtype=np.complex64)
-    half = height // 2
-    cols = width // 2  # the highest frequency itself is left out: its sign is not known
-    whole[:half, :cols] = spectrum[:half, :cols]
-    whole[-half + 1 :, :cols] = spectrum[-half + 1 :, :cols]
-    return np.asarray(fft.irfft2(whole, s=(height * DOTS, width * DOTS)) * DOTS**2, dtype=np.float32)
+    """Band-limited interpolation to `DOTS` dots a sample."""
+    for axis, length in enumerate(samples.shape):
+        samples = signal.resample(samples, length * DOTS, axis=axis)
+    return samples
 
 
 # Width and height in millimetres, lying (ISO 216)

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
@@ -33,7 +34,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.measurer import MeasuredPsf, require_photos
 from lensmodel.measured.registration import Warp, match, matched
-from lensmodel.measured.solve import measured_pixels, quadratic, window_corners, window_psf
+from lensmodel.measured.solve import measured_pixels, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
@@ -87,15 +88,13 @@ class AperturePair:
         """Measure the PSF of the first photo; see `Measurer`."""
         require_photos(self, photos)
         _require_pair(*photos)
-        opened, closed = with_bounded_noise(list(photos))
+        opened, closed = _with_bounded_noise(photos)
         warp = self.register(opened, closed)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
         psfs = []
         for done, corner in enumerate(corners, start=1):
-            for channel in channels:
-                psf = self._window(opened, closed, warp, corner, size, channel)
-                if psf is not None:
-                    psfs.append(psf)
+            solved = [self._window(opened, closed, warp, corner, size, channel) for channel in channels]
+            psfs += [psf for psf in solved if psf is not None]
             on_step(done, len(corners))
         if not psfs:
             raise NotEnoughEvidenceError(
@@ -117,11 +116,8 @@ class AperturePair:
         warp = Warp.of_homography(start, opened.frame)
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
-            places = bent(
-                *np.meshgrid(
-                    *(at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True)), indexing="ij"
-                )
-            )
+            pixels = (at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True))
+            places = bent(*np.meshgrid(*pixels, indexing="ij"))
             return np.asarray(ndimage.map_coordinates(reference, places, order=3, mode="mirror"))
 
         half = self.side // 2
@@ -142,10 +138,6 @@ class AperturePair:
         """PSF of one window, or None where it does not determine one."""
         around = size // 2
         scene = _Scene(closed, warp, corner, self.side, around, channel)
-        try:
-            light = _falloff(opened, scene, corner, self.side, around, channel)
-        except NotEnoughEvidenceError:
-            return None
 
         def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
             cut = around - margin
@@ -153,14 +145,10 @@ class AperturePair:
             return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
 
         try:
+            light = _falloff(opened, scene, corner, self.side, around, channel)
+            noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
             kernel, solved, _ = window_psf(
-                opened,
-                channel,
-                corner,
-                (self.side, self.side),
-                latent,
-                size,
-                latent_noise=scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size),
+                opened, channel, corner, (self.side, self.side), latent, size, latent_noise=noise
             )
         except NotEnoughEvidenceError:
             return None
@@ -280,8 +268,7 @@ def _falloff(
 ) -> NDArray[np.float64]:
     """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
     row, col = corner
-    t = (np.arange(-around, side + around) - (side - 1) / 2.0) / side
-    basis = quadratic(t[:, None], t[None, :])
+    basis = window_terms(side, around)
     # smoothed, the two differ by the light alone, however one of them is blurred
     smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
     inner = slice(around, around + side)
@@ -352,54 +339,41 @@ _FINE: Final = (0.4, 0.5)
 _DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
 
 
-def with_bounded_noise(photos: list[LinearPhoto]) -> list[LinearPhoto]:
-    """Return photos whose noise is no stronger than their quietest places show.
+def _with_bounded_noise(photos: Sequence[LinearPhoto]) -> list[LinearPhoto]:
+    """Photos whose noise is no stronger than their quietest places show.
 
     Photos of one camera at one ISO share the bound, since they share the sensor's noise.
     """
-    bounds = [[quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos]
+    known = [(photo.info.metadata.camera_model, photo.info.metadata.iso) for photo in photos]
+    bounds = [[_quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos]
     bounded = []
-    for photo in photos:
-        alike = [bounds[i] for i, other in enumerate(photos) if _one_sensitivity(photo, other)]
-        least = np.min(alike, axis=0)
-        sensor = None if photo.sensor_noise is None else _all_bounded(photo.sensor_noise, least)
-        bounded.append(replace(photo, noise=_all_bounded(photo.noise, least), sensor_noise=sensor))
+    for photo, own in zip(photos, known, strict=True):
+        least = np.min([bound for bound, other in zip(bounds, known, strict=True) if other == own], axis=0)
+        sensor = None if photo.sensor_noise is None else _bounded(photo.sensor_noise, least)
+        bounded.append(replace(photo, noise=_bounded(photo.noise, least), sensor_noise=sensor))
     return bounded
 
 
-def quietest(photo: LinearPhoto, channel: int) -> float:
+def _quietest(photo: LinearPhoto, channel: int) -> float:
     """Least power of fine detail over the level of light, of all blocks of a plane; inf where none is lit."""
-    plane = photo.planes[channel]
-    window = np.hanning(_BLOCK)[:, None] * np.hanning(_BLOCK)
-    f = fft.fftfreq(_BLOCK)
-    radius = np.hypot(f[:, None], f[None, :])
+    window = np.outer(np.hanning(_BLOCK), np.hanning(_BLOCK))
+    radius = np.hypot(fft.fftfreq(_BLOCK)[:, None], fft.fftfreq(_BLOCK))
     fine = (radius >= _FINE[0]) & (radius < _FINE[1])
-    least = np.inf
+    least, plane = np.inf, photo.planes[channel]
     for row in range(0, plane.shape[0] - _BLOCK + 1, _BLOCK // 2):
-        for col in range(0, plane.shape[1] - _BLOCK + 1, _BLOCK // 2):
-            block = np.asarray(plane[row : row + _BLOCK, col : col + _BLOCK], dtype=np.float64)
-            level = float(block.mean())
-            if level > _DARK and float(block.max()) < photo.clip[channel]:
-                least = min(least, _power(block - level, window, fine) / level)
+        blocks = sliding_window_view(plane[row : row + _BLOCK], (_BLOCK, _BLOCK))[0, :: _BLOCK // 2]
+        level = blocks.mean(axis=(1, 2), dtype=np.float64)
+        lit = (level > _DARK) & (blocks.max(axis=(1, 2)) < photo.clip[channel])
+        if lit.any():
+            waves = fft.fft2((blocks[lit] - level[lit, None, None]) * window)[:, fine]
+            power = np.square(np.abs(waves)).mean(axis=1) / np.square(window).sum()
+            least = min(least, float((power / level[lit]).min()))
     return least
 
 
-def _power(block: NDArray[np.float64], window: NDArray[np.float64], fine: NDArray[np.bool_]) -> float:
-    power = np.square(np.abs(fft.fft2(block * window))) / np.square(window).sum()
-    return float(power[fine].mean())
-
-
-def _all_bounded(noise: PlaneNoise, least: Sequence[float]) -> PlaneNoise:
-    r, g, b = (_bounded(of_plane, shot) for of_plane, shot in zip(noise, least, strict=True))
+def _bounded(noise: PlaneNoise, least: Sequence[float]) -> PlaneNoise:
+    r, g, b = (
+        own if own.shot <= shot else NoiseModel(shot, own.read * shot / own.shot)
+        for own, shot in zip(noise, least, strict=True)
+    )
     return r, g, b
-
-
-def _bounded(noise: NoiseModel, shot: float) -> NoiseModel:
-    if noise.shot <= shot:
-        return noise
-    return NoiseModel(shot, noise.read * shot / noise.shot)
-
-
-def _one_sensitivity(first: LinearPhoto, second: LinearPhoto) -> bool:
-    a, b = first.info.metadata, second.info.metadata
-    return (a.camera_model, a.iso) == (b.camera_model, b.iso)

@@ -82,10 +82,8 @@ class Points:
         }
         psfs = []
         for done, cell in enumerate(good, start=1):
-            for channel in channels:
-                psf = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
-                if psf is not None:
-                    psfs.append(psf)
+            solved = [_cell_psf(photo, c, cell[:_MOST], size, skies[c]) for c in channels]
+            psfs += [psf for psf in solved if psf is not None]
             on_step(done, len(good))
         if not psfs:
             raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
@@ -119,6 +117,10 @@ class _Stamp:
         side = self.observed.shape[0] + 2 * (size // 2)
         t = np.arange(side) - size // 2
         return self.flux * np.outer(np.sinc(t - self.place[0]), np.sinc(t - self.place[1]))
+
+    def blurred(self, kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the pixels of the window see of it behind a kernel."""
+        return np.asarray(scipy.signal.fftconvolve(self.latent(len(kernel)), kernel, mode="valid"))
 
 
 def _cell_psf(
@@ -170,43 +172,36 @@ def _stacked(
 
     `kernel` is that of the round before, by which the noise of each pixel is known.
     """
-    high = 2 * size - 1
     shot, read = photo_noise(photo, channel)
     latent = np.concatenate([stamp.latent(size) for stamp in stamps])
     observed = np.zeros((latent.shape[0] - size + 1, size))
-    measured = np.zeros(observed.shape, dtype=bool)
-    variance = np.ones(observed.shape)
+    measured, variance = np.zeros(observed.shape, dtype=bool), np.ones(observed.shape)
     for number, stamp in enumerate(stamps):
-        rows = slice(number * high, number * high + size)
+        rows = slice(number * (2 * size - 1), number * (2 * size - 1) + size)
         observed[rows], measured[rows] = stamp.observed, stamp.measured
-        if kernel is None:
-            light = np.full((size, size), max(stamp.flux, 0.0) / size**2)
-        else:
-            light = np.maximum(scipy.signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
-        variance[rows] = shot * (stamp.sky + light) + read
+        light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
+        variance[rows] = shot * (stamp.sky + np.maximum(light, 0.0)) + read
     return solve(observed, latent, measured, variance, size, even=True)
 
 
 def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
     """Move and scale a light so that the kernel explains its pixels best: one Gauss-Newton step."""
-    size = kernel.shape[0]
     step = 0.05
 
-    def rendered(row: float, col: float) -> NDArray[np.float64]:
-        moved = replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
-        return np.asarray(scipy.signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
+    def moved(row: float, col: float) -> _Stamp:
+        return replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
 
-    predicted = rendered(0.0, 0.0)
-    by_row = (rendered(step, 0.0) - rendered(-step, 0.0)) / (2 * step)
-    by_col = (rendered(0.0, step) - rendered(0.0, -step)) / (2 * step)
-    good = stamp.measured
-    basis = np.stack([predicted[good], by_row[good], by_col[good], np.ones(int(good.sum()))], axis=-1)
-    terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
+    by_row, by_col = (
+        (moved(*d).blurred(kernel) - moved(*np.negative(d)).blurred(kernel)) / (2 * step)
+        for d in ((step, 0.0), (0.0, step))
+    )
+    predicted = stamp.blurred(kernel)
+    basis = np.stack([predicted, by_row, by_col, np.ones_like(predicted)], axis=-1)[stamp.measured]
+    terms, *_ = np.linalg.lstsq(basis, stamp.observed[stamp.measured], rcond=None)
     if not terms[0] > 0.0:
         return stamp
     row, col = np.clip(terms[1:3] / terms[0], -0.5, 0.5)
-    place = stamp.place[0] + float(row), stamp.place[1] + float(col)
-    return replace(stamp, place=place, flux=stamp.flux * float(terms[0]))
+    return replace(moved(float(row), float(col)), flux=stamp.flux * float(terms[0]))
 
 
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
@@ -226,22 +221,12 @@ class PointLight:
 
 def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     """Smooth background of a plane, and how much its pixels scatter (1.48 times the median deviation)."""
-    rows, cols = (max(n // _SKY_CELL, 1) for n in plane.shape)
-    cells = np.empty((rows, cols))
-    for i in range(rows):
-        for j in range(cols):
-            part = plane[
-                i * plane.shape[0] // rows : (i + 1) * plane.shape[0] // rows,
-                j * plane.shape[1] // cols : (j + 1) * plane.shape[1] // cols,
-            ]
-            cells[i, j] = np.median(part)
+    shape = [max(n // _SKY_CELL, 1) for n in plane.shape]
+    strips = np.array_split(plane, shape[0])
+    cells = np.array([[np.median(part) for part in np.array_split(s, shape[1], axis=1)] for s in strips])
     cells = ndimage.median_filter(cells, 3, mode="nearest")
-    zoom = plane.shape[0] / rows, plane.shape[1] / cols
-    grid = np.meshgrid(
-        (np.arange(plane.shape[0]) + 0.5) / zoom[0] - 0.5,
-        (np.arange(plane.shape[1]) + 0.5) / zoom[1] - 0.5,
-        indexing="ij",
-    )
+    places = [(np.arange(n) + 0.5) * count / n - 0.5 for n, count in zip(plane.shape, shape, strict=True)]
+    grid = np.meshgrid(*places, indexing="ij")
     sky = ndimage.map_coordinates(cells, grid, order=1, mode="nearest")
     left = plane - sky
     scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
@@ -266,25 +251,20 @@ def find_lights(plane: NDArray[np.floating]) -> list[PointLight]:
     t = np.arange(-2, 3)
     for row, col in np.argwhere(peaks):
         part = np.maximum(smooth[row - 2 : row + 3, col - 2 : col + 3], 0.0)
-        total = float(part.sum())
-        lights.append(
-            PointLight(
-                row + float((part.sum(axis=1) * t).sum()) / total,
-                col + float((part.sum(axis=0) * t).sum()) / total,
-                float(clean[row - 1 : row + 2, col - 1 : col + 2].max()),
-            )
-        )
+        down, across = (float(part.sum(axis=axis) @ t / part.sum()) for axis in (1, 0))
+        peak = float(clean[row - 1 : row + 2, col - 1 : col + 2].max())
+        lights.append(PointLight(row + down, col + across, peak))
     return sorted(lights, key=lambda light: -light.peak)
 
 
 def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
     """Lights that have no other beside them that would disturb, within `reach` pixels."""
-    places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
+    if not lights:
+        return []
+    places = np.array([(light.row, light.col) for light in lights])
     peaks = np.array([light.peak for light in lights])
-    kept = []
-    for number, light in enumerate(lights):
-        away = np.abs(places - places[number]).max(axis=1)
-        near = (away < reach) & (peaks > _NEIGHBOUR * light.peak)
-        if near.sum() == 1:
-            kept.append(light)
-    return kept
+    return [
+        light
+        for light, place in zip(lights, places, strict=True)
+        if ((np.abs(places - place).max(axis=1) < reach) & (peaks > _NEIGHBOUR * light.peak)).sum() == 1
+    ]

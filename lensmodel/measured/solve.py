@@ -59,6 +59,12 @@ def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.floa
     return np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)
 
 
+def window_terms(side: int, margin: int) -> NDArray[np.float64]:
+    """Terms of `quadratic` in sides of a window from its middle, with a margin around it."""
+    t = (np.arange(-margin, side + margin) - (side - 1) / 2.0) / side
+    return quadratic(t[:, None], t[None, :])
+
+
 # T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light
 PEAK: Final = 0.5
 # D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have

@@ -20,9 +20,9 @@ is linear in e_j, the light, and c_j, what the lens and its reflections lay over
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import ClassVar, Final
 
 import numpy as np
@@ -37,7 +37,6 @@ from lensmodel.measured.page import DETAILS, MEAN, TargetPage
 from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
     SMALL,
-    Latent,
     Solved,
     even_variance,
     measured_pixels,
@@ -45,6 +44,7 @@ from lensmodel.measured.solve import (
     roughly,
     window_corners,
     window_psf,
+    window_terms,
 )
 from lensmodel.photo import LinearPhoto
 
@@ -53,6 +53,7 @@ FLOOR: Final = 0.02
 # Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
 # too low is no reason to cut it (chosen)
 EXPLAINED: Final = 1.15
+_TOO_SMALL: Final = "the page is too small in the photo; go nearer until it nearly fills the frame"
 _CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
 # Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
 _SIDE: Final = 144
@@ -101,14 +102,13 @@ class Target:
         ]
         corners = _spread(held, across, down)
         if not corners:
-            raise NotEnoughEvidenceError(
-                "the page is too small in the photo; go nearer until it nearly fills the frame"
-            )
+            raise NotEnoughEvidenceError(_TOO_SMALL)
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         placed = replace(placed, tones=tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side))
         psfs = []
         for done, corner in enumerate(corners, start=1):
-            psfs += self._window(photo, placed, corner, size, channels)
+            solved = [self._window(photo, placed, corner, size, channel) for channel in channels]
+            psfs += [psf for psf in solved if psf is not None]
             on_step(done, len(corners))
         if not psfs:
             raise NotEnoughEvidenceError("no window of the page determines a PSF; is the photo in focus?")
@@ -116,55 +116,37 @@ class Target:
 
     def find(self, photo: LinearPhoto) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
-        plane = np.asarray(photo.planes[1])
-        marks = find_marks(plane)
-        placed = _identified(photo, plane, marks, self.details)
-        side = self.side
-        corners = [
-            corner for corner in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*corner, side, 0)
-        ]
+        plane, side = np.asarray(photo.planes[1]), self.side
+        placed = _identified(photo, plane, find_marks(plane), self.details)
+        corners = [at for at in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*at, side, 0)]
         warp = placed.warp
         for degree in (1, 3, 5, 5):
             warp = matched(
-                warp, partial(_light, placed.page), plane, corners, side, least_clarity=_CLEAR, degree=degree
-            )
+                warp, lambda bent, at, shape: replace(placed, warp=bent).window(*at, shape),
+                plane, corners, side, least_clarity=_CLEAR, degree=degree,
+            )  # fmt: skip
         return replace(placed, warp=warp)
 
     def _window(
-        self,
-        photo: LinearPhoto,
-        placed: PlacedPage,
-        corner: tuple[int, int],
-        size: int,
-        channels: Iterable[Channel],
-    ) -> list[MeasuredPsf]:
-        psfs = []
-        for channel in channels:
-            try:
-                at, window = self._explained(photo, placed, channel, corner, size)
-            except NotEnoughEvidenceError:
-                continue
-            error = float(np.hypot(window.solved.error, FLOOR))
-            if error < _SURE:
-                pixel = at[0] + (window.side - 1) / 2.0, at[1] + (window.side - 1) / 2.0
-                position = photo.frame.position(*pixel)
-                psfs.append(MeasuredPsf(window.kernel, position, channel, error, pixel, window.side))
-        return psfs
-
-    def _explained(
-        self, photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], size: int
-    ) -> tuple[tuple[int, int], SolvedWindow]:
+        self, photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], size: int, channel: Channel
+    ) -> MeasuredPsf | None:
         """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
-        best = corner, solve_window(photo, placed, channel, corner, self.side, size)
-        for part in _SMALLER:
-            side = round(self.side * part)
-            if best[1].solved.misfit <= EXPLAINED:
-                break
-            if _pixels(photo, channel, side) < _LEAST_PIXELS * size * size:
-                break
-            inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
-            best = inner, solve_window(photo, placed, channel, inner, side, size)
-        return best
+        try:
+            best = solve_window(photo, placed, channel, corner, self.side, size)
+            for part in _SMALLER:
+                side = round(self.side * part)
+                few = _pixels(photo, channel, side) < _LEAST_PIXELS * size * size
+                if best.solved.misfit <= EXPLAINED or few:
+                    break
+                inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
+                best = solve_window(photo, placed, channel, inner, side, size)
+        except NotEnoughEvidenceError:
+            return None
+        error = float(np.hypot(best.solved.error, FLOOR))
+        pixel = best.corner[0] + (best.side - 1) / 2.0, best.corner[1] + (best.side - 1) / 2.0
+        if error >= _SURE:
+            return None
+        return MeasuredPsf(best.kernel, photo.frame.position(*pixel), channel, error, pixel, best.side)
 
 
 def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
@@ -175,23 +157,15 @@ def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
     return side * side * sites / 4.0
 
 
-def _light(
-    page: TargetPage, warp: Warp, corner: tuple[int, int], shape: tuple[int, int]
-) -> NDArray[np.float32]:
-    return PlacedPage(page, warp).window(*corner, shape)
-
-
 def _identified(
     photo: LinearPhoto, plane: NDArray[np.floating], marks: NDArray[np.float64], details: Sequence[int]
 ) -> PlacedPage:
     """Say which page it is and which way up, by the noise near the middle of the page."""
     best: tuple[float, PlacedPage] | None = None
-    middle = marks.mean(axis=0)
-    side = _SIDE
-    corner = round(middle[0] - side / 2), round(middle[1] - side / 2)
-    if min(corner) < 0 or corner[0] + side > plane.shape[0] or corner[1] + side > plane.shape[1]:
-        raise NotEnoughEvidenceError("the page is too small in the photo; go nearer until it fills the frame")
-    window = plane[corner[0] : corner[0] + side, corner[1] : corner[1] + side]
+    middle, side = marks.mean(axis=0), _SIDE
+    row, col = np.rint(middle - side / 2).astype(int)
+    if min(row, col) < 0 or row + side > plane.shape[0] or col + side > plane.shape[1]:
+        raise NotEnoughEvidenceError(_TOO_SMALL)
     for detail in details:
         page = TargetPage(detail)
         for turn in range(4):
@@ -199,9 +173,10 @@ def _identified(
             if not 0.3 < warp.scale(*middle) < 3.0:
                 break  # no turn makes noise visible that pixels do not resolve
             placed = PlacedPage(page, warp)
-            matching = match(window, placed.window(*corner, (side, side)))
-            if best is None or matching.clarity > best[0]:
-                best = matching.clarity, placed
+            shown = placed.window(row, col, (side, side))
+            clarity = match(plane[row : row + side, col : col + side], shown).clarity
+            if best is None or clarity > best[0]:
+                best = clarity, placed
     if best is None or best[0] < _CLEAR:
         raise NotEnoughEvidenceError(
             "four discs are seen, but between them not the noise of a target that is known; print it with "
@@ -216,17 +191,9 @@ def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tup
         return []
     places = np.array(held)
     first, last = places.min(axis=0), places.max(axis=0)
-    chosen = {
-        held[int(np.argmin(np.hypot(*(places - first - (last - first) * np.array([i, j])).T)))]
-        for i in _parts(down)
-        for j in _parts(across)
-    }
-    return sorted(chosen)
-
-
-def _parts(count: int) -> NDArray[np.float64]:
-    """From one end to the other, or the middle alone."""
-    return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+    parts = [np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5]) for count in (down, across)]
+    wanted = first + (last - first) * np.stack(np.meshgrid(*parts, indexing="ij"), axis=-1).reshape(-1, 2)
+    return sorted({held[int(np.argmin(np.hypot(*(places - place).T)))] for place in wanted})
 
 
 # Standard deviation of q and c, see `tones_of`: what tones a print of unknown making may have (chosen: a
@@ -255,19 +222,14 @@ class PlacedPage:
     def window(self, row: float, col: float, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Light of the page as pixels would see it that are points; no frequency beyond theirs."""
         # turned or aslant, a page has frequencies along the pixels' axes that pixels do not hold
-        high, wide = (fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape)
-        rows = row - _SPARE + np.arange(high * _FINE) / _FINE
-        cols = col - _SPARE + np.arange(wide * _FINE) / _FINE
-        light = self._toned(self.page.at(*self.warp(*np.meshgrid(rows, cols, indexing="ij"))))
-        spectrum = fft.rfft2((light - MEAN) * _taper(high * _FINE)[:, None] * _taper(wide * _FINE))
-        coarse = np.zeros((high, wide // 2 + 1), dtype=spectrum.dtype)
-        up, down, across = (high + 1) // 2, (high - 1) // 2, (wide + 1) // 2
-        coarse[:up, :across] = spectrum[:up, :across]
-        coarse[-down:, :across] = spectrum[-down:, :across]
-        plane = fft.irfft2(coarse, s=(high, wide)) / _FINE**2 + MEAN
-        return np.ascontiguousarray(
-            plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]], dtype=np.float32
-        )
+        sides = [fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape]
+        places = [at - _SPARE + np.arange(n * _FINE) / _FINE for at, n in zip((row, col), sides, strict=True)]
+        plane = self._toned(self.page.at(*self.warp(*np.meshgrid(*places, indexing="ij")))) - MEAN
+        plane *= _taper(sides[0] * _FINE)[:, None] * _taper(sides[1] * _FINE)
+        for axis, n in enumerate(sides):
+            plane = scipy.signal.resample(plane, n, axis=axis)
+        inner = plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]]
+        return np.ascontiguousarray(inner + MEAN, dtype=np.float32)
 
     def holds(self, row: int, col: int, side: int, margin: int) -> bool:
         """Whether a window of the photo, with its margin, shows noise and nothing else."""
@@ -276,8 +238,7 @@ class PlacedPage:
 
     def _toned(self, reflectance: NDArray[np.float32]) -> NDArray[np.float32]:
         first, second, third = (np.float32(t) for t in self.tones)
-        toned = reflectance * (first + reflectance * (second + reflectance * third))
-        return np.asarray(toned, dtype=np.float32)
+        return np.asarray(reflectance * (first + reflectance * (second + reflectance * third)))
 
 
 @cache
@@ -293,7 +254,8 @@ class SolvedWindow:
     kernel: NDArray[np.float64]
     solved: Solved
     shift: tuple[float, float]
-    light: Illumination
+    light: NDArray[np.float64]  # (6,), terms of `window_terms`
+    corner: tuple[int, int]
     side: int
 
 
@@ -301,38 +263,25 @@ def solve_window(
     photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int, size: int
 ) -> SolvedWindow:
     """Find the light and the kernel of size `size` of a window of the page."""
-    light = _light_on(photo, placed, channel, corner, side)
-    kernel, solved, shift = window_psf(
-        photo, channel, corner, (side, side), _lit(placed, light, corner, side), size
-    )
-    return SolvedWindow(kernel, solved, shift, light, side)
-
-
-def _light_on(
-    photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int
-) -> Illumination:
-    """Light and a small kernel of a window, each found with the other."""
-    row, col = corner
-    measured = measured_pixels(photo, channel, row, col, (side, side))
+    (row, col), shape = corner, (side, side)
+    measured = measured_pixels(photo, channel, row, col, shape)
     plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
     observed = np.asarray(plane, dtype=np.float64)
     variance = even_variance(photo, channel, observed, measured)
-    light, page = Illumination.even(side), _lit(placed, Illumination.even(side), corner, side)
-    for _ in range(_LIGHT_ROUNDS):
-        rough, shift = roughly(observed, measured, variance, _lit(placed, light, corner, side))
-        light = fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
-    return light
 
+    def page(shift: tuple[float, float], margin: int) -> NDArray[np.float32]:
+        outer = side + 2 * margin, side + 2 * margin
+        return placed.window(row - margin - shift[0], col - margin - shift[1], outer)
 
-def _lit(placed: PlacedPage, light: Illumination, corner: tuple[int, int], side: int) -> Latent:
-    """Return what a window shows without blur in some light."""
+    def lit(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
+        return page(shift, margin) * (window_terms(side, margin) @ light)
 
-    def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
-        shape = side + 2 * margin, side + 2 * margin
-        page = placed.window(corner[0] - margin - shift[0], corner[1] - margin - shift[1], shape)
-        return page * light(margin)
-
-    return latent
+    light = np.eye(6)[0]
+    for _ in range(_LIGHT_ROUNDS):  # light and a small kernel, each found with the other
+        rough, shift = roughly(observed, measured, variance, lit)
+        light = _fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
+    kernel, solved, shift = window_psf(photo, channel, corner, shape, lit, size)
+    return SolvedWindow(kernel, solved, shift, light, corner, side)
 
 
 def tones_of(
@@ -362,9 +311,9 @@ def _tones_in(
     photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], side: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Precision (2, 2) and value (2,) of (q, c) in one window."""
-    half = 7
-    window = solve_window(photo, placed, "g", corner, side, 2 * half + 1)
-    light, kernel = window.light(half), window.kernel
+    half = SMALL // 2
+    window = solve_window(photo, placed, "g", corner, side, SMALL)
+    light, kernel = window_terms(side, half) @ window.light, window.kernel
     start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
     shape = side + 2 * half, side + 2 * half
     columns = [
@@ -392,40 +341,18 @@ def _tones_in(
 _FEWEST: Final = 64  # pixels: five times as many as there are terms
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Illumination:
-    """A quadratic in row and column whose mean over its square window is 1."""
-
-    terms: NDArray[np.float64]  # (6,), of `quadratic`, in sides of the window from its middle
-    side: int  # side of the window in pixels
-
-    @classmethod
-    def even(cls, side: int) -> Illumination:
-        """Return light that is the same everywhere."""
-        return cls(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), side)
-
-    def __call__(self, margin: int) -> NDArray[np.float64]:
-        """Return the light of the window and of a margin around it."""
-        return _terms(self.side, margin) @ self.terms
-
-
-def fitted_light(
+def _fitted_light(
     observed: NDArray[np.floating], measured: NDArray[np.bool_], page: NDArray[np.floating], kernel: Kernel
-) -> Illumination:
-    """Fit the light of a window."""
+) -> NDArray[np.float64]:
+    """Terms (6,) of a quadratic in row and column, whose mean over its square window is 1."""
     side = observed.shape[0]
     if int(measured.sum()) < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
-    outer, inner = _terms(side, kernel.shape[0] // 2), _terms(side, 0)
+    outer, inner = window_terms(side, kernel.shape[0] // 2), window_terms(side, 0)
     lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
-    basis = np.stack([*lit, *(inner[..., j][measured] for j in range(6))], axis=-1)
+    basis = np.stack([*lit, *inner[measured].T], axis=-1)
     terms, *_ = np.linalg.lstsq(basis, np.asarray(observed[measured], dtype=np.float64), rcond=None)
     light = inner @ terms[:6]
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
-    return Illumination(np.asarray(terms[:6] / float(light.mean())), side)
-
-
-def _terms(side: int, margin: int) -> NDArray[np.float64]:
-    t = (np.arange(-margin, side + margin) - (side - 1) / 2.0) / side
-    return quadratic(t[:, None], t[None, :])
+    return np.asarray(terms[:6] / float(light.mean()))

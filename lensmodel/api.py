@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterable
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +24,7 @@ from lensmodel.photo.location import gps_directory
 from lensmodel.workflow.calibrating import Calibration, LensStore
 from lensmodel.workflow.correcting import correct_photo, lateral_of
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.sampling import (
-    CalibrationEvent,
-    Config,
-    EventHook,
-    photo_id,
-    preset_of,
-    settings_of,
-)
+from lensmodel.workflow.sampling import CalibrationEvent, Config, EventHook, photo_id, preset_of, settings_of
 
 FORMATS: dict[str, photo.OutputFormat] = {
     ".tif": "tiff16",
@@ -120,7 +114,7 @@ def calibrate(
         As `on_event` raised it.
     """
     _require_workers(workers)
-    on_event = _shown_events() if on_event is None else on_event
+    on_event = on_event or _show_event
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
@@ -138,15 +132,9 @@ def calibrate(
     reasons = []
     with processes.pool(None, workers, estimators.resolve(config.of_lens(lens).method)) as pool:
         calibration = Calibration(LensStore(lens), config, begin=begin, any_lens=any_lens, pool=pool)
-        for verdict in calibration.learn(paths, executor, on_event=on_event):
-            path, count = verdict.photo, verdict.samples
-            if verdict.error is not None:
-                reasons.append(f"{path.name}: {verdict.error}")
-                event = CalibrationEvent(path, "skipped", detail=str(verdict.error))
-            elif count is None:
-                event = CalibrationEvent(path, "skipped", detail="its samples are in the model already")
-            else:
-                event = CalibrationEvent(path, "counted", count, count)
+        for event in calibration.learn(paths, executor, on_event=on_event):
+            if event.error is not None:
+                reasons.append(f"{event.photo.name}: {event.detail}")
             on_event(event)
     learned = calibration.known
     if learned is None:
@@ -272,7 +260,7 @@ def correct(
         photo="" if source is None else photo_id(source),
         least_gain_db=least_gain_db,
         workers=workers or os.cpu_count() or 1,
-        on_step=_shown_steps(source) if on_step is None else on_step,
+        on_step=on_step or partial(_show_step, "the photo" if source is None else source.name),
     )
     too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
     if target is None or too_little:
@@ -299,54 +287,29 @@ def correct(
     return corrected
 
 
-class ProgressLine:
-    """One line on standard error, shown anew by a terminal; a notebook gets whole lines, others nothing."""
-
-    def __init__(self) -> None:
-        self._terminal = sys.stderr.isatty()
-        self._shown = self._terminal or "ipykernel" in sys.modules
-        self._width = 0
-
-    def say(self, text: str) -> None:
-        """Show a step in place of the last one."""
-        if self._terminal:
-            sys.stderr.write(f"\r{text:<{self._width}}")
-            sys.stderr.flush()
-            self._width = len(text)
-
-    def end(self, text: str) -> None:
-        """Show a line that stays."""
-        if self._shown:
-            sys.stderr.write(f"{chr(13) if self._terminal else ''}{text:<{self._width}}\n")
-            self._width = 0
+def say(text: str, *, stays: bool = False) -> None:
+    """Show a step on the last line of a terminal; a notebook gets only lines that stay, others nothing."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[K{text}{chr(10) if stays else ''}")  # in place of the step before
+        sys.stderr.flush()
+    elif stays and "ipykernel" in sys.modules:
+        sys.stderr.write(f"{text}\n")
 
 
-def _shown_events() -> EventHook:
-    """Show what becomes of each photo."""
-    line = ProgressLine()
-
-    def show(event: CalibrationEvent) -> None:
-        if event.stage == "counted":
-            line.end(f"{event.photo.name}: {event.total} samples")
-        elif event.stage == "skipped":
-            line.end(f"{event.photo.name}: not used: {event.detail}")
-        else:
-            share = f" {event.done / event.total:.0%}" if event.total else ""
-            line.say(f"{event.photo.name}: {event.stage}{share}")
-
-    return show
+def _show_event(event: CalibrationEvent) -> None:
+    """Show what becomes of a photo."""
+    if event.stage == "counted":
+        say(f"{event.photo.name}: {event.total} samples", stays=True)
+    elif event.stage == "skipped":
+        say(f"{event.photo.name}: not used: {event.detail}", stays=True)
+    else:
+        share = f" {event.done / event.total:.0%}" if event.total else ""
+        say(f"{event.photo.name}: {event.stage}{share}")
 
 
-def _shown_steps(source: Path | None) -> StepHook:
+def _show_step(name: str, done: int, total: int) -> None:
     """Show how far the correction of a photo is."""
-    line, name = ProgressLine(), "the photo" if source is None else source.name
-
-    def show(done: int, total: int) -> None:
-        line.say(f"{name}: corrected {done / max(total, 1):.0%}")
-        if done == total:
-            line.say("")
-
-    return show
+    say(f"{name}: corrected {done / max(total, 1):.0%}" if done < total else "")
 
 
 def _format_of(output: Path) -> photo.OutputFormat:

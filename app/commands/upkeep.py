@@ -38,7 +38,7 @@ def doctor(
 
     Exit status: 0 all is well, 1 something is not, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, as_json=json_output)
     settings = _existing(data)
     with opened(settings) as store:
         migrate.check(store.database)
@@ -76,7 +76,7 @@ def backup(
 
     Exit status: 0 there is a new backup, 1 there is none, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=0)
+    shown = Display.of(context, quiet=quiet, as_json=json_output)
     settings = _existing(data)
     with opened(settings) as store, shown.progress() as bars:
         task = bars.add_task("blobs", total=None)

@@ -101,7 +101,7 @@ def blind(
         write_report,
     )
 
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
     refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
     with as_usage():
         settings = BlindBenchmark(
@@ -150,7 +150,7 @@ def model(
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
     refuse_existing(_file(json_output), force=force)
     try:
         first, last = (int(part) for part in seeds.split(":"))
@@ -218,7 +218,7 @@ def correct(
     from lensmodel.photo import develop  # noqa: PLC0415 - same
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
     refuse_existing(_file(json_output), force=force)
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")

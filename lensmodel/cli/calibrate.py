@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from importlib import import_module
-from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import typer
 
@@ -17,13 +16,10 @@ from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import AnyLens, Aperture, Json, Photos, Profile, Quiet, Verbose, Workers, choice
 from lensmodel.core import processes
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings
-from lensmodel.model import LensProfile, save_profile
 from lensmodel.patches import selectors
 from lensmodel.workflow import calibrating, sampling
 from lensmodel.workflow.calibrating import AHEAD
-from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import PRESETS, preset_of
 
 Selector = Annotated[
@@ -89,7 +85,8 @@ def calibrate(
 
     Exit status: 0 all photos counted, 1 some did not, 2 wrong usage.
     """
-    shown, target = Display.of(context, quiet=quiet, verbose=verbose), files.named(profile)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
+    target = files.named(profile)
     paths = files.photos(photos)
     files.refuse_photo(target, paths)
     with files.as_usage():
@@ -106,27 +103,33 @@ def calibrate(
             )
 
         with executor_of(scheduler) as (executor, ahead), processes.pool(None, workers) as pool:
-            store = ProfileFile(target, model, force=force)
+            store = files.ProfileFile(target, model, force=force)
             calibration = calibrating.Calibration(store, config, any_lens=any_lens, pool=pool)
-            for verdict in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
-                results.append({"photo": str(verdict.photo), **_result(verdict, shown)})
+            for event in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
+                result: dict[str, Any] = {"state": "counted", "samples": event.total}
+                if event.error is not None:
+                    result = files.failed(event.error)
+                    shown.error(f"{event.photo}: {result['reason']}")
+                elif event.stage == "skipped":
+                    result = {"state": "known"}
+                    shown.note(f"{event.photo}: the profile has it already")
+                results.append({"photo": str(event.photo), **result})
                 bars.update(task, completed=len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
     photo_count, sample_count = (len(lens.profile.photos), len(lens.samples)) if lens else (0, 0)
     failed = [result for result in results if result["state"] == "failed"]
-    if json_output:
-        shown.document(
-            {
-                "profile": str(target) if lens else None,
-                "photos": photo_count,
-                "samples": sample_count,
-                "coverage": coverage,
-                "model": preset_of(lens.model).name if lens else None,
-                "results": results,
-            }
-        )
-    elif lens is not None and len(failed) < len(results):
+    shown.document(
+        {
+            "profile": str(target) if lens else None,
+            "photos": photo_count,
+            "samples": sample_count,
+            "coverage": coverage,
+            "model": preset_of(lens.model).name if lens else None,
+            "results": results,
+        }
+    )
+    if lens is not None and len(failed) < len(results):
         cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
         shown.result(f"{target}: photos {photo_count}, samples {sample_count} ({cover})")
     if lens is None:
@@ -135,73 +138,6 @@ def calibrate(
         )
     if failed:
         raise typer.Exit(1)
-
-
-_ZIP: Final = b"PK"  # First bytes of a profile, damaged or not: the signature of a ZIP file
-
-
-def _result(verdict: calibrating.PhotoVerdict, display: Display) -> dict[str, Any]:
-    """Say what became of a photo, at once and in the document."""
-    if verdict.error is not None:
-        result = files.failed(verdict.error)
-        display.error(f"{verdict.photo}: {result['reason']}")
-        return result
-    if verdict.samples is None:
-        display.note(f"{verdict.photo}: the profile has it already")
-        return {"state": "known"}
-    return {"state": "counted", "samples": verdict.samples}
-
-
-class ProfileFile(calibrating.LensStore):
-    """The store of a lens in a file.
-
-    Another run may add to the same file meanwhile: the profile is read again whenever the file has
-    changed, so that no run drops what another one learned.
-    """
-
-    def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
-        super().__init__()
-        self._target, self._model = target, model
-        self._stamp_read = _stamp(target) if force else None
-
-    def lens(self) -> Lens | None:
-        """Return the lens, read anew if another run changed the file."""
-        stamp = _stamp(self._target)
-        if stamp not in {None, self._stamp_read}:
-            profile = _opened(self._target)
-            learned = preset_of(profile.model).name
-            if self._model not in {None, learned}:  # its kernels are the other model's: both would be mixed
-                raise InvalidInputError(
-                    f"the lens in {self._target.name} has the model {learned}, not {self._model}: name a new "
-                    "file after --profile and give its photos again, or replace the file with --force"
-                )
-            self._lens, self._stamp_read = Lens(profile), stamp
-        return self._lens
-
-    def keep(self, lens: Lens) -> None:
-        """Save the lens."""
-        self._target.parent.mkdir(parents=True, exist_ok=True)
-        save_profile(self._target, lens.profile)
-        self._lens, self._stamp_read = lens, _stamp(self._target)
-
-
-def _opened(target: Path) -> LensProfile:
-    try:
-        return files.profile_at(target)
-    except InvalidInputError as error:
-        with target.open("rb") as file:
-            damaged = file.read(len(_ZIP)) == _ZIP
-        remedy = "--force replaces the file" if damaged else "name a new file after --profile"
-        raise InvalidInputError(f"{error}; {remedy}") from error
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return inode, size and time of a file, which change when it is replaced; None without file."""
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 # Seconds to reach the scheduler of a cluster (chosen): one in the same network answers at once

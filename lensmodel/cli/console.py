@@ -1,10 +1,7 @@
 """What a command says: results on standard output, all else on standard error.
 
-Progress as bars and as plain lines, and when a time left can be told.
-
-Tables of plain text: columns in line in a terminal, words that `grep` and `awk` find in a pipe.
-
-Words that command line, pages and reports share.
+Progress as a bar or as plain lines, and when a time left can be told; tables of plain text; words that
+commands, pages and reports share.
 """
 
 from __future__ import annotations
@@ -17,22 +14,12 @@ from bisect import bisect_right
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TaskID,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
-from rich.text import Text
+from rich.progress import BarColumn, Progress, Task, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from lensmodel.core.codec import to_json
 
@@ -54,12 +41,15 @@ class Display:
 
     quiet: bool = False  # only errors; and results where they were asked for as JSON
     verbose: int = 0  # 0 warnings, 1 what happens, 2 all that is logged
+    as_json: bool = False  # a document instead of results in words
 
     @classmethod
-    def of(cls, context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Display:
+    def of(
+        cls, context: typer.Context, *, quiet: bool = False, verbose: int = 0, as_json: bool = False
+    ) -> Display:
         """Return the display of a subcommand, whose options add to those of the program."""
         base = context.find_object(Display) or Display()
-        display = Display(base.quiet or quiet, max(base.verbose, verbose))
+        display = Display(base.quiet or quiet, max(base.verbose, verbose), as_json)
         display.configure()
         return display
 
@@ -73,13 +63,14 @@ class Display:
             logging.getLogger(COMPILING).setLevel(logging.INFO)
 
     def result(self, text: str) -> None:
-        """Print what was asked for."""
-        if not self.quiet:
+        """Print what was asked for, in words."""
+        if not self.quiet and not self.as_json:
             typer.echo(text)
 
     def document(self, value: Any) -> None:  # noqa: ANN401 - any value that the codec knows
-        """Print a result as JSON, the only thing on standard output."""
-        typer.echo(json.dumps(to_json(value), indent=2))
+        """Print what was asked for as JSON, then the only thing on standard output."""
+        if self.as_json:
+            typer.echo(json.dumps(to_json(value), indent=2))
 
     def note(self, text: str) -> None:
         """Tell what a person may want to know."""
@@ -88,8 +79,8 @@ class Display:
 
     def detail(self, text: str) -> None:
         """Tell what only who asks for more with -v wants to know."""
-        if self.verbose and not self.quiet:
-            self.error(text)
+        if self.verbose:
+            self.note(text)
 
     def progress_line(self, text: str, seconds: float) -> None:
         """Tell a step of long work, with the time since its start, on standard error."""
@@ -100,39 +91,22 @@ class Display:
         """Tell what went wrong."""
         typer.echo(f"lensmodel: {text}", err=True)
 
-    @contextmanager
-    def progress(self) -> Iterator[PacedProgress]:
+    def progress(self) -> PacedProgress:
         """One bar with share and time left; plain lines now and then where no terminal can show it."""
         terminal = sys.stderr.isatty()
-        bars = PacedProgress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            TimeLeft(),
-            say=None if self.quiet or terminal else _to_standard_error,
+        return PacedProgress(
+            say=None if self.quiet or terminal else partial(typer.echo, err=True),
             console=Console(file=sys.stderr),
             disable=self.quiet or not terminal,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
         )
-        with bars:
-            yield bars
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
         """Show that something goes on whose end cannot be foretold, with the time since its start."""
-        bars = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            TimeElapsedColumn(),
-            console=Console(file=sys.stderr),
-            disable=self.quiet or not sys.stderr.isatty(),
-            transient=True,
-            redirect_stdout=sys.stdout.isatty(),
-        )
-        with bars:
-            bars.add_task(text, total=None)
+        with self.progress() as bar:
+            bar.add_task(text, total=None)
             yield
 
 
@@ -156,11 +130,9 @@ class Pace:
         self._total: float | None = None
 
     def mark(self, now: float, done: float, total: float | None) -> None:
-        """Take note of how far a task is; a new count begins where it falls, or its total changes."""
-        if self._done and (done < self._done[-1] or total != self._total):
-            self._times.clear()
-            self._done.clear()
-        self._total = total
+        """Take note of how far a task is; a new count begins where its total changes."""
+        if total != self._total:
+            self._times, self._done, self._total = [], [], total
         if not self._done or done > self._done[-1]:
             self._times.append(now)
             self._done.append(done)
@@ -171,10 +143,8 @@ class Pace:
             return None
         start, end, first, last = self._times[0], self._times[-1], self._done[0], self._done[-1]
         middle = self._done[bisect_right(self._times, (start + end) / 2.0) - 1]
-        earlier, later = middle - first, last - middle
-        if last < min(LEAST_SHARE * self._total, LEAST_COUNT) or min(earlier, later) <= 0.0:
-            return None
-        if max(earlier, later) > AGREE * min(earlier, later):
+        earlier, later = sorted((middle - first, last - middle))
+        if last < min(LEAST_SHARE * self._total, LEAST_COUNT) or earlier <= 0.0 or later > AGREE * earlier:
             return None
         return max((end - start) * (self._total - last) / (last - first) - (now - end), 0.0)
 
@@ -184,15 +154,20 @@ class PacedProgress(Progress):
 
     def __init__(
         self,
-        *columns: ProgressColumn,
+        *,
         say: Callable[[str], None] | None = None,
         every_s: float = EVERY_S,
         **given: Any,  # noqa: ANN401 - as `Progress` takes them
     ) -> None:
-        super().__init__(*columns, **given)
+        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+        super().__init__(*columns, TextColumn("{task.fields[left]}"), **given)
         self._say, self._every_s = say, every_s
         self._began = self._last = time.monotonic()
         self._paces: dict[TaskID, Pace] = {}
+
+    def add_task(self, *given: Any, **options: Any) -> TaskID:  # noqa: ANN401 - as `Progress` takes them
+        """Add a task as `Progress.add_task` does."""
+        return super().add_task(*given, left="", **options)
 
     def update(self, task_id: TaskID, *, more: bool = False, **changes: Any) -> None:  # noqa: ANN401 - as there
         """Change a task as `Progress.update` does; tell it if it is time.
@@ -213,13 +188,9 @@ class PacedProgress(Progress):
             self._last = now
             self._say(line(task, now - self._began, left))
 
-
-class TimeLeft(ProgressColumn):
-    """Column of a bar: the time left, once it can be told."""
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a task."""
-        return Text(task.fields.get("left", ""))
+    def part(self, task: TaskID, number: int, done: int, total: int, *, more: bool = False) -> None:
+        """Show that photo `number` is done as far as `done` of `total`."""
+        self.update(task, completed=number + done / max(total, 1), more=more)
 
 
 def line(task: Task, seconds: float, left: float | None) -> str:
@@ -234,17 +205,6 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def show_share(
-    bars: PacedProgress, task: TaskID, number: int, done: int, total: int, *, more: bool = False
-) -> None:
-    """Show that photo `number` is done as far as `done` of `total`."""
-    bars.update(task, completed=number + done / max(total, 1), more=more)
-
-
-def _to_standard_error(text: str) -> None:
-    typer.echo(text, err=True)
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Container[int] = ()) -> str:

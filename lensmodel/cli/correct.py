@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 
 from lensmodel.cli import files, folder, outputs
-from lensmodel.cli.console import Display, show_share
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import (
     ANY_LENS,
@@ -25,8 +23,10 @@ from lensmodel.cli.options import (
     choice,
     rare,
 )
+from lensmodel.core.types import LensSettings
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.photo import OutputFormat
+from lensmodel.workflow.correcting import SEEN_DB
 from lensmodel.workflow.lens import Lens
 
 # Panels of the options that --help-all adds
@@ -85,8 +85,7 @@ def correct(
         ),
     ] = None,
     learn_from: Annotated[
-        int,
-        rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group."),
+        int, rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group.")
     ] = folder.LEARN_FROM,
     any_lens: Annotated[bool, rare(LEARNING, ANY_LENS)] = False,
     method: Annotated[
@@ -152,20 +151,9 @@ def correct(
     Exit status: 0 all photos are corrected, 1 some are not, 2 wrong usage.
     """
     del help_all
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")
-    options = outputs.CorrectionOptions(
-        aperture,
-        method,
-        strength,
-        Bounds(halo, texture, denoise),
-        file_format,
-        workers,
-        any_lens=any_lens,
-        force=force,
-        keep_location=keep_location,
-    )
     if (profile is None) == (lens is None):
         raise UsageError(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
@@ -173,41 +161,32 @@ def correct(
     if profile is None and lens != "auto":
         raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
     targets, twice = outputs.targets_of(files.photos(photos), output, file_format)
-    outputs.check(options)
+    with files.as_usage():  # before any work
+        if method is not None:
+            deconvolvers.create(method)
+        LensSettings(aperture=aperture)
     clashed = outputs.clashes(twice, shown)
-    if profile is not None:
-        document = _correct_by(profile, targets, options, shown, as_json=json_output)
+    options = {
+        "aperture": aperture,
+        "method": method,
+        "strength": strength,
+        "bounds": Bounds(halo, texture, denoise),
+        "file_format": file_format,
+        "least_gain_db": SEEN_DB if profile is None else None,
+        "keep_location": keep_location,
+        "workers": workers,
+    }
+    correction = outputs.Correction(targets, options, any_lens, force, shown)
+    document: dict[str, Any] = {"profile": str(profile)}
+    if profile is None:
+        base = next(iter([*targets.values(), *twice])).parent
+        document = folder.correct_folder(correction, profiles or base / folder.PROFILES, learn_from)
     else:
-        base = next(iter({**targets, **twice})).parent
-        work = folder.Folder(base, profiles or base / folder.PROFILES, learn_from, options, shown)
-        document = work.correct(targets, as_json=json_output)
+        known = Lens(files.profile_at(profile))
+        with shown.progress() as bar:
+            task = bar.add_task("", total=len(targets))
+            document["results"] = correction.photos(list(targets), known, bar, task)
     document["results"][:0] = clashed
-    if json_output:
-        shown.document(document)
+    shown.document(document)
     if any(result["state"] == "failed" for result in document["results"]):
         raise typer.Exit(1)
-
-
-def _correct_by(
-    profile: Path,
-    targets: Mapping[Path, Path],
-    options: outputs.CorrectionOptions,
-    display: Display,
-    *,
-    as_json: bool,
-) -> dict[str, Any]:
-    """Correct photos, given by the file that each becomes, one after the other."""
-    lens = Lens(files.profile_at(profile))
-    results: list[dict[str, Any]] = []
-    with display.progress() as bars:
-        task = bars.add_task("", total=len(targets))
-        for number, (target, path) in enumerate(targets.items()):
-            bars.update(task, description=path.name)
-            share = partial(show_share, bars, task, number)
-            result = outputs.correct_one(path, target, lens, options, display, share, targets.values())
-            if result["state"] == "corrected" and not as_json:
-                display.result(str(target))
-            outputs.say(path, target, result, display, display.note)
-            results.append({"photo": str(path), "output": str(target), **result})
-            bars.update(task, completed=number + 1)
-    return {"profile": str(profile), "results": results}

@@ -19,7 +19,7 @@ import time
 from types import FrameType
 from typing import Final
 
-from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError, LensModelError
 
 
 class UsageError(InvalidInputError):
@@ -65,6 +65,16 @@ def _end_workers(number: int) -> None:
             child.kill()
         time.sleep(0.05)
     os._exit(128 + number)
+
+
+def words_of(error: LensModelError | ModuleNotFoundError | OSError) -> str:
+    """Say why a command failed and what helps; nothing where that is a fault of the program."""
+    if isinstance(error, ModuleNotFoundError):
+        return remedy(error) or ""
+    if isinstance(error, LensModelError):
+        return str(error)
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}; check the path, its rights and the disk"
 
 
 def remedy(missing: ModuleNotFoundError) -> str | None:

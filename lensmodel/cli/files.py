@@ -13,6 +13,9 @@ from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
+from lensmodel.workflow.calibrating import LensStore
+from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.sampling import preset_of
 
 # What phones add to the names of the files of one shot
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
@@ -87,15 +90,65 @@ def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
         )
 
 
-def profile_at(path: Path) -> LensProfile:
-    """Open a profile."""
+def profile_at(path: Path, *, replaceable: bool = False) -> LensProfile:
+    """Open a profile; one that is not `replaceable` is only read."""
     if path.is_dir():
         raise UsageError(f"{path} is a folder; give the file of a lens profile")
     if not path.exists():
         raise UsageError(
             f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
         )
-    return load_profile(path)
+    try:
+        return load_profile(path)
+    except InvalidInputError as error:
+        if not replaceable:
+            raise
+        damaged = path.read_bytes().startswith(b"PK")  # a ZIP file, as profiles are
+        remedy = "--force replaces the file" if damaged else "name a new file after --profile"
+        raise InvalidInputError(f"{error}; {remedy}") from error
+
+
+class ProfileFile(LensStore):
+    """The store of a lens in a file.
+
+    Another run may add to the same file meanwhile: the profile is read again whenever the file has
+    changed, so that no run drops what another one learned.
+    """
+
+    def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
+        super().__init__()
+        self._target, self._model = target, model
+        self._stamp_read = _stamp(target) if force else None
+
+    def lens(self) -> Lens | None:
+        """Return the lens, read anew if another run changed the file."""
+        stamp = _stamp(self._target)
+        if stamp in {None, self._stamp_read}:
+            return self._lens
+        lens = Lens(profile_at(self._target, replaceable=True))
+        learned = preset_of(lens.model).name
+        if self._model not in {None, learned}:  # its kernels are the other model's: both would be mixed
+            raise InvalidInputError(
+                f"the lens in {self._target.name} has the model {learned}, not {self._model}: name a new "
+                "file after --profile and give its photos again, or replace the file with --force"
+            )
+        self._lens, self._stamp_read = lens, stamp
+        return lens
+
+    def keep(self, lens: Lens) -> None:
+        """Save the lens."""
+        self._target.parent.mkdir(parents=True, exist_ok=True)
+        lens.save(self._target)
+        self._lens, self._stamp_read = lens, _stamp(self._target)
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return inode, size and time of a file, which change when it is replaced; None without file."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def refuse_existing(*paths: Path | None, force: bool) -> None:

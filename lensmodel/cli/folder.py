@@ -1,288 +1,137 @@
-"""`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains.
-
-What a run found out and need not find out again is kept in a small JSON file beside its results.
-"""
+"""`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final
 
 from rich.progress import TaskID
 
-from lensmodel.cli import calibrate, files, outputs
-from lensmodel.cli.console import Display, PacedProgress, aligned, gain_words, show_share
-from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError, UnreadablePhotoError
-from lensmodel.core.files import atomic
+from lensmodel.cli import files
+from lensmodel.cli.console import Display, PacedProgress, aligned, gain_words
+from lensmodel.cli.outputs import Correction
+from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError
 from lensmodel.core.names import camera_name, name_key, serial_key
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow import calibrating, sampling
-from lensmodel.workflow.calibrating import Identity
-from lensmodel.workflow.correcting import SEEN_DB
+from lensmodel.workflow.calibrating import Calibration, Identity
 from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.sampling import CalibrationEvent, Config
 
 # Photos that a group is learned from: five are the advice (docs/guide.md), three more for other apertures
 # (chosen); each takes about a minute
 LEARN_FROM: Final = 8
-# Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)
-_UNSURE: Final = 0.5
-_SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
 PROFILES: Final = "lenses"
 ENDING: Final = ".lensprofile"
 
 
-class Folder:
-    """The work on one folder, and its journal.
+def correct_folder(correction: Correction, profiles: Path, most: int) -> dict[str, Any]:
+    """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
 
-    Corrected photos go to `output`, lens profiles to `profiles`; each group is learned from `most` photos.
+    Lens profiles go to `profiles`; each group is learned from `most` photos.
     """
-
-    def __init__(
-        self,
-        output: Path,
-        profiles: Path,
-        most: int,
-        options: outputs.CorrectionOptions,
-        display: Display,
-    ) -> None:
-        self._profiles, self._most, self._display = profiles, most, display
-        self._options = replace(options, least_gain_db=SEEN_DB)
-        self._journal = Journal(output)
-        self._learned: Counter[tuple[str, str]] = Counter()
-        self._calibrations: dict[Path, calibrating.Calibration] = {}
-        self._refused: dict[Path, LensModelError | OSError] = {}  # photos that taught nothing, and why
-
-    def correct(self, targets: Mapping[Path, Path], *, as_json: bool) -> dict[str, Any]:
-        """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
-
-        Photos are given by the file that each becomes.
-        """
-        shots: list[Shot] = []
-        results: list[dict[str, Any]] = []
-        for path in targets.values():
-            try:
-                shots.append(Shot.of(path))
-            except (LensModelError, OSError) as error:
-                results.append({"photo": str(path), "output": None, **files.failed(error)})
-                self._display.error(f"{path}: {files.reason(error)}")
-        lens_groups, unread = groups(shots), len(results)
-        most = [min(self._most, group.scenes) for group in lens_groups]
-        with self._display.progress() as bars:
-            task = bars.add_task("learning", total=sum(most) + len(shots))
-            self._learn_all(lens_groups, most, bars, task)
-            by_path = {path: target for target, path in targets.items()}
-            rows = self._correct_all(lens_groups, by_path, bars, task, sum(most), results, as_json=as_json)
-        if not as_json:
-            self._display.result(_table(rows))
-            self._say_more(rows, unread, {target.parent for target in targets})
-        return {"groups": rows, "results": results}
-
-    def _say_more(self, rows: Sequence[Mapping[str, Any]], unread: int, folders: Iterable[Path]) -> None:
-        """Say what the table does not: what was not read, which lens is little known, and where files are."""
-        if unread:
-            self._display.note(f"not in the table: files that could not be read, {unread}; see above why")
-        for row in rows:
-            if row["learned_from"] == 1:
-                self._display.note(
-                    f"{row['camera']}, {row['lens']}: learned from one photo; with five or more its blur is "
-                    "known better, and scenes do not pass for it"
-                )
-        if any(row["corrected"] for row in rows):
-            where = ", ".join(str(folder) for folder in sorted(set(folders)))
-            self._display.note(f"corrected photos are in {where}, lens profiles in {self._profiles}")
-
-    def _profile_of(self, group: PhotoGroup) -> Path:
-        return self._profiles / f"{group.name}{ENDING}"
-
-    def _learn_all(
-        self, lens_groups: Sequence[PhotoGroup], most: Sequence[int], bars: PacedProgress, task: TaskID
-    ) -> None:
-        """Learn the lenses of all groups from their usable photos, `most` of each."""
-        for number, group in enumerate(lens_groups):
-            target = self._profile_of(group)
-            if target not in self._calibrations:
-                self._calibrations[target] = calibrating.Calibration(
-                    calibrate.ProfileFile(target),
-                    sampling.Config(LensSettings(aperture=self._options.aperture)),
-                    any_lens=self._options.any_lens,
-                )
-            self._learn(group, self._calibrations[target], most[number], bars, task, sum(most[:number]))
-
-    def _learn(
-        self,
-        group: PhotoGroup,
-        calibration: calibrating.Calibration,
-        most: int,
-        bars: PacedProgress,
-        task: TaskID,
-        before: int,
-    ) -> None:
-        counted = 0
-        for shot in group.to_learn_from():
-            if counted == most:
-                break
-            on_event = partial(_learning, bars, task, before + counted)
-            counted += self._learns(calibration, shot, group, on_event)
-        bars.update(task, completed=before + most, more=True)
-        refused = [self._refused.get(shot.path) for shot in group.shots]
-        if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
-            reasons = set(map(str, refused))
-            why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
-            self._display.note(
-                f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from{why}"
-            )
-        self._learned[group.name, group.focal] = counted
-
-    def _learns(
-        self,
-        calibrated: calibrating.Calibration,
-        shot: Shot,
-        group: PhotoGroup,
-        on_event: sampling.EventHook,
-    ) -> bool:
-        """Learn from one photo; return whether it counts, now or from an earlier run."""
-        photo = sampling.photo_id(shot.path)
-        under = f"aperture {self._options.aperture}, any {self._options.any_lens}"
-        known = self._journal.verdict("not learned from", photo, under)
-        if known is not None:
-            self._refused[shot.path] = NotEnoughEvidenceError(known)
-            self._display.detail(f"{shot.path}: {known}")
-            return False
+    shots: list[Shot] = []
+    results: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
+    display = correction.display
+    for path in correction.targets:
         try:
-            calibrated.add(shot.path, siblings=group.paths, on_event=on_event)
-        except NotEnoughEvidenceError as error:
-            self._journal.note("not learned from", photo, under, str(error))
-            self._refused[shot.path] = error
-            self._display.detail(f"{shot.path}: {error}")
-            return False
-        except (LensModelError, OSError) as error:  # is found again at once, or may be mended meanwhile
-            self._refused[shot.path] = error
-            return False
-        return True
-
-    def _correct_all(
-        self,
-        lens_groups: Sequence[PhotoGroup],
-        targets: Mapping[Path, Path],
-        bars: PacedProgress,
-        task: TaskID,
-        before: int,
-        results: list[dict[str, Any]],
-        *,
-        as_json: bool,
-    ) -> list[dict[str, Any]]:
-        """Correct the photos that gain from it, leave the others, and return a row for each group."""
-        rows, number = [], before
-        for group in lens_groups:
-            profile = self._profile_of(group)
-            lens = Lens(files.profile_at(profile)) if profile.exists() else None
-            states: Counter[str] = Counter()
-            left: Counter[str] = Counter()
-            gains: list[float] = []
-            for shot in group.shots:
-                more = group is not lens_groups[-1]  # of other photos, which may be left or take longer
-                bars.update(task, description=f"correcting {shot.path.name}", more=more)
-                target = targets[shot.path]
-                result = self._correct_shot(
-                    shot, group, target, lens, partial(show_share, bars, task, number, more=more)
-                )
-                states[result["state"]] += 1
-                if result["state"] == "corrected":
-                    gains.append(result["expected_gain_db"])
-                    if not as_json:
-                        self._display.detail(f"{target}: {gain_words(gains[-1])} expected")
-                left[result.get("reason", "")] += 1
-                few = result["state"] == "left" and left[result["reason"]] <= _SAID
-                tell = self._display.note if few else self._display.detail
-                outputs.say(shot.path, target, result, self._display, tell)
-                results.append({"photo": str(shot.path), "output": str(target), **result})
-                number += 1
-                bars.update(task, completed=number, more=more)
-            rows.append(
-                {
-                    "camera": group.camera,
-                    "lens": group.lens,
-                    "focal_length": group.focal,
-                    "profile": str(profile) if profile.exists() else None,
-                    "photos": len(group.shots),
-                    "learned_from": self._learned[group.name, group.focal],
-                    "corrected": states["corrected"],
-                    "corrected_before": states["kept"],
-                    "left": states["left"],
-                    "failed": states["failed"],
-                    "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
-                }
-            )
-        return rows
-
-    def _correct_shot(
-        self,
-        shot: Shot,
-        group: PhotoGroup,
-        target: Path,
-        lens: Lens | None,
-        on_step: Callable[[int, int], None],
-    ) -> dict[str, Any]:
-        refused = self._refused.get(shot.path)
-        if isinstance(refused, UnreadablePhotoError) or (
-            lens is None and refused is not None and not isinstance(refused, NotEnoughEvidenceError)
-        ):
-            return files.failed(refused)
-        if lens is None:
-            return {"state": "left", "reason": "no photo of its lens shows enough to learn the blur from"}
-        photo = sampling.photo_id(shot.path)
-        samples = len(lens.profile.model.samples)
-        options = self._options
-        under = (
-            f"{target.name}, {samples} samples, {options.method or 'standard'}, "
-            f"strength {options.strength:g}, {options.bounds}, aperture {options.aperture}, least {SEEN_DB:g}"
-        )
-        known = self._journal.verdict("left", photo, under)
-        if known is not None and not options.force:
-            return {"state": "left", "reason": known}
-        result = outputs.correct_one(shot.path, target, lens, options, self._display, on_step, group.paths)
-        if result["state"] == "left":
-            result["reason"] = why_left(result, lossy=shot.lossy)
-            self._journal.note("left", photo, under, result["reason"])
-        return result
+            shots.append(Shot.of(path))
+        except (LensModelError, OSError) as error:
+            results.append({"photo": str(path), "output": None, **files.failed(error)})
+            display.error(f"{path}: {files.reason(error)}")
+    lens_groups, unread = groups(shots), len(results)
+    counts = [min(most, group.scenes) for group in lens_groups]
+    with display.progress() as bar:
+        task = bar.add_task("learning", total=sum(counts) + len(shots))
+        begins = accumulate(counts, initial=0)
+        learned = [
+            _learn(group, profiles, count, correction, bar, task, begin)
+            for group, count, begin in zip(lens_groups, counts, begins, strict=False)
+        ]
+        for group, count in zip(lens_groups, learned, strict=True):
+            target = group.profile_in(profiles)
+            lens = Lens(files.profile_at(target)) if target.exists() else None
+            begin = sum(counts) + len(results) - unread
+            more = group is not lens_groups[-1]  # photos of another kind, which may be left or take longer
+            done = correction.photos(group.paths, lens, bar, task, begin=begin, more=more)
+            results += done
+            rows.append(_row(group, None if lens is None else target, count, done))
+    display.result(_table(rows))
+    _say_more(display, rows, unread, {target.parent for target in correction.targets.values()}, profiles)
+    return {"groups": rows, "results": results}
 
 
-def why_left(result: Mapping[str, Any], *, lossy: bool) -> str:
-    """Say in a sentence why a photo is not worth correcting."""
-    zones = result["zones"].values()
-    error = sum(zone.cells * zone.psf_error for zone in zones) / max(sum(zone.cells for zone in zones), 1)
-    why = (
-        "not enough is known about its lens yet; take more photos that are full of detail"
-        if error > _UNSURE
-        else "the camera has sharpened and compressed it, and no more can be restored safely"
-        if lossy
-        else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
+def _learn(
+    group: PhotoGroup,
+    profiles: Path,
+    most: int,
+    correction: Correction,
+    bar: PacedProgress,
+    task: TaskID,
+    begin: int,
+) -> int:
+    """Learn the lens of a group; return from how many photos, now or in an earlier run."""
+    display, counted = correction.display, 0
+
+    def on_event(event: CalibrationEvent) -> None:
+        text = f"learning from {event.photo.name}: {event.stage}"
+        bar.update(task, description=text, more=True)
+        bar.part(task, begin + counted, event.done, event.total, more=True)
+
+    calibration = Calibration(
+        files.ProfileFile(group.profile_in(profiles)),
+        Config(LensSettings(aperture=correction.options["aperture"])),
+        any_lens=correction.any_lens,
     )
-    return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
+    paths = [shot.path for shot in group.to_learn_from()]
+    for event in calibration.learn(paths, siblings=group.paths, on_event=on_event):
+        if event.error is None:
+            counted += 1
+        else:
+            correction.refused[event.photo] = event.error
+            display.detail(f"{event.photo}: {event.error}")
+        if counted == most:
+            break
+    bar.update(task, completed=begin + most, more=True)
+    refused = [correction.refused.get(path) for path in paths]
+    if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
+        reasons = set(map(str, refused))
+        why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
+        display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from{why}")
+    return counted
 
 
-def _learning(bars: PacedProgress, task: TaskID, number: int, event: sampling.CalibrationEvent) -> None:
-    share = event.done / event.total if event.total else 0.0
-    bars.update(
-        task,
-        description=f"learning from {event.photo.name}: {event.stage}",
-        completed=number + share,
-        more=True,
-    )
+def _row(
+    group: PhotoGroup, profile: Path | None, learned: int, results: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Say what became of the photos of a group."""
+    states = Counter(result["state"] for result in results)
+    gains = [result["expected_gain_db"] for result in results if result["state"] == "corrected"]
+    return {
+        "camera": group.camera,
+        "lens": group.lens,
+        "focal_length": group.focal,
+        "profile": None if profile is None else str(profile),
+        "photos": len(group.shots),
+        "learned_from": learned,
+        "corrected": states["corrected"],
+        "corrected_before": states["kept"],
+        "left": states["left"],
+        "failed": states["failed"],
+        "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
+    }
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    head = ("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed")
     lines = [
         [
             *(row[name] for name in ("camera", "lens", "focal_length")),
@@ -293,7 +142,27 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         ]
         for row in rows
     ]
+    head = ("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed")
     return aligned([*head, "expected gain"], lines, numbers=range(3, 9))
+
+
+def _say_more(
+    display: Display, rows: Sequence[Mapping[str, Any]], unread: int, folders: Iterable[Path], profiles: Path
+) -> None:
+    """Say what the table does not: what was not read, which lens is little known, and where files are."""
+    if display.as_json:
+        return
+    if unread:
+        display.note(f"not in the table: files that could not be read, {unread}; see above why")
+    for row in rows:
+        if row["learned_from"] == 1:
+            display.note(
+                f"{row['camera']}, {row['lens']}: learned from one photo; with five or more its blur is "
+                "known better, and scenes do not pass for it"
+            )
+    if any(row["corrected"] for row in rows):
+        where = ", ".join(str(folder) for folder in sorted(folders))
+        display.note(f"corrected photos are in {where}, lens profiles in {profiles}")
 
 
 # Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
@@ -312,7 +181,6 @@ class Shot:
     path: Path
     metadata: PhotoMetadata
     half_diagonal_mm: float = 0.0
-    lossy: bool = False
 
     @classmethod
     def of(cls, path: Path) -> Shot:
@@ -320,7 +188,7 @@ class Shot:
         info = inspect(path)
         pitch = info.metadata.pixel_pitch_um or 0.0
         half = math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0
-        return cls(path, info.metadata, half, lossy=info.kind == "jpeg")
+        return cls(path, info.metadata, half)
 
     @property
     def owner(self) -> tuple[str, ...]:
@@ -373,6 +241,10 @@ class PhotoGroup:
     def paths(self) -> list[Path]:
         """The files."""
         return [shot.path for shot in self.shots]
+
+    def profile_in(self, folder: Path) -> Path:
+        """The file of its lens."""
+        return folder / f"{self.name}{ENDING}"
 
     @property
     def scenes(self) -> int:
@@ -458,39 +330,3 @@ def _free(name: str, taken: set[str]) -> str:
     while free in taken:
         free, number = f"{name}-{number}", number + 1
     return free
-
-
-NAME: Final = ".lensmodel-folder.json"
-
-
-class Journal:
-    """Verdicts by photo, each valid as long as what it was given under is unchanged.
-
-    Written after each verdict, complete or not at all: a run that was stopped goes on where it was.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / NAME
-        self._verdicts: dict[str, list[str]] = {}
-        try:
-            stored = json.loads(self._path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # none yet, or damaged: every verdict is determined anew
-            return
-        if isinstance(stored, dict):
-            self._verdicts = {
-                key: [str(text) for text in value]
-                for key, value in stored.items()
-                if isinstance(value, list) and len(value) == 2  # a condition and a verdict
-            }
-
-    def verdict(self, kind: str, photo: str, under: str) -> str | None:
-        """Return the verdict on a photo under the same conditions, or None."""
-        given, text = self._verdicts.get(f"{kind} {photo}", ["", ""])
-        return text if given == under and text else None
-
-    def note(self, kind: str, photo: str, under: str, text: str) -> None:
-        """Store the verdict on a photo."""
-        self._verdicts[f"{kind} {photo}"] = [under, text]
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(self._path) as file:
-            file.write(json.dumps(self._verdicts, indent=1, ensure_ascii=False).encode())

@@ -24,97 +24,67 @@ from lensmodel.core.errors import LensModelError
 
 ending.workers_ignore_it()
 
-RESEARCH: Final = "Research"
-ADMINISTRATION: Final = "Administration"  # Panels of what few people need, after the commands of everyone
-
-COMMANDS: Final[Mapping[str, tuple[str, str, str | None]]] = {
-    "correct": ("lensmodel.cli.correct:correct", "Remove the blur of the lens from photos.", None),
-    "calibrate": (
-        "lensmodel.cli.calibrate:calibrate",
-        "Learn the blur of one lens from photos and write it to a profile.",
-        None,
-    ),
-    "report": (
-        "lensmodel.cli.report:report",
-        "Say how sharp a lens is, whether it is centred, and which photo would help most.",
-        None,
-    ),
-    "measure": (
-        "lensmodel.cli.measure:measure",
-        "Measure the blur of a lens from photos made for the purpose.",
-        None,
-    ),
-    "serve": ("app.commands.service:serve", "Run the whole service: the API and a worker.", None),
-    "target": (
-        "lensmodel.cli.measure:target",
-        "Write the page to print for `lensmodel measure target`.",
-        RESEARCH,
-    ),
-    "psf": (
-        "lensmodel.cli.psf:psf",
-        "Show what the lens makes of a point of light at one place in the picture.",
-        RESEARCH,
-    ),
-    "export": (
-        "lensmodel.cli.report:export_psfs",
-        "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
-        RESEARCH,
-    ),
-    "demo": (
-        "lab.demo.command:demo",
-        "Run the whole process on a simulated lens whose true blur is known.",
-        RESEARCH,
-    ),
-    "reproduce": (
-        "lab.commands.reproduce:reproduce",
-        "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
-        RESEARCH,
-    ),
-    "bench": ("lab.commands.benchmarks:bench", "Measure quality and speed.", RESEARCH),
-    "api": (
-        "app.commands.service:api",
-        "Run only the API process, for installations on many machines.",
-        ADMINISTRATION,
-    ),
-    "worker": (
-        "app.commands.service:worker",
-        "Run only a worker process, for installations on many machines.",
-        ADMINISTRATION,
-    ),
-    "config": (
-        "app.commands.service:config",
-        "Print the effective settings as environment variables; secrets are masked.",
-        ADMINISTRATION,
-    ),
-    "doctor": (
-        "app.commands.upkeep:doctor",
-        "Check an installation, running or not: tables, blobs, and whether a worker is running.",
-        ADMINISTRATION,
-    ),
-    "backup": (
-        "app.commands.upkeep:backup",
-        "Copy all rows and blobs of an installation into a folder, even while it runs.",
-        ADMINISTRATION,
-    ),
-    "keys": (
-        "app.commands.keys:keys",
-        "Make, list and revoke the keys of a service that others can reach.",
-        ADMINISTRATION,
-    ),
+COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
+    None: {
+        "correct": ("lensmodel.cli.correct", "Remove the blur of the lens from photos."),
+        "calibrate": (
+            "lensmodel.cli.calibrate",
+            "Learn the blur of one lens from photos and write it to a profile.",
+        ),
+        "report": (
+            "lensmodel.cli.report",
+            "Say how sharp a lens is, whether it is centred, and which photo would help most.",
+        ),
+        "measure": ("lensmodel.cli.measure", "Measure the blur of a lens from photos made for the purpose."),
+        "serve": ("app.commands.service", "Run the whole service: the API and a worker."),
+    },
+    "Research": {
+        "target": ("lensmodel.cli.measure", "Write the page to print for `lensmodel measure target`."),
+        "psf": (
+            "lensmodel.cli.psf",
+            "Show what the lens makes of a point of light at one place in the picture.",
+        ),
+        "export": (
+            "lensmodel.cli.report",
+            "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
+        ),
+        "demo": ("lab.demo.command", "Run the whole process on a simulated lens whose true blur is known."),
+        "reproduce": (
+            "lab.commands.reproduce",
+            "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
+        ),
+        "bench": ("lab.commands.benchmarks", "Measure quality and speed."),
+    },
+    "Administration": {
+        "api": ("app.commands.service", "Run only the API process, for installations on many machines."),
+        "worker": ("app.commands.service", "Run only a worker process, for installations on many machines."),
+        "config": (
+            "app.commands.service",
+            "Print the effective settings as environment variables; secrets are masked.",
+        ),
+        "doctor": (
+            "app.commands.upkeep",
+            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
+        ),
+        "backup": (
+            "app.commands.upkeep",
+            "Copy all rows and blobs of an installation into a folder, even while it runs.",
+        ),
+        "keys": ("app.commands.keys", "Make, list and revoke the keys of a service that others can reach."),
+    },
 }
-"""Home, the first sentence of its help, and panel of each command in the order of the list."""
+"""By panel, the commands in the order of the list: the module of each, which has a function or a
+`typer.Typer` of that name, and the first sentence of its help. Panels are of what few people need."""
 
 
 class OnDemand(TyperGroup):
-    """`COMMANDS`, each imported when it is called: neither `--help` nor `config` waits for SciPy.
-
-    The home of one is its function, or the `typer.Typer` of a command with commands of its own.
-    """
+    """`COMMANDS`, each imported when it is called: neither `--help` nor `config` waits for SciPy."""
 
     def __init__(self, **given: Any) -> None:  # noqa: ANN401 - what Typer passes
         super().__init__(**given)
-        for name, (_, summary, panel) in COMMANDS.items():
-            self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
+        for panel, commands in COMMANDS.items():
+            for name, (_, summary) in commands.items():
+                self.add_command(TyperCommand(name, help=summary, rich_help_panel=panel))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - Typer's own
         """Import the command that the words name."""
@@ -123,8 +93,8 @@ class OnDemand(TyperGroup):
 
     def imported(self, name: str) -> Any:  # noqa: ANN401 - a command or a group of Typer's
         """Import a command and return it as Typer builds it from its signature."""
-        module, _, attribute = COMMANDS[name][0].partition(":")
-        value = getattr(import_module(module), attribute)
+        module = next(commands[name][0] for commands in COMMANDS.values() if name in commands)
+        value = getattr(import_module(module), name)
         alone = typer.Typer(rich_markup_mode=self.rich_markup_mode, add_completion=False)
         if isinstance(value, typer.Typer):
             alone.add_typer(value, name=name)
@@ -179,27 +149,20 @@ def main() -> None:
     ending.install()
     try:
         app(prog_name="lensmodel")  # also where `python -m lensmodel` runs it
-    except LensModelError as error:
-        typer.echo(f"lensmodel: {error}", err=True)
-        sys.exit(2 if isinstance(error, UsageError) else 1)
-    except ModuleNotFoundError as error:
-        remedy = ending.remedy(error)
-        if remedy is None:
-            raise
-        typer.echo(f"lensmodel: {remedy}", err=True)
-        sys.exit(1)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        typer.echo(
-            f"lensmodel: {where}{error.strerror or error}; check the path, its rights and the disk", err=True
-        )
-        sys.exit(1)
     except InterruptedByUser as stopped:
         name = signal.Signals(stopped.number).name
-        typer.echo(
-            f"lensmodel: stopped by {name}; finished files are kept, nothing is half-written", err=True
+        text, status = (
+            f"stopped by {name}; finished files are kept, nothing is half-written",
+            128 + stopped.number,
         )
-        sys.exit(128 + stopped.number)
+    except (LensModelError, ModuleNotFoundError, OSError) as error:
+        text, status = ending.words_of(error), 2 if isinstance(error, UsageError) else 1
+        if not text:
+            raise
+    else:
+        return
+    typer.echo(f"lensmodel: {text}", err=True)
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from lensmodel.cli import files
-from lensmodel.cli.console import Display, show_share
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import (
     AnyLens,
@@ -31,11 +30,9 @@ from lensmodel.core.files import write_atomically
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 from lensmodel.measured.edges import chart_edges
-from lensmodel.model import save_profile
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
 from lensmodel.workflow import measuring, sampling
-from lensmodel.workflow.calibrating import Identity, grown, joined, require_same_lens
-from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.calibrating import Admit, Calibration
 
 KINDS: Final = ("target", "pair", "points", "edges")
 EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
@@ -104,7 +101,8 @@ def measure(
 
     Exit status: 0 all photos were used, 1 some were not, 2 wrong usage.
     """
-    shown, target = Display.of(context, quiet=quiet, verbose=verbose), files.named(profile)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
+    target = files.named(profile)
     if show is not None:
         if kind != "edges" or len(photos) != 1:
             raise UsageError("--show is for the edges of one photo: lensmodel measure edges PHOTO --show DIR")
@@ -113,40 +111,30 @@ def measure(
     files.refuse_photo(target, paths)
     with files.as_usage():
         groups = measuring.measurements_of(kind, paths)
+        config = sampling.Config(LensSettings(aperture=aperture))
+        calibration = Calibration(files.ProfileFile(target), config, any_lens=any_lens, replace=replace_blind)
     results: list[dict[str, Any]] = []
     with shown.progress() as bars:
         task = bars.add_task("", total=len(groups))
         for number, group in enumerate(groups):
-
-            def measured(photos: list[LinearPhoto], key: str, number: int = number) -> list[PsfSample]:
-                return measuring.samples_of_developed(
-                    kind,
-                    photos,
-                    photo_id=key,
-                    settings=LensSettings(aperture=aperture),
-                    size=size,
-                    on_step=partial(show_share, bars, task, number),
-                )
-
             bars.update(task, description=f"{group[0].name}: measuring")
+            method = partial(
+                measuring.samples_of_developed,
+                kind,
+                settings=config.settings,
+                size=size,
+                on_step=partial(bars.part, task, number),
+            )
             try:
-                result = _add(
-                    group, target, measured, replace_blind=replace_blind, any_lens=any_lens, show=show
-                )
+                result = _added(calibration, group, method, show)
             except (LensModelError, OSError) as error:
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
             bars.update(task, completed=number + 1)
-    _tell(results, target, shown, as_json=json_output)
-
-
-def _tell(results: list[dict[str, Any]], target: Path, shown: Display, *, as_json: bool) -> None:
-    """Say what became of the photos; some that were not used are a failure."""
-    if as_json:
-        shown.document({"profile": str(target) if target.exists() else None, "results": results})
+    shown.document({"profile": str(target) if target.exists() else None, "results": results})
     for result in results:
-        if result["state"] == "measured" and not as_json:
+        if result["state"] == "measured":
             shown.result(
                 f"{target}: {result['places']} places measured on {Path(result['photos'][0]).name} "
                 f"({result['estimator']}), usual error {result['error']:.2f}"
@@ -157,40 +145,21 @@ def _tell(results: list[dict[str, Any]], target: Path, shown: Display, *, as_jso
         raise typer.Exit(1)
 
 
-def _add(
-    group: tuple[Path, ...],
-    target: Path,
-    measured: Callable[[list[LinearPhoto], str], list[PsfSample]],
-    *,
-    replace_blind: bool,
-    any_lens: bool,
-    show: Path | None,
+def _added(
+    calibration: Calibration, group: Sequence[Path], method: Callable[..., list[PsfSample]], show: Path | None
 ) -> dict[str, Any]:
-    """Measure on the photos of one measurement and save the profile; say what became of it."""
-    path, key = group[0], sampling.photo_id(group[0])
-    known = Lens.load(target) if target.exists() else None
-    if show is None and known is not None and key in known.profile.photos:
+    """Measure on the photos of one measurement and add to the lens; say what became of it."""
+    samples: list[PsfSample] = []
+
+    def measured(key: str, admit: Admit) -> list[PsfSample]:
+        photos = _developed(group, show, lambda info: admit(info.metadata))
+        samples.extend(method(photos, photo_id=key))
+        return samples
+
+    if calibration.add(group[0], measured) is None:
+        if show is not None:
+            _developed(group, show)
         return {"state": "known"}
-
-    def admit(info: PhotoInfo) -> None:
-        if known is not None and not any_lens:
-            require_same_lens(known, Identity.of(info.metadata))
-
-    photos = [develop(path, on_info=admit), *(develop(other) for other in group[1:])]
-    if show is not None:
-        _show_edges(photos[0], show)
-        if known is not None and key in known.profile.photos:
-            return {"state": "known"}
-    identity = Identity.of(photos[0].info.metadata)
-    samples = measured(photos, key)
-    if target.exists():  # another run may have added to it meanwhile
-        known = Lens.load(target)
-    model = joined(None if known is None else known.model, samples, replace=replace_blind)
-    profile = grown(known, model, key, path, identity, any_lens=any_lens).profile
-    left = {sample.photo for sample in model.samples}  # `--replace` may have taken all of a photo
-    profile = replace(profile, photos={name: label for name, label in profile.photos.items() if name in left})
-    target.parent.mkdir(parents=True, exist_ok=True)
-    save_profile(target, profile)
     green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
     return {
         "state": "measured",
@@ -201,17 +170,22 @@ def _add(
     }
 
 
-def _show_edges(photo: LinearPhoto, folder: Path) -> None:
-    """Write what was seen of a chart: the chart with its edges, each edge's profile and SFR, a table."""
-    from lensmodel.report.chart_edges import edge_pages, edges_csv  # noqa: PLC0415 - matplotlib, an extra
-    from lensmodel.report.plots import to_pdf, to_png  # noqa: PLC0415 - as above
+def _developed(
+    group: Sequence[Path], show: Path | None, on_info: Callable[[PhotoInfo], None] | None = None
+) -> list[LinearPhoto]:
+    """Develop the photos of a measurement; write to a folder which edges are seen on the first."""
+    photos = [develop(group[0], on_info=on_info), *map(develop, group[1:])]
+    if show is not None:
+        from lensmodel.report.chart_edges import edge_pages, edges_csv  # noqa: PLC0415 - matplotlib, an extra
+        from lensmodel.report.plots import to_pdf, to_png  # noqa: PLC0415 - as above
 
-    edges = chart_edges(photo)
-    folder.mkdir(parents=True, exist_ok=True)
-    pages = edge_pages(photo, edges)
-    write_atomically(folder / EDGE_FILES[1], to_png(pages[0]))
-    write_atomically(folder / EDGE_FILES[0], to_pdf(pages))
-    write_atomically(folder / EDGE_FILES[2], edges_csv(photo, edges).encode())
+        edges = chart_edges(photos[0])
+        pages = edge_pages(photos[0], edges)
+        show.mkdir(parents=True, exist_ok=True)
+        contents = (to_pdf(pages), to_png(pages[0]), edges_csv(photos[0], edges).encode())
+        for name, content in zip(EDGE_FILES, contents, strict=True):
+            write_atomically(show / name, content)
+    return photos
 
 
 def target(
@@ -242,7 +216,7 @@ def target(
 
     Exit status: 0 written, 1 failed, 2 wrong usage.
     """
-    from lensmodel.measured import DETAILS, TargetPage, print_target  # noqa: PLC0415 - see `_run`
+    from lensmodel.measured import DETAILS, TargetPage, print_target  # noqa: PLC0415 - takes long, as above
 
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if detail not in DETAILS:

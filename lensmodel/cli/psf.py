@@ -50,16 +50,14 @@ def psf(
 
     Exit status: 0 answered, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     with files.as_usage():
         place = FieldPosition(r, phi)
         settings = LensSettings(aperture=aperture, channel=channel)
     with shown.busy("computing the PSF"):
         answer = files.profile_at(profile).model.query(place, settings, size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
-    if not json_output:
-        shown.result(_words(place, answer, tangential, sagittal))
-        return
+    shown.result(_words(place, answer, tangential, sagittal))
     support = ("effective_samples", "photos", "extrapolated", "predicted_error", "nearest", "answered_by")
     shown.document(
         {

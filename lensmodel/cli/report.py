@@ -34,7 +34,6 @@ from lensmodel.report import (
     LensReport,
     Side,
     compare,
-    export,
     exporters,
     filled_aspect,
     lens_report,
@@ -42,6 +41,7 @@ from lensmodel.report import (
     psf_grid,
     widest,
 )
+from lensmodel.report import export as write_psfs
 from lensmodel.report.tables import to_csv
 from lensmodel.workflow.correcting import lateral_of
 
@@ -101,7 +101,7 @@ def report(
 
     Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     targets = _targets(output)
     if against is not None:
         if output is None or output in targets:
@@ -119,12 +119,10 @@ def report(
                 write_atomically(target, _written(found, target.suffix.lower()))
             if against is not None:
                 write_comparison(output, found, measured(against, aperture, [], whole=True))
-    if json_output:
-        shown.document(found)
-    else:
-        at = found.tested[0].at or "unknown aperture"
-        lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
-        shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
+    shown.document(found)
+    at = found.tested[0].at or "unknown aperture"
+    lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
+    shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
 def measured(profile: Path, aperture: float | None, photos: Sequence[Path], *, whole: bool) -> LensReport:
@@ -186,7 +184,7 @@ def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
     write_atomically(folder / COMPARED, to_pdf([comparison_page(both)]))
 
 
-def export_psfs(
+def export(
     context: typer.Context,
     profile: ProfileFile,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Where to write: a file.")],
@@ -222,7 +220,7 @@ def export_psfs(
 
     Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     written = _format(output, file_format)
     files.refuse_existing(output, force=force)
     if phi is not None and r is None:
@@ -240,11 +238,9 @@ def export_psfs(
             aspect=filled_aspect(model),
             at=place,
         )
-    export(output, psfs, written)
-    if json_output:
-        shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
-    else:
-        shown.result(str(output))
+    write_psfs(output, psfs, written)
+    shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
+    shown.result(str(output))
 
 
 def _format(output: Path, named: str | None) -> str:

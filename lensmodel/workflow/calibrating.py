@@ -5,6 +5,7 @@ photo, photo, ... -> samples of each (`sampling`) -> added to the model
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
+    CalibrationEvent,
     Config,
     EventHook,
     ignore_event,
@@ -136,22 +138,9 @@ class LensStore:
         self._lens = lens
 
 
-@dataclass(frozen=True, slots=True)
-class PhotoVerdict:
-    """What became of a photo: how many samples it gave, None where the lens has it already; or why not."""
-
-    photo: Path
-    samples: int | None = None
-    error: LensModelError | OSError | None = None
-
-
-def _verdict(path: Path, learn: Callable[[], int | None]) -> PhotoVerdict:
-    try:
-        return PhotoVerdict(path, learn())
-    except CancelledError:  # is of the whole work, not of one photo
-        raise
-    except (LensModelError, OSError) as error:
-        return PhotoVerdict(path, error=error)
+Admit = Callable[[PhotoMetadata], None]
+Sampler = Callable[[str, Admit], Sequence[PsfSample]]
+"""Makes the samples of a photo, given its name and what may refuse it by its header."""
 
 
 class Calibration:
@@ -159,7 +148,7 @@ class Calibration:
 
     `begin` are the choices of the regression of a new lens; a known one keeps its own. `pool` estimates the
     cells of all photos, where they are estimated here; without one each photo starts and ends processes of
-    its own.
+    its own. `replace` drops what was learned blindly at the settings of new, measured samples.
     """
 
     def __init__(
@@ -169,11 +158,12 @@ class Calibration:
         *,
         begin: ModelSettings | None = None,
         any_lens: bool = False,
+        replace: bool = False,
         pool: Executor | None = None,
     ) -> None:
         self._store, self._config = store, config
         self._begin = begin or ModelSettings(mode=config.preset.mode)
-        self._any_lens, self._pool = any_lens, pool
+        self._any_lens, self._replace, self._pool = any_lens, replace, pool
         config.of_lens(self.known).check()
 
     @property
@@ -181,132 +171,136 @@ class Calibration:
         """The lens as it is now, with what other runs added; None where no photo could be used."""
         return self._store.lens()
 
+    def knows(self, key: str) -> bool:
+        """Whether the lens was learned from a photo already."""
+        lens = self.known
+        return lens is not None and (
+            key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
+        )
+
     def learn(
         self,
         paths: Iterable[Path],
         executor: Executor | None = None,
         *,
         ahead: int = AHEAD,
+        siblings: Iterable[Path] | None = None,
         on_event: EventHook = ignore_event,
-    ) -> Iterator[PhotoVerdict]:
-        """Learn from photos in their order, on an executor if there is one, and give what becomes of each."""
-        paths = list(paths)
-        if executor is None:
-            for path in paths:
-                yield _verdict(path, partial(self.add, path, siblings=paths, on_event=on_event))
-            return
-        orders: dict[Path, tuple[str, Identity]] = {}
+    ) -> Iterator[CalibrationEvent]:
+        """Learn from photos in their order, on an executor if there is one; give what becomes of each.
 
-        def sent(path: Path) -> tuple[Any, ...] | None:
-            """What the executor needs; None where there is nothing to send, and `add` says why."""
-            try:
-                key = photo_id(path)
-                if self._knows(key):
-                    return None
-                require_original(path)
-                orders[path] = key, self._admitted(photo.inspect(path).metadata)
-                return path.name, path.read_bytes(), self._config.of_lens(self.known), key
-            except (LensModelError, OSError):
-                return None
-
-        for path, job in processes.in_order(executor, samples_of_bytes, paths, sent, ahead=ahead):
-            if job is None:
-                yield _verdict(path, partial(self.add, path, siblings=paths, on_event=on_event))
-            else:
-                yield _verdict(path, partial(self._received, path, *orders[path], job))
-
-    def add(
-        self, path: Path, *, siblings: Iterable[Path] = (), on_event: EventHook = ignore_event
-    ) -> int | None:
-        """Learn from one photo; return how many samples it gave, None where the lens has it already.
-
-        `siblings` are other photos, which tell of the defects of the sensor.
+        `siblings` are the photos that tell of the defects of the sensor; by default all of them.
         """
+        paths = list(paths)
+        jobs: Iterable[tuple[Path, Future[list[PsfSample]] | None]] = ((path, None) for path in paths)
+        if executor is not None:
+            jobs = processes.in_order(executor, samples_of_bytes, paths, self._sent, ahead=ahead)
+        for path, job in jobs:
+            sampler = partial(
+                self._sampled,
+                path,
+                job=job,
+                siblings=paths if siblings is None else siblings,
+                on_event=on_event,
+            )
+            try:
+                count = self.add(path, sampler)
+            except CancelledError:  # is of the whole work, not of one photo
+                raise
+            except (LensModelError, OSError) as error:
+                yield CalibrationEvent(path, "skipped", detail=str(error), error=error)
+            else:
+                if count is None:
+                    yield CalibrationEvent(path, "skipped", detail="its samples are in the model already")
+                else:
+                    yield CalibrationEvent(path, "counted", count, count)
+
+    def add(self, path: Path, sampler: Sampler) -> int | None:
+        """Learn from one photo; return how many samples it gave, None where the lens has it already."""
         key = photo_id(path)
-        if self._knows(key):
+        if self.knows(key):
             return None
-        require_original(path)
+        if path.stem.endswith(CORRECTED):
+            raise InvalidInputError(
+                "it was corrected already and says nothing about the lens; give the original"
+            )
         identities: list[Identity] = []
-        samples = samples_of_photo(
+        samples = sampler(key, lambda metadata: identities.append(self._admitted(metadata)))
+        if self.knows(key):  # another run has added it meanwhile
+            return None
+        lens, identity = self.known, identities[0]
+        self._require_same(lens, identity)
+        if lens is None:
+            known = LensProfile(LensModel.fit(samples, self._begin))
+        else:
+            model = joined(lens.model, samples, replace=self._replace)
+            known = dataclasses.replace(lens.profile, model=model)
+        names, camera = known.lens, identity.camera
+        if lens is None or not self._any_lens:  # a photo that may be of another lens does not name this one
+            names = {**identity.lens, **names}
+        cameras = known.cameras if camera is None or camera in known.cameras else (*known.cameras, camera)
+        photos = {**known.photos, key: path.name}
+        if self._replace:  # which may have taken all samples of a photo
+            left = {sample.photo for sample in known.model.samples}
+            photos = {name: label for name, label in photos.items() if name in left}
+        self._store.keep(Lens(LensProfile(known.model, names, photos, cameras)))
+        return len(samples)
+
+    def _sampled(
+        self,
+        path: Path,
+        key: str,
+        admit: Admit,
+        *,
+        job: Future[list[PsfSample]] | None,
+        siblings: Iterable[Path],
+        on_event: EventHook,
+    ) -> list[PsfSample]:
+        """Estimate the samples of a photo, or wait for those that are estimated elsewhere."""
+        if job is not None:
+            admit(photo.inspect(path).metadata)
+            return job.result()
+        return samples_of_photo(
             path,
             self._config.of_lens(self.known),
             key=key,
-            admit=lambda metadata: identities.append(self._admitted(metadata)),
+            admit=admit,
             executor=self._pool,
             siblings=siblings,
             on_event=on_event,
         )
-        return self._keep(path, key, identities[0], samples)
 
-    def _received(self, path: Path, key: str, identity: Identity, job: Future[list[PsfSample]]) -> int | None:
-        """Wait for the samples of a photo, and add them."""
-        return self._keep(path, key, identity, job.result())
-
-    def _keep(self, path: Path, key: str, identity: Identity, samples: Sequence[PsfSample]) -> int | None:
-        """Add the samples of a photo to the lens as it is now."""
-        if self._knows(key):  # another run has added it meanwhile
+    def _sent(self, path: Path) -> tuple[Any, ...] | None:
+        """What an executor needs of a photo; None where there is nothing to send, and `add` says why."""
+        try:
+            key = photo_id(path)
+            if self.knows(key) or path.stem.endswith(CORRECTED):
+                return None
+            self._admitted(photo.inspect(path).metadata)
+            return path.name, path.read_bytes(), self._config.of_lens(self.known), key
+        except (LensModelError, OSError):
             return None
-        lens = self.known
-        if lens is not None and not self._any_lens:
-            require_same_lens(lens, identity)
-        model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
-        self._store.keep(grown(lens, model, key, path, identity, any_lens=self._any_lens))
-        return len(samples)
-
-    def _knows(self, key: str) -> bool:
-        lens = self.known
-        return lens is not None and (
-            key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
-        )
 
     def _admitted(self, metadata: PhotoMetadata) -> Identity:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
-        identity, lens = Identity.of(metadata), self.known
-        if lens is not None and not self._any_lens:
-            require_same_lens(lens, identity)
+        identity = Identity.of(metadata)
+        self._require_same(self.known, identity)
         require_aperture(metadata, self._config.settings)
         return identity
 
-
-def require_same_lens(lens: Lens, identity: Identity) -> None:
-    """Refuse a photo of another lens."""
-    why = difference(lens.profile.lens, lens.profile.cameras, identity)
-    if why is not None:
-        raise InvalidInputError(
-            f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
-        )
-
-
-def require_original(path: Path) -> None:
-    """Refuse a photo that this program has corrected."""
-    if path.stem.endswith(CORRECTED):
-        raise InvalidInputError("it was corrected already and says nothing about the lens; give the original")
+    def _require_same(self, lens: Lens | None, identity: Identity) -> None:
+        """Refuse a photo of another lens."""
+        if lens is None or self._any_lens:
+            return
+        why = difference(lens.profile.lens, lens.profile.cameras, identity)
+        if why is not None:
+            raise InvalidInputError(
+                f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
+            )
 
 
-def grown(
-    lens: Lens | None, model: LensModel, key: str, path: Path, identity: Identity, *, any_lens: bool = False
-) -> Lens:
-    """Return a lens whose model has learned from one photo more, with names and cameras of both.
-
-    A photo that may be of another lens (`any_lens`) does not name this one.
-    """
-    known = LensProfile(model) if lens is None else lens.profile
-    names, camera = known.lens, identity.camera
-    if lens is None or not any_lens:
-        names = {**identity.lens, **names}
-    new = () if camera is None or camera in known.cameras else (camera,)
-    return Lens(LensProfile(model, names, {**known.photos, key: path.name}, (*known.cameras, *new)))
-
-
-def joined(
-    model: LensModel | None,
-    samples: Sequence[PsfSample],
-    *,
-    replace: bool = False,
-) -> LensModel:
-    """Add measured samples to a model, or begin one with them."""
-    if model is None:
-        return LensModel.fit(samples)
+def joined(model: LensModel, samples: Sequence[PsfSample], *, replace: bool = False) -> LensModel:
+    """Add samples to a model; `replace` drops its blind ones of the same settings."""
     if not replace:
         return model.added(samples)
     kept = [old for old in model.samples if is_measured(old) or not any(_alike(old, new) for new in samples)]

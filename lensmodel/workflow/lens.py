@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,16 @@ from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+class Settings(TypedDict, total=False):
+    """Settings of the lens that a question may name."""
+
+    aperture: float | None
+    focal_mm: float | None
+    focus_m: float | None
+    channel: Channel
+
 
 DEFAULT_SIZE = 55
 """Side of a kernel in pixels (chosen): what a correction uses, so that the same numbers are seen."""
@@ -105,27 +115,26 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        places = zip(_each(r, n, "r"), _each(phi, n, "phi"), strict=True)
-        apertures = [None] * n if aperture is None else _each(aperture, n, "aperture")
+        given = {
+            "r": r,
+            "phi": phi,
+            "aperture": aperture,
+            "channel": channel,
+            "weight": weight,
+            "photo": photo,
+        }
+        columns = [_each(values, n, name) for name, values in given.items()]
         samples = [
             PsfSample(
                 centred(kernel),
-                FieldPosition(*place),
+                FieldPosition(radius, angle),
                 LensSettings(f_number, channel=color),
                 weight=sure,
                 photo=name,
                 pixel_pitch_um=pixel_pitch_um,
                 estimator="given",
             )
-            for kernel, place, f_number, color, sure, name in zip(
-                stack,
-                places,
-                apertures,
-                _each(channel, n, "channel"),
-                _each(weight, n, "weight"),
-                _each(photo, n, "photo"),
-                strict=True,
-            )
+            for kernel, radius, angle, f_number, color, sure, name in zip(stack, *columns, strict=True)
         ]
         return cls(LensProfile(LensModel.fit(samples, model)))
 
@@ -171,15 +180,7 @@ class Lens:
         save_profile(path, self.profile)
 
     def psf(
-        self,
-        r: float,
-        phi: float = 0.0,
-        *,
-        aperture: float | None = None,
-        focal_mm: float | None = None,
-        focus_m: float | None = None,
-        channel: Channel = "g",
-        size: int = DEFAULT_SIZE,
+        self, r: float, phi: float = 0.0, *, size: int = DEFAULT_SIZE, **settings: Unpack[Settings]
     ) -> PsfAnswer:
         """Return the PSF at one place, with how much stands behind it.
 
@@ -187,13 +188,11 @@ class Lens:
         ----------
         r, phi : float
             Field position: half diagonals 0..1, and radians.
-        aperture : float, optional
-            f-number; None takes all apertures of the samples together. The same goes for `focal_mm` in mm and
-            `focus_m` in metres.
-        channel : {"r", "g", "b"}
-            Color.
         size : int
             Odd side of the kernel in pixels.
+        **settings
+            `aperture`, the f-number, where None takes all apertures of the samples together; the same goes
+            for `focal_mm` in mm and `focus_m` in metres. `channel`, "r", "g" (default) or "b".
 
         Returns
         -------
@@ -211,8 +210,7 @@ class Lens:
         InvalidInputError
             If a value is out of its range.
         """
-        settings = LensSettings(aperture, focal_mm, focus_m, channel)
-        answer = self.model.query(FieldPosition(r, phi), settings, size)
+        answer = self.model.query(FieldPosition(r, phi), LensSettings(**settings), size)
         if answer.extrapolated:
             warnings.warn(
                 f"no photo shows r = {r:g}, phi = {phi:g} at these settings: the PSF there is a guess, "
@@ -222,15 +220,7 @@ class Lens:
         return answer
 
     def kernels(
-        self,
-        r: ArrayLike,
-        phi: ArrayLike,
-        *,
-        aperture: float | None = None,
-        focal_mm: float | None = None,
-        focus_m: float | None = None,
-        channel: Channel = "g",
-        size: int = DEFAULT_SIZE,
+        self, r: ArrayLike, phi: ArrayLike, *, size: int = DEFAULT_SIZE, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
         """Return the kernels of many places at once, faster than `psf` for each.
 
@@ -238,7 +228,7 @@ class Lens:
         ----------
         r, phi : array_like of float
             Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
-        aperture, focal_mm, focus_m, channel, size
+        size, **settings
             As of `psf`.
 
         Returns
@@ -254,19 +244,11 @@ class Lens:
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
-        flat = self.model.kernels(places, LensSettings(aperture, focal_mm, focus_m, channel), size)
+        flat = self.model.kernels(places, LensSettings(**settings), size)
         return flat.reshape(*radii.shape, size, size)
 
     def mtf(
-        self,
-        r: ArrayLike,
-        phi: ArrayLike,
-        frequencies: ArrayLike,
-        *,
-        aperture: float | None = None,
-        focal_mm: float | None = None,
-        focus_m: float | None = None,
-        channel: Channel = "g",
+        self, r: ArrayLike, phi: ArrayLike, frequencies: ArrayLike, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
         """Return the contrast that the lens leaves of fine lines (`mtf_from_kernel` gives the equation).
 
@@ -276,7 +258,7 @@ class Lens:
             Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
         frequencies : array_like of float, shape (n,) or ()
             Cycles/pixel; not negative.
-        aperture, focal_mm, focus_m, channel
+        **settings
             As of `psf`.
 
         Returns
@@ -291,19 +273,11 @@ class Lens:
             broadcast, or a value is out of its range.
         """
         wanted = _frequencies_of(frequencies)
-        kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
+        kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, lambda kernel, angle: mtf_from_kernel(kernel, angle, wanted))
 
     def mtf50_map(
-        self,
-        rows: int = 20,
-        cols: int = 30,
-        *,
-        aspect: float = 1.5,
-        aperture: float | None = None,
-        focal_mm: float | None = None,
-        focus_m: float | None = None,
-        channel: Channel = "g",
+        self, rows: int = 20, cols: int = 30, *, aspect: float = 1.5, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
         """Return where contrast falls to one half, over the picture.
 
@@ -313,7 +287,7 @@ class Lens:
             Equal cells of the picture; each value is that of its cell's center.
         aspect : float
             Width over height of the picture.
-        aperture, focal_mm, focus_m, channel
+        **settings
             As of `psf`.
 
         Returns
@@ -327,7 +301,7 @@ class Lens:
             If there are no cells, or a value is out of its range.
         """
         r, phi = field_grid(rows, cols, aspect=aspect)
-        kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
+        kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, mtf50_from_kernel)
 
     def psf_grid(
@@ -363,16 +337,15 @@ class Lens:
         data = np.stack([self.kernels(r, phi, aperture=aperture, channel=c, size=size) for c in channels])
         pixels = np.arange(size) - size // 2
         coords = {
-            "channel": {"dims": ("channel",), "data": list(channels)},
-            "r": {"dims": ("row", "col"), "data": r},
-            "phi": {"dims": ("row", "col"), "data": phi},
-            "u": {"dims": ("u",), "data": pixels},
-            "v": {"dims": ("v",), "data": pixels},
+            "channel": (("channel",), list(channels)),
+            "r": (("row", "col"), r),
+            "phi": (("row", "col"), phi),
+            "u": (("u",), pixels),
+            "v": (("v",), pixels),
         }
-        dims = ("channel", "row", "col", "v", "u")
         return {
-            "dims": dims,
-            "coords": coords,
+            "dims": ("channel", "row", "col", "v", "u"),
+            "coords": {name: {"dims": dims, "data": values} for name, (dims, values) in coords.items()},
             "data": data,
             "name": "psf",
             "attrs": {"lens": self.description},
@@ -421,23 +394,22 @@ class Lens:
             r, phi, aperture, focal_mm, focus_m, channel, weight, error, photo, estimator; numbers that are
             not known are NaN.
         """
-        own = self.samples
-        numbers = {
-            "r": [s.position.r for s in own],
-            "phi": [s.position.phi for s in own],
-            "aperture": [s.settings.aperture for s in own],
-            "focal_mm": [s.settings.focal_mm for s in own],
-            "focus_m": [s.settings.focus_m for s in own],
-            "weight": [s.weight for s in own],
-            "error": [s.error for s in own],
+        columns: dict[str, Callable[[PsfSample], Any]] = {
+            "r": lambda s: s.position.r,
+            "phi": lambda s: s.position.phi,
+            "aperture": lambda s: s.settings.aperture,
+            "focal_mm": lambda s: s.settings.focal_mm,
+            "focus_m": lambda s: s.settings.focus_m,
+            "weight": lambda s: s.weight,
+            "error": lambda s: s.error,
+            "channel": lambda s: s.settings.channel,
+            "photo": lambda s: self.profile.photos.get(s.photo, s.photo),
+            "estimator": lambda s: s.estimator,
         }
-        texts = {
-            "channel": [s.settings.channel for s in own],
-            "photo": [self.profile.photos.get(s.photo, s.photo) for s in own],
-            "estimator": [s.estimator for s in own],
-        }
-        return {name: np.array(column, dtype=np.float64) for name, column in numbers.items()} | {
-            name: np.array(column, dtype=np.str_) for name, column in texts.items()
+        texts = {"channel", "photo", "estimator"}
+        return {
+            name: np.array([of(s) for s in self.samples], dtype=np.str_ if name in texts else np.float64)
+            for name, of in columns.items()
         }
 
     @property
@@ -495,8 +467,10 @@ def _frequencies_of(values: ArrayLike) -> NDArray[np.float64]:
     return wanted
 
 
-def _each(values: ArrayLike | Sequence[str], n: int, name: str) -> list[Any]:
+def _each(values: ArrayLike | Sequence[str] | None, n: int, name: str) -> list[Any]:
     """Return n numbers or names that were given one by one, or once for all."""
+    if values is None:
+        return [None] * n
     array = np.asarray(values)
     if array.shape not in {(), (n,)}:
         raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {array.shape}")

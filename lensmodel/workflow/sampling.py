@@ -20,7 +20,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from lensmodel.blind.estimator import require_size
 from lensmodel.core import codec, processes
 from lensmodel.core.errors import (
     InvalidInputError,
+    LensModelError,
     MetadataMissingError,
     NotEnoughEvidenceError,
     NoUsablePatchesError,
@@ -266,14 +267,11 @@ def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
     return [tuple(group) for _, group in sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))]
 
 
-@dataclass(frozen=True, slots=True)
-class CellSample:
-    """One PSF sample with what it was made from."""
+class CellSample(NamedTuple):
+    """One PSF sample, and the part of the photo that it was made from."""
 
-    patch: Patch  # where in the photo
-    channel: Channel  # which colour plane
-    sample: PsfSample  # the estimate, ready for the model
-    diagnostics: Mapping[str, float]  # what the estimator reports of itself
+    patch: Patch
+    sample: PsfSample
 
 
 def estimate_cell(
@@ -296,23 +294,15 @@ def estimate_cell(
     """
     method = blind.estimators.resolve(estimator)
     if isinstance(method, blind.PhotoEstimator):
-        patches_of = {patch.position: patch for patch in group}
+        patch_at = {patch.position: patch for patch in group}
         samples = method.samples(
             developed, group, settings=settings, photo=photo_id, size=size, on_step=on_step
         )
-        return [
-            CellSample(
-                patches_of[sample.position],
-                sample.settings.channel,
-                sample,
-                {"predicted_error": sample.error or 0.0},
-            )
-            for sample in samples
-        ]
+        return [CellSample(patch_at[sample.position], sample) for sample in samples]
     order = sorted(channels, key=lambda c: c != "g")
     results: list[CellSample] = []
     green: blind.PsfEstimate | None = None
-    for done, channel in enumerate(order):
+    for done, channel in enumerate(order, start=1):
         planes, noises = zip(*(_view(developed, patch, channel) for patch in group), strict=True)
         try:
             estimate = method.estimate(planes, noises, size=size, green=green)
@@ -335,9 +325,8 @@ def estimate_cell(
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
                 half_diagonal_px=developed.frame.half_diagonal,
             )
-            diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
-            results.append(CellSample(patch, channel, sample, diagnostics))
-        on_step(done + 1, len(order))
+            results.append(CellSample(patch, sample))
+        on_step(done, len(order))
     return results
 
 
@@ -364,6 +353,8 @@ class CalibrationEvent:
         Patches, while estimating; else 0.
     detail : str
         Why a photo was skipped.
+    error : Exception or None
+        What was raised where a photo cannot be used; None where the lens knows it already.
     """
 
     photo: Path
@@ -371,6 +362,7 @@ class CalibrationEvent:
     done: int = 0
     total: int = 0
     detail: str = ""
+    error: LensModelError | OSError | None = None
 
 
 EventHook = Callable[[CalibrationEvent], None]
@@ -436,7 +428,8 @@ def samples_of_photo(
             f"none of the {total} patches of {path.name} determines a PSF; "
             "use a photo with more fine detail in focus"
         )
-    require_spread([cell.patch for cell in made if cell.channel == "g"], count=config.patches)
+    green = [cell.patch for cell in made if cell.sample.settings.channel == "g"]
+    require_spread(green, count=config.patches)
     return [cell.sample for cell in made]
 
 

@@ -197,7 +197,10 @@ def test_a_name_that_ends_as_a_pictures_is_a_file_and_any_other_a_folder(
 def test_of_several_photos_the_output_is_a_folder_whatever_its_name(made: Path) -> None:
     targets, twice = outputs.targets_of([made / "a.dng", made / "b.dng"], "out.tif", None)
 
-    assert [str(target) for target in targets] == ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]
+    assert [str(target) for target in targets.values()] == [
+        "out.tif/a-corrected.tif",
+        "out.tif/b-corrected.tif",
+    ]
     assert not twice
 
 

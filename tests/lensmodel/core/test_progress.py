@@ -7,13 +7,13 @@ from types import ModuleType
 
 import pytest
 
-from lensmodel.api import ProgressLine
+from lensmodel.api import say
 
 
 @pytest.mark.parametrize(
     ("terminal", "notebook", "said"),
     [
-        (True, False, "\ra.dng: 50%\ra.dng: done\n"),
+        (True, False, "\r\x1b[Ka.dng: 50%\r\x1b[Ka.dng: done\n"),
         (False, True, "a.dng: done\n"),
         (False, False, ""),
     ],
@@ -30,8 +30,7 @@ def test_a_terminal_shows_each_step_and_a_notebook_whole_lines(
     if notebook:
         monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
 
-    line = ProgressLine()
-    line.say("a.dng: 50%")
-    line.end("a.dng: done")
+    say("a.dng: 50%")
+    say("a.dng: done", stays=True)
 
     assert capsys.readouterr().err == said

@@ -358,7 +358,6 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
     model = LensModel.fit(blind)
     assert [s.photo for s in joined(model, samples).samples] == ["old", "other", "new"]
     assert [s.photo for s in joined(model, samples, replace=True).samples] == ["other", "new"]
-    assert joined(None, samples).samples == tuple(samples)
     assert resized(samples[0].kernel, 21).shape == (21, 21)
 
 

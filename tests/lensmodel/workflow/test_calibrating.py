@@ -63,17 +63,27 @@ class Noting(calibrating.LensStore):
         self.kept.append(len(lens.samples))
 
 
-def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
+def test_a_lens_is_kept_after_each_photo_and_what_another_run_added_meanwhile_stays(
+    photos: list[Path],
+) -> None:
     store = Noting()
-    calibration = calibrating.Calibration(store, sampling.Config())
+    events = calibrating.Calibration(store, sampling.Config()).learn([*photos, photos[0]])
 
-    verdicts = list(calibration.learn([*photos, photos[0]]))
-    lens = calibration.known
+    first = next(events)
+    kept = store.lens()
+    assert kept is not None
+    model = LensModel.fit([*kept.samples, *samples_of("x")])
+    store.keep(Lens(replace(kept.profile, model=model, photos={**kept.profile.photos, "x": "x.dng"})))
 
-    assert [verdict.samples for verdict in verdicts] == [9, 9, None]
+    assert [(event.stage, event.total) for event in (first, *events)] == [
+        ("counted", 9),
+        ("counted", 9),
+        ("skipped", 0),
+    ]
+    lens = store.lens()
     assert lens is not None
-    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
-    assert store.kept == [9, 18]
+    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng", "x.dng"]
+    assert store.kept == [9, 18, 27]
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
@@ -81,42 +91,26 @@ def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     store = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
     calibration = calibrating.Calibration(store, sampling.Config())
 
-    assert calibration.add(photos[0]) is None
+    (event,) = calibration.learn(photos[:1])
+
+    assert (event.stage, event.error) == ("skipped", None)
     assert calibration.known is store.lens()
     assert store.kept == []
 
 
-def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
-    store = Noting()
-    calibration = calibrating.Calibration(store, sampling.Config())
-    calibration.add(photos[0])
-    kept = store.lens()
-    assert kept is not None
-    others = Lens(
-        replace(kept.profile, model=LensModel.fit([*kept.samples, *samples_of("x")]), photos={"x": "x.dng"})
-    )
-
-    store.keep(others)
-    calibration.add(photos[1])
-    lens = calibration.known
-
-    assert lens is not None
-    assert len(lens.samples) == 27
-    assert sorted(lens.profile.photos.values()) == ["b.dng", "x.dng"]
-
-
-def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
-    photos: list[Path], tmp_path: Path
+def test_photos_that_cannot_teach_a_lens_are_passed_over_with_the_reason(
+    tmp_path: Path, photos: object
 ) -> None:
+    paths = [tmp_path / "a-corrected.dng", tmp_path / "unknown.dng"]
+    for path in paths:
+        path.write_bytes(path.name.encode())
     calibration = calibrating.Calibration(Noting(), sampling.Config())
-    for name in ("a-corrected.dng", "unknown.dng"):
-        (tmp_path / name).write_bytes(name.encode())
 
-    with pytest.raises(InvalidInputError, match="give the original"):
-        calibration.add(tmp_path / "a-corrected.dng")
-    with pytest.raises(MetadataMissingError, match="--aperture"):
-        calibration.add(tmp_path / "unknown.dng")
+    corrected, unknown = (event.error for event in calibration.learn(paths))
 
+    assert isinstance(corrected, InvalidInputError)
+    assert "give the original" in str(corrected)
+    assert isinstance(unknown, MetadataMissingError)
     assert calibration.known is None
 
 

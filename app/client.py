@@ -1,14 +1,4 @@
-"""A typed client of the service, for scripts and notebooks.
-
-with Client("http://127.0.0.1:8000") as client:
-    photo = client.upload("p1.dng")
-    client.wait(photo)
-    lens = client.lenses()[0]
-    psf = client.psf(lens.id, r=0.9, phi=0.6, aperture=1.4)
-    correction = client.correct(photo.id)
-    client.wait(correction)
-    client.download(correction.id, "p1-corrected.tif")
-"""
+"""A typed client of the service, for scripts and notebooks; docs/topics/client.md has examples."""
 
 from __future__ import annotations
 
@@ -18,7 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, Self, TypeAlias, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import httpx2
 import numpy as np
@@ -31,9 +21,7 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import atomic
 
 M = TypeVar("M", bound=BaseModel)
-Query: TypeAlias = Mapping[str, str | int | float | bool | None]
 
-DEFAULT_URL: Final = "http://127.0.0.1:8000"
 ANSWER_SECONDS: Final = 60.0  # longest wait for a response (chosen): longer than a long poll
 # Attempts to connect (chosen): with the pauses of httpx, seven seconds bridge the restart of a service
 CONNECTS: Final = 5
@@ -81,7 +69,11 @@ class Client:
     """
 
     def __init__(
-        self, url: str = DEFAULT_URL, *, http: httpx2.Client | None = None, key: str | None = None
+        self,
+        url: str = "http://127.0.0.1:8000",
+        *,
+        http: httpx2.Client | None = None,
+        key: str | None = None,
     ) -> None:
         if http is None:
             shown = os.environ.get(CLIENT_KEY, "") if key is None else key
@@ -96,13 +88,7 @@ class Client:
 
     def __exit__(self, *_: object) -> None:
         """Close the connections."""
-        self.close()
-
-    def close(self) -> None:
-        """Close the connections."""
         self._http.close()
-
-    # --- photos -----------------------------------------------------------------------------------
 
     def upload(
         self,
@@ -128,9 +114,10 @@ class Client:
         """
         given = s.UploadFields.model_validate(fields).model_dump(mode="json", exclude_unset=True)
         with Path(path).open("rb") as file:
-            answer = self._http.post(
+            answer = self._ask(
+                "POST",
                 "/v1/photos",
-                params=_present({"filename": Path(path).name, **given}),
+                {"filename": Path(path).name, **given},
                 content=_pieces(file, on_progress),
                 headers={"Content-Type": "application/octet-stream"},
             )
@@ -138,34 +125,28 @@ class Client:
 
     def photo(self, photo_id: str) -> s.PhotoOut:
         """Return one photo."""
-        return self._get(s.PhotoOut, f"/v1/photos/{photo_id}")
+        return _read(s.PhotoOut, self._ask("GET", f"/v1/photos/{photo_id}"))
 
     def photos(self, *, lens_id: str | None = None, state: s.PhotoState | None = None) -> list[s.PhotoOut]:
         """Return all photos, newest first."""
-        return list(self._pages(s.Page[s.PhotoOut], "/v1/photos", {"lens_id": lens_id, "state": state}))
+        return self._listed(s.PhotoOut, "/v1/photos", {"lens_id": lens_id, "state": state})
 
     def change_photo(self, /, photo_id: str, **changes: object) -> s.PhotoOut:
         """Name the lens of a photo, correct its settings, or exclude it: fields of `PhotoChange`."""
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
-        return self._send(s.PhotoOut, "PATCH", f"/v1/photos/{photo_id}", body)
+        return _read(s.PhotoOut, self._ask("PATCH", f"/v1/photos/{photo_id}", json=body))
 
     def delete(self, what: s.PhotoOut | s.LensOut | s.CorrectionOut) -> None:
         """Delete a photo with all that was made of it, a lens, or a correction, which stops if it runs."""
-        _require_success(self._http.delete(str(what.links["self"])))
-
-    # --- jobs -------------------------------------------------------------------------------------
-
-    def job(self, job_id: str) -> s.JobOut:
-        """Return one job."""
-        return self._get(s.JobOut, f"/v1/jobs/{job_id}")
+        self._ask("DELETE", str(what.links["self"]))
 
     def cancel(self, job_id: str) -> s.JobOut:
         """Cancel a job."""
-        return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/cancel")
+        return _read(s.JobOut, self._ask("POST", f"/v1/jobs/{job_id}/cancel"))
 
     def retry(self, job_id: str) -> s.JobOut:
         """Start a failed or cancelled job anew."""
-        return self._send(s.JobOut, "POST", f"/v1/jobs/{job_id}/retry")
+        return _read(s.JobOut, self._ask("POST", f"/v1/jobs/{job_id}/retry"))
 
     def wait(
         self,
@@ -197,58 +178,56 @@ class Client:
         tag = ""
         while True:
             left = min(max(until - time.monotonic(), 0.0), LONG_POLL_SECONDS) if tag else 0.0
-            pause = PAUSE_SECONDS
+            known, pause = {"If-None-Match": tag} if tag else {}, PAUSE_SECONDS
             try:
-                answer = self._http.get(
-                    f"/v1/jobs/{job_id}", params={"wait": left}, headers={"If-None-Match": tag} if tag else {}
-                )
-                if answer.status_code != httpx2.codes.NOT_MODIFIED:
-                    job, tag = _read(s.JobOut, answer), answer.headers.get("ETag", "")
-                    if _ended(job, on_change):
-                        return job
+                answer = self._ask("GET", f"/v1/jobs/{job_id}", {"wait": left}, headers=known)
             except (httpx2.TransportError, ServiceProblemError) as error:
                 away = not isinstance(error, ServiceProblemError) or error.problem.status in _AWAY
                 if not (tag and away):
                     raise
                 pause = AWAY_SECONDS
+            else:
+                if answer.status_code != httpx2.codes.NOT_MODIFIED:
+                    job, tag = _read(s.JobOut, answer), answer.headers.get("ETag", "")
+                    if on_change is not None:
+                        on_change(job)
+                    if job.state in {"failed", "cancelled", "waiting"}:
+                        raise JobEndedError(job)
+                    if job.state == "succeeded":
+                        return job
             if time.monotonic() >= until:
-                raise JobPatienceError(
-                    f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
-                )
+                text = f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
+                raise JobPatienceError(text)
             time.sleep(pause)
-
-    # --- corrections ------------------------------------------------------------------------------
 
     def correct(self, /, photo_id: str, **options: object) -> s.CorrectionOut:
         """Ask for a correction: fields of `CorrectionIn`."""
         body = s.CorrectionIn.model_validate({"photo_id": photo_id, **options}).model_dump(mode="json")
-        return self._send(s.CorrectionOut, "POST", "/v1/corrections", body)
+        return _read(s.CorrectionOut, self._ask("POST", "/v1/corrections", json=body))
 
     def correction(self, correction_id: str) -> s.CorrectionOut:
         """Return one correction."""
-        return self._get(s.CorrectionOut, f"/v1/corrections/{correction_id}")
+        return _read(s.CorrectionOut, self._ask("GET", f"/v1/corrections/{correction_id}"))
 
     def download(self, correction_id: str, path: str | Path) -> Path:
         """Save the corrected photo; the file appears under its name only when it is complete."""
         return self._save(f"/v1/corrections/{correction_id}/result", Path(path))
 
-    # --- lenses -----------------------------------------------------------------------------------
-
     def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
         """Return all lenses, newest first, optionally of one model or serial."""
-        return list(self._pages(s.Page[s.LensOut], "/v1/lenses", {"model": model, "serial": serial}))
+        return self._listed(s.LensOut, "/v1/lenses", {"model": model, "serial": serial})
 
     def lens(self, lens_id: str) -> s.LensOut:
         """Return one lens."""
-        return self._get(s.LensOut, f"/v1/lenses/{lens_id}")
+        return _read(s.LensOut, self._ask("GET", f"/v1/lenses/{lens_id}"))
 
     def psf(self, /, lens_id: str, **query: str | float | None) -> s.PsfOut:
         """Return the PSF of a lens at one place and setting, with what it rests on: fields of `PsfQuery`."""
-        return self._get(s.PsfOut, f"/v1/lenses/{lens_id}/psf.json", query)
+        return _read(s.PsfOut, self._ask("GET", f"/v1/lenses/{lens_id}/psf.json", query))
 
     def kernel(self, /, lens_id: str, **query: str | float | None) -> NDArray[np.float32]:
         """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
-        answer = _require_success(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=_present(query)))
+        answer = self._ask("GET", f"/v1/lenses/{lens_id}/psf.npy", query)
         kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
         return kernel
 
@@ -257,7 +236,7 @@ class Client:
 
         Two that seem to be different lenses are merged only with `any_lens=True`.
         """
-        return self._send(s.LensOut, "PATCH", f"/v1/lenses/{lens_id}", change)
+        return _read(s.LensOut, self._ask("PATCH", f"/v1/lenses/{lens_id}", json=change))
 
     def save_profile(self, lens_id: str, path: str | Path) -> Path:
         """Save what was learned of a lens as a `.lensprofile`."""
@@ -268,12 +247,15 @@ class Client:
 
         One that seems to be of another lens is refused without `any_lens`.
         """
-        headers = {"Content-Type": "application/zip"}
-        address = f"/v1/lenses/{lens_id}/profile{'?any_lens=true' if any_lens else ''}"
-        answer = self._http.put(address, content=Path(path).read_bytes(), headers=headers)
-        lens = _read(s.LensOut, answer)
+        answer = self._ask(
+            "PUT",
+            f"/v1/lenses/{lens_id}/profile",
+            {"any_lens": any_lens or None},
+            content=Path(path).read_bytes(),
+            headers={"Content-Type": "application/zip"},
+        )
         if answer.status_code != httpx2.codes.ACCEPTED:
-            return lens
+            return _read(s.LensOut, answer)
         try:
             self.wait(answer.headers["Location"].rpartition("/")[2])  # a worker is still reading it
         except JobEndedError as ended:
@@ -293,42 +275,37 @@ class Client:
 
     def get(self, path: str, **query: str | float | bool | None) -> Any:  # noqa: ANN401 - JSON of any shape
         """Return the JSON of any other address of the service, such as `/v1/account`."""
-        return _require_success(self._http.get(path, params=_present(query))).json()
+        return self._ask("GET", path, query).json()
 
-    # --- requests ---------------------------------------------------------------------------------
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, Any] | None = None,
+        **more: Any,  # noqa: ANN401 - of httpx
+    ) -> httpx2.Response:
+        """Return the answer to a request, without what its query leaves open; refusals are errors."""
+        # None and not {}: empty parameters would cut off the query that an address carries already
+        given = {name: value for name, value in (query or {}).items() if value is not None} or None
+        return _accepted(self._http.request(method, path, params=given, **more))
 
     def _save(self, address: str, target: Path) -> Path:
         with self._http.stream("GET", address) as answer:
             if answer.is_error:
                 answer.read()
-            _require_success(answer)
+            _accepted(answer)
             with atomic(target) as file:
                 for piece in answer.iter_bytes():
                     file.write(piece)
         return target
 
-    def _send(self, answer: type[M], method: str, path: str, body: Mapping[str, object] | None = None) -> M:
-        return _read(answer, self._http.request(method, path, json=body))
-
-    def _get(self, answer: type[M], path: str, query: Query | None = None) -> M:
-        # None and not {}: empty parameters would cut off the query that an address carries already
-        return _read(answer, self._http.get(path, params=_present(query) if query else None))
-
-    def _pages(self, answer: type[M], path: str, query: Query | None = None) -> Iterator[Any]:
-        page: Any = self._get(answer, path, query)
-        yield from page.items
-        while page.next is not None:
-            page = self._get(answer, page.next)
-            yield from page.items
-
-
-def _ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
-    """Tell a caller of a change; say whether the job has succeeded."""
-    if on_change is not None:
-        on_change(job)
-    if job.state in {"failed", "cancelled", "waiting"}:
-        raise JobEndedError(job)
-    return job.state == "succeeded"
+    def _listed(self, kind: type[M], path: str, query: Mapping[str, Any]) -> list[M]:
+        page = self._ask("GET", path, query).json()
+        items = page["items"]
+        while page["next"] is not None:
+            page = self._ask("GET", page["next"]).json()
+            items += page["items"]
+        return [kind.model_validate(item) for item in items]
 
 
 def _pieces(file: io.BufferedReader, on_progress: Callable[[int, int], None] | None) -> Iterator[bytes]:
@@ -339,23 +316,16 @@ def _pieces(file: io.BufferedReader, on_progress: Callable[[int, int], None] | N
             on_progress(file.tell(), total)
 
 
-def _present(query: Query) -> dict[str, str | int | float | bool]:
-    """Return a query without what is left open."""
-    return {name: value for name, value in query.items() if value is not None}
-
-
-def _require_success(answer: httpx2.Response) -> httpx2.Response:
+def _accepted(answer: httpx2.Response) -> httpx2.Response:
     if not answer.is_error:
         return answer
     try:
         problem = s.Problem.model_validate_json(answer.content)
     except ValidationError:  # a proxy between us and the service
-        text = answer.text[:200]
-        problem = s.Problem(
-            title=answer.reason_phrase, status=answer.status_code, detail=text, code="no_problem"
-        )
+        title, text = answer.reason_phrase, answer.text[:200]
+        problem = s.Problem(title=title, status=answer.status_code, detail=text, code="no_problem")
     raise ServiceProblemError(problem)
 
 
 def _read(model: type[M], answer: httpx2.Response) -> M:
-    return model.model_validate_json(_require_success(answer).content)
+    return model.model_validate_json(answer.content)

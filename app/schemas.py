@@ -105,19 +105,9 @@ class Problem(Model):
 
 
 MeasurementKind = Literal["target", "pair", "points", "edges"]
-PhotoState = Literal[
-    "received",
-    "inspecting",
-    "developing",
-    "selecting",
-    "estimating",
-    "counted",
-    "stored",
-    "needs_lens",
-    "excluded",
-    "failed",
-    "cancelled",
-]
+Working = Literal["received", "inspecting", "developing", "selecting", "estimating"]
+Ended = Literal["counted", "stored", "excluded", "failed", "cancelled"]
+PhotoState = Literal[Working, "needs_lens", Ended]
 
 
 class Settings(Question):
@@ -129,7 +119,16 @@ class Settings(Question):
     pixel_pitch_um: PixelPitch | None = None
 
 
-class UploadFields(Settings):
+class Taken(Settings):
+    """With which lens a photo was taken, and at which settings."""
+
+    lens_id: Id | None = None
+    lens_serial: Name | None = None
+    lens_model: Name | None = None
+    lens_maker: Name | None = None
+
+
+class UploadFields(Taken):
     """What an owner may say about a photo.
 
     The lens that it names goes before that of the file; a setting counts where the file says none.
@@ -143,10 +142,6 @@ class UploadFields(Settings):
     selector: Name | None = Field(
         default=None, description="who chooses its patches, one of GET /v1/formats; r-map by default"
     )
-    lens_id: Id | None = None
-    lens_serial: Name | None = None
-    lens_model: Name | None = None
-    lens_maker: Name | None = None
 
     @field_validator("*", mode="before")
     @classmethod
@@ -160,13 +155,9 @@ class NewLens(Question):
     label: Name
 
 
-class PhotoChange(Settings):
+class PhotoChange(Taken):
     """What to change about a photo; at least one field. It goes before what the file says."""
 
-    lens_id: Id | None = None
-    lens_serial: Name | None = None
-    lens_model: Name | None = None
-    lens_maker: Name | None = None
     new_lens: NewLens | None = None
     excluded: bool | None = None
     calibrate: bool | None = Field(
@@ -364,10 +355,9 @@ class LensOut(Model):
     @property
     def links(self) -> Links:
         """Where to go from here."""
-        own = f"{V1}/lenses/{self.id}"
+        own, photos = f"{V1}/lenses/{self.id}", f"{V1}/photos?lens_id={self.id}"
         parts = {"psf": "psf", "field": "field.png", "calibrations": "calibrations"}
         parts["lateral_colour"] = "lateral-colour"
-        photos = f"{V1}/photos?lens_id={self.id}"
         return {"self": own, **{name: f"{own}/{part}" for name, part in parts.items()}, "photos": photos}
 
 
@@ -399,20 +389,25 @@ class LateralOut(Model):
     blue: tuple[float, float, float, float]
 
 
-class PsfQuery(Question):
-    """Where and how to ask for a PSF."""
+class Setting(Question):
+    """At which settings, in which colour and of which version PSFs are asked for, and how large."""
 
-    r: float = Field(ge=0, le=1, description="half diagonals: 0 centre, 1 corner")
-    phi: float = Field(0.0, ge=-100, le=100, description="radians, counter-clockwise from the right")
     aperture: Aperture | None = None
     channel: Channel = "g"
     size: KernelSize = 55
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
+    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
+
+
+class PsfQuery(Setting):
+    """Where and how to ask for a PSF."""
+
+    r: float = Field(ge=0, le=1, description="half diagonals: 0 centre, 1 corner")
+    phi: float = Field(0.0, ge=-100, le=100, description="radians, counter-clockwise from the right")
     pixel_pitch_um: float | None = Field(
         None, gt=0.1, le=100, description="pixel of the answer; that of most photos by default"
     )
-    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
 
 
@@ -478,24 +473,11 @@ class PsfOut(Model):
     units: Units
 
 
-class FieldQuery(Question):
+class FieldQuery(Setting):
     """What a field map shows."""
 
-    aperture: Aperture | None = None
-    channel: Channel = "g"
     grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
-    size: KernelSize = 55
     aspect: float = Field(1.5, ge=0.2, le=5, description="width over height of the picture")
-    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
-    gamma: float = Field(0.5, ge=0.1, le=2, description="brightness ~ value^gamma")
-    focal_length_mm: FocalLength | None = None
-    focus_distance_m: FocusDistance | None = None
-
-
-class Health(Model):
-    """The process lives."""
-
-    status: Literal["ok"] = "ok"
 
 
 class Readiness(Model):
@@ -547,19 +529,22 @@ class SignIn(Question):
     key: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class SessionOut(Model):
-    """Who is signed in, and what he may; on a service of one owner without keys, that one."""
+class Owner(Model):
+    """Who asks, and what he may; on a service of one owner without keys, that one."""
 
     owner: str
     scopes: list[Literal["read", "write", "admin"]]
+
+
+class SessionOut(Owner):
+    """Who is signed in."""
+
     needed: bool = Field(description="whether one must sign in here at all")
 
 
-class AccountOut(Model):
+class AccountOut(Owner):
     """What an owner has, and may have."""
 
-    owner: str
-    scopes: list[Literal["read", "write", "admin"]]
     photos: int
     max_photos: int
     stored_bytes: int

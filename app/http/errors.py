@@ -39,19 +39,23 @@ HEADERS: Final[Mapping[str, str]] = {
 }
 # Status of the codes that errors have and jobs end with; all others are faults of ours
 STATUS_OF_CODE: Final[Mapping[str, int]] = {
-    **dict.fromkeys(("malformed_upload", "invalid_request"), 400),
-    "not_signed_in": 401,
-    "forbidden": 403,
-    **dict.fromkeys(("unknown_photo", "unknown_lens", "unknown_correction", "unknown_job"), 404),
-    "not_acceptable": 406,
-    "too_slow": 408,
-    **dict.fromkeys(("no_samples", "not_ready", "conflict", "other_lens", "cancelled"), 409),
-    **dict.fromkeys(("image_too_large", "decompression_bomb", "body_too_large"), 413),
-    **dict.fromkeys(("not_an_image", "truncated_image", "unsupported_format", "raw_decode_failed"), 415),
-    **dict.fromkeys(("metadata_missing", "invalid_parameter", "no_usable_patches", "outside_support"), 422),
-    **dict.fromkeys(("memory_limit", "time_limit", "turned_pixels"), 422),
-    "quota_exceeded": 429,
-    **dict.fromkeys(("busy", "outage"), 503),
+    code: status
+    for status, codes in {
+        400: "malformed_upload invalid_request",
+        401: "not_signed_in",
+        403: "forbidden",
+        404: "unknown_photo unknown_lens unknown_correction unknown_job",
+        406: "not_acceptable",
+        408: "too_slow",
+        409: "no_samples not_ready conflict other_lens cancelled",
+        413: "image_too_large decompression_bomb body_too_large",
+        415: "not_an_image truncated_image unsupported_format raw_decode_failed",
+        422: "metadata_missing invalid_parameter no_usable_patches outside_support memory_limit time_limit "
+        "turned_pixels",
+        429: "quota_exceeded",
+        503: "busy outage",
+    }.items()
+    for code in codes.split()
 }
 CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
@@ -71,15 +75,15 @@ def status_of(error: library.LensModelError) -> int:
     return next((STATUS_OF_CODE[code] for code in codes if code in STATUS_OF_CODE), 500)
 
 
-def problem_of(code: str, detail: str | None) -> Problem:
-    """Return the error of a job as the problem of a response."""
-    status = STATUS_OF_CODE.get(code, 500)
+def problem_of(code: str, detail: str | None, status: int | None = None, **more: Any) -> Problem:  # noqa: ANN401 - of Problem
+    """Return an error, of a request or of a job, as a problem."""
     return Problem(
         type=f"urn:lensmodel:{code}",
-        title=_title(code),
-        status=status,
+        title=code.replace("_", " ").capitalize(),
+        status=status or STATUS_OF_CODE.get(code, 500),
         detail=detail or "",
         code=code,
+        **more,
     )
 
 
@@ -94,26 +98,11 @@ def respond(
 ) -> Response:
     """Build the response for a problem."""
     request_id = getattr(request.state, "request_id", None)
-    problem = Problem(
-        type=f"urn:lensmodel:{code}",
-        title=_title(code),
-        status=status,
-        detail=detail,
-        instance=request.url.path,
-        code=code,
-        errors=list(errors),
-        request_id=request_id,
-    )
-    all_headers = {**HEADERS, **(headers or {})}
-    if request_id is not None:
-        all_headers[REQUEST_ID] = request_id  # here too: unforeseen errors are answered outside of RequestLog
-    return Response(
-        problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=all_headers
-    )
-
-
-def _title(code: str) -> str:
-    return code.replace("_", " ").capitalize()
+    more = {"instance": request.url.path, "errors": list(errors), "request_id": request_id}
+    body = problem_of(code, detail, status, **more).model_dump_json(exclude_none=True)
+    # the id here too: unforeseen errors are answered outside of RequestLog
+    own = {} if request_id is None else {REQUEST_ID: request_id}
+    return Response(body, status, {**HEADERS, **(headers or {}), **own}, MEDIA_TYPE)
 
 
 def field_errors(errors: Sequence[Any]) -> list[FieldError]:
@@ -121,14 +110,14 @@ def field_errors(errors: Sequence[Any]) -> list[FieldError]:
     return [
         FieldError(
             field=".".join(_writable(part) for part in error["loc"]) or "body",
-            value=_shortened(error.get("input")),
+            value=_quoted(error.get("input")),
             message=_writable(error["msg"]),
         )
         for error in errors
     ]
 
 
-def _shortened(value: object) -> str | None:
+def _quoted(value: object) -> str | None:
     if value is None or isinstance(value, dict | list | bytes):
         return None  # too long to quote
     text = _writable(value)
@@ -138,13 +127,6 @@ def _shortened(value: object) -> str | None:
 def _writable(value: object) -> str:
     """Return a value as text that UTF-8 can encode: JSON may contain lone surrogates."""
     return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _sentence(errors: Sequence[FieldError]) -> str:
-    sentences = (
-        f"{e.field}: {e.message}" + (f", got {e.value!r}" if e.value is not None else "") for e in errors
-    )
-    return "; ".join(sentences)
 
 
 def install(app: FastAPI) -> None:
@@ -162,7 +144,9 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(ValidationError)
     async def _invalid(request: Request, error: RequestValidationError | ValidationError) -> Response:
         errors = field_errors(error.errors())
-        return respond(request, 422, "invalid_parameter", _sentence(errors), errors=errors)
+        got = ((e, "" if e.value is None else f", got {e.value!r}") for e in errors)
+        detail = "; ".join(f"{e.field}: {e.message}{value}" for e, value in got)
+        return respond(request, 422, "invalid_parameter", detail, errors=errors)
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> Response:

@@ -135,7 +135,7 @@ class Guard:
             self._check_host(headers)
             if changes:
                 self._check_site(headers)
-                _check_body(headers, most, too_long)
+                self._check_body(headers, most, too_long)
         except BodyError as refusal:
             answer = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
             await answer(scope, receive, send)
@@ -180,19 +180,18 @@ class Guard:
             code, most, remedy = "image_too_large", MAX_PROFILE_BYTES, "send a smaller profile"
         return most, BodyError(413, code, f"the body has more than {most} bytes: {remedy}")
 
-
-def _check_body(headers: Headers, most: int, too_long: BodyError) -> None:
-    """Refuse a body by its headers alone; uploads are bytes or forms, all others JSON."""
-    is_json, declared = most == MAX_JSON_BYTES, declared_length(headers)
-    if declared is None:
-        text = f"Content-Length {headers['content-length'][:40]!r} is no number: send the number of bytes"
-        raise BodyError(400, "invalid_request" if is_json else "malformed_upload", text)
-    if declared > most:
-        raise too_long
-    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    empty = declared == 0 and "transfer-encoding" not in headers
-    if is_json and not empty and kind != "application/json":
-        raise BodyError(415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json")
+    @staticmethod
+    def _check_body(headers: Headers, most: int, too_long: BodyError) -> None:
+        """Refuse a body by its headers alone; uploads are bytes or forms, all others JSON."""
+        is_json, declared = most == MAX_JSON_BYTES, declared_length(headers)
+        if declared is None:
+            text = f"Content-Length {headers['content-length'][:40]!r} is no number: send the number of bytes"
+            raise BodyError(400, "invalid_request" if is_json else "malformed_upload", text)
+        if declared > most:
+            raise too_long
+        kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+        if is_json and (declared or "transfer-encoding" in headers) and kind != "application/json":
+            raise BodyError(415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json")
 
 
 def declared_length(headers: Headers) -> int | None:

@@ -53,35 +53,32 @@ class ModelCache:
         state = self._store.lenses.state_of(lens_id) if state is None else state
         if state is None:
             raise UnknownError("lens", lens_id)
-        if version is not None and version != state.version:
-            return self._earlier(lens_id, version, state)
-        fitted = self._recall((lens_id, None))
-        if fitted is not None and fitted.state == state:
+        wanted = replace(state, version=state.version if version is None else version)
+        if wanted != state:
+            check_version(self._store, lens_id, wanted.version, state)
+        key = (lens_id, None if wanted == state else version)
+        fitted = self._recall(key)
+        if fitted is not None and fitted.state == wanted:
             metrics.MODELS.labels("known").inc()
             return fitted
         with self._lock_of(lens_id):  # one thread fits, the others wait for its result
-            fitted = self._recall((lens_id, None))
-            if fitted is not None and fitted.state == self._store.lenses.state_of(lens_id):
+            fitted = self._recall(key)
+            newest = wanted if wanted != state else self._store.lenses.state_of(lens_id)
+            if fitted is not None and fitted.state == newest:
                 return fitted
             metrics.MODELS.labels("fitted" if fitted is None else "extended").inc()
-            return self._keep((lens_id, None), self._build(lens_id, fitted))
+            return self._keep(key, self._build(lens_id, fitted, key[1]))
 
-    def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
+    def _build(self, lens_id: str, old: Fitted | None, version: int | None) -> Fitted:
+        lenses = self._store.lenses
+        if version is not None:
+            state, samples = lenses.samples_of(lens_id, up_to_version=version)
+            return _fit(lens_id, replace(state, version=version), samples)
         if old is not None:
-            state, samples = self._store.lenses.samples_of(lens_id, after_version=old.state.version)
+            state, samples = lenses.samples_of(lens_id, after_version=old.state.version)
             if state.rebuild_epoch == old.state.rebuild_epoch:
                 return Fitted(lens_id, state, old.model.added(samples))
-        return _fit(lens_id, *self._store.lenses.samples_of(lens_id))
-
-    def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
-        check_version(self._store, lens_id, version, state)
-        key = (lens_id, version)
-        with self._lock_of(lens_id):
-            fitted = self._recall(key)
-            if fitted is not None and fitted.state.rebuild_epoch == state.rebuild_epoch:
-                return fitted
-            _, samples = self._store.lenses.samples_of(lens_id, up_to_version=version)
-            return self._keep(key, _fit(lens_id, replace(state, version=version), samples))
+        return _fit(lens_id, *lenses.samples_of(lens_id))
 
     def _lock_of(self, lens_id: str) -> threading.Lock:
         with self._guard:

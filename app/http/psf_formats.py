@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Final, Literal
@@ -12,7 +13,7 @@ import tifffile
 from PIL import Image
 
 from app.http.model_cache import Fitted
-from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
+from app.schemas import KernelOut, PsfOut, PsfQuery, QueryOut, Support, Units
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import PsfAnswer
@@ -33,16 +34,17 @@ HATCH_PX: Final = 7  # pixels between the strokes over a cell that is not known 
 
 
 def describe(
-    lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer, pixel_pitch_um: float | None
+    lens_id: str, fitted: Fitted, at: PsfQuery, answer: PsfAnswer, pixel_pitch_um: float | None
 ) -> PsfOut:
     """Describe an answer and its support, without the kernel, which most formats carry themselves."""
-    size = answer.kernel.shape[0]
     error = float(answer.predicted_error)
+    phi = at.phi if -math.pi < at.phi <= math.pi else FieldPosition(at.r, at.phi).phi
+    question = QueryOut.model_validate(at.model_dump(include=set(QueryOut.model_fields)) | {"phi": phi})
     return PsfOut(
         lens_id=lens_id,
         version=fitted.state.version,
         query=question,
-        psf=KernelOut(shape=(size, size), dtype="float32", data=[]),
+        psf=KernelOut(shape=(at.size, at.size), dtype="float32", data=[]),
         support=Support(
             effective_samples=float(answer.effective_samples),
             photos=answer.photos,
@@ -89,7 +91,6 @@ def field_map(
     columns: int,
     rows: int,
     size: int,
-    gamma: float,
     aspect: float,
 ) -> tuple[bytes, Mapping[str, str]]:
     """Draw kernels of side `size` on a grid over the field as an 8-bit PNG, each scaled to its own peak."""
@@ -105,7 +106,7 @@ def field_map(
         made[answer.answered_by] += 1
         top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
         known = answer.predicted_error < UNKNOWN and not answer.extrapolated
-        bright = np.round((answer.kernel / answer.kernel.max()) ** gamma * 255)
+        bright = np.round(np.sqrt(answer.kernel / answer.kernel.max()) * 255)
         sheet[top : top + size, left : left + size] = bright if known else hatched
     buffer = io.BytesIO()
     Image.fromarray(sheet).save(buffer, "PNG")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Final, TypeVar
+from typing import Final, TypeVar, get_args
 
 from app import distances
 from app import schemas as s
@@ -16,15 +16,10 @@ M = TypeVar("M", bound=s.Model)
 
 # State of the job, by the state of the photo
 JOB_STATES: Final[dict[str, s.JobState]] = {
+    **dict.fromkeys(get_args(s.Working), "running"),
+    **dict.fromkeys(("counted", "stored", "excluded"), "succeeded"),
     "received": "queued",
-    "inspecting": "running",
-    "developing": "running",
-    "selecting": "running",
-    "estimating": "running",
     "needs_lens": "waiting",
-    "counted": "succeeded",
-    "stored": "succeeded",
-    "excluded": "succeeded",
     "failed": "failed",
     "cancelled": "cancelled",
 }
@@ -76,51 +71,51 @@ def patch_out(row: PatchRow) -> s.PatchOut:
 
 def photo_job(row: PhotoRow) -> s.JobOut:
     """Describe the work on a photo."""
-    state = JOB_STATES[row.state]
-    estimating = row.state == "estimating"
-    return _of(
-        s.JobOut,
-        row,
-        id=row.public_id,
-        kind="photo",
-        state=state,
-        stage=row.state if state == "running" else None,
-        progress={"done": row.patches_done, "total": row.patches_total, "unit": "patches"},
-        eta_seconds=_eta(row.stage_at, row.patches_done, row.patches_total) if estimating else None,
-        attempt=max(row.attempt, 1),
-        error=_problem(row),
-        created_at=row.received_at,
-        links={
-            "self": f"{V1}/jobs/{row.public_id}",
-            "photo": f"{V1}/photos/{row.public_id}",
-            "lens": None if row.lens is None else f"{V1}/lenses/{row.lens.public_id}",
-            "correction": None,
-            "result": None,
-        },
-    )
+    since = row.stage_at if row.state == "estimating" else None
+    how_far = (row.patches_done, row.patches_total, "patches")
+    return _job(row, "photo", JOB_STATES[row.state], row.state, since, how_far, row, {}, row.received_at)
 
 
 def correction_job(row: CorrectionRow) -> s.JobOut:
     """Describe the work on a correction."""
-    running = row.state == "running"
     own = f"{V1}/corrections/{row.public_id}"
-    since = row.started_at if running else None
+    links = {"correction": own, "result": f"{own}/result" if row.state == "succeeded" else None}
+    since = row.started_at if row.state == "running" else None
+    how_far = (row.progress_done, row.progress_total, "tiles")
+    return _job(row, "correction", row.state, row.stage, since, how_far, row.photo, links, row.created_at)
+
+
+def _job(
+    row: PhotoRow | CorrectionRow,
+    kind: str,
+    state: str,
+    stage: str | None,
+    since: datetime | None,
+    how_far: tuple[int, int, str],
+    photo: PhotoRow,
+    links: dict[str, str | None],
+    created_at: datetime,
+) -> s.JobOut:
+    done, total, unit = how_far
     return _of(
         s.JobOut,
         row,
         id=row.public_id,
-        kind="correction",
-        stage=row.stage if running else None,
-        progress={"done": row.progress_done, "total": row.progress_total, "unit": "tiles"},
-        eta_seconds=None if since is None else _eta(since, row.progress_done, row.progress_total),
+        kind=kind,
+        state=state,
+        stage=stage if state == "running" else None,
+        progress={"done": done, "total": total, "unit": unit},
+        eta_seconds=None if since is None else _eta(since, done, total),
         attempt=max(row.attempt, 1),
         error=_problem(row),
+        created_at=created_at,
         links={
             "self": f"{V1}/jobs/{row.public_id}",
-            "photo": f"{V1}/photos/{row.photo.public_id}",
-            "lens": f"{V1}/lenses/{row.lens.public_id}",
-            "correction": own,
-            "result": f"{own}/result" if row.state == "succeeded" else None,
+            "photo": f"{V1}/photos/{photo.public_id}",
+            "lens": None if row.lens is None else f"{V1}/lenses/{row.lens.public_id}",
+            "correction": None,
+            "result": None,
+            **links,
         },
     )
 

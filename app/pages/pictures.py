@@ -6,7 +6,7 @@ A place of the upright picture and of the sensor are related by an EXIF orientat
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Depends, Path, Response
 
@@ -31,7 +31,6 @@ NOTHING: Final = (
     '<rect width="3" height="2" fill="#8882"/></svg>'
 )
 
-N = TypeVar("N", int, float)
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
@@ -105,51 +104,36 @@ def correction_layer(
     return _picture(_stored(call, f"{row.run_folder}{LAYER_FILES[name]}"), "image/png")
 
 
-def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:
-    """Return a point, `(row, col)`, in the coordinates of the upright picture."""
-    row, col = turned(row, col, height - 1, width - 1, orientation)
-    return round(row), round(col)
-
-
-def turned(row: N, col: N, last_row: int, last_col: int, orientation: int) -> tuple[N, N]:
-    """Turn a place that lies in rows 0..last_row and columns 0..last_col as an EXIF orientation says."""
-    below, right = last_row - row, last_col - col
-    return {
-        1: (row, col),
-        2: (row, right),
-        3: (below, right),
-        4: (below, col),
-        5: (col, row),
-        6: (col, below),
-        7: (right, below),
-        8: (right, row),
-    }.get(orientation, (row, col))
+def turned_box(
+    top: int, left: int, bottom: int, right: int, height: int, width: int, orientation: int
+) -> tuple[int, int, int, int]:
+    """Turn a part of a picture of `height` x `width` by EXIF orientation: top, left, height, width."""
+    corners = [
+        {
+            1: (row, col),
+            2: (row, width - col),
+            3: (height - row, width - col),
+            4: (height - row, col),
+            5: (col, row),
+            6: (col, height - row),
+            7: (width - col, height - row),
+            8: (width - col, row),
+        }.get(orientation, (row, col))
+        for row, col in ((top, left), (bottom, right))
+    ]
+    (top, bottom), (left, right) = (sorted(places) for places in zip(*corners, strict=True))
+    return top, left, bottom - top, right - left
 
 
 _BACK: Final = {6: 8, 8: 6}  # EXIF orientations whose inverse differs from them, with that inverse
 
 
 def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:
-    """Return a part of the upright picture in the coordinates of the sensor.
-
-    Parameters
-    ----------
-    part : Region
-        In pixels of the upright picture.
-    height, width : int
-        Of the picture as the sensor has it.
-    orientation : int
-        EXIF orientation.
-    """
+    """Return a part of the upright picture in the coordinates of the sensor, which has `height` x `width`."""
     shape = (width, height) if orientation > 4 else (height, width)
-    back = _BACK.get(orientation, orientation)
-    corners = [
-        upright_point(row, col, *shape, back)
-        for row in (part.y, part.y + part.height - 1)
-        for col in (part.x, part.x + part.width - 1)
-    ]
-    rows, cols = [row for row, _ in corners], [col for _, col in corners]
-    return Region(x=min(cols), y=min(rows), width=max(cols) - min(cols) + 1, height=max(rows) - min(rows) + 1)
+    ends = (part.y, part.x, part.y + part.height, part.x + part.width)
+    top, left, rise, run = turned_box(*ends, *shape, _BACK.get(orientation, orientation))
+    return Region(x=left, y=top, width=run, height=rise)
 
 
 def exists(storage: Storage, key: str) -> bool:

@@ -83,41 +83,24 @@ def waiting(call: Call) -> list[WaitingGroup]:
 
 @dataclass(frozen=True, slots=True)
 class WaitingGroup:
-    """Photos that wait for their lens and were probably taken with the same one.
-
-    Parameters
-    ----------
-    camera : str or None
-    body : int or None
-        Which of several bodies of that camera, counted from 1; None where there is but one.
-    focal_mm : float or None
-    lens_model : str or None
-        What the files call the lens, where they do.
-    needs_aperture : bool
-        Whether any of the files does not say its aperture.
-    own_lens : bool
-        Whether the lens is a part of the camera.
-    photos : list of PhotoRow
-        Newest first.
-    """
+    """Photos that wait for their lens and were probably taken with the same one."""
 
     camera: str | None
-    body: int | None
+    body: int | None  # which of several bodies of that camera, from 1; None where there is but one
     focal_mm: float | None
-    lens_model: str | None
-    needs_aperture: bool
-    own_lens: bool
-    photos: list[PhotoRow]
+    lens_model: str | None  # what the files call the lens, where they do
+    needs_aperture: bool  # whether any of the files does not say it
+    own_lens: bool  # whether the lens is a part of the camera
+    photos: list[PhotoRow]  # newest first
 
     @property
     def name(self) -> str:
         """What to call the lens: its own name, else camera and focal length; empty where nothing is known."""
-        parts = [self.camera] if self.camera else []
         if self.lens_model:
             maker = self.camera.split()[0] if self.camera else None
             return full_name(maker, self.lens_model) if self.lens_model[0].isdigit() else self.lens_model
-        parts += [f"body {self.body}"] if self.body else []
-        return ", ".join([*parts, *([f"{self.focal_mm:g} mm"] if self.focal_mm else [])])
+        body, focal = self.body and f"body {self.body}", self.focal_mm and f"{self.focal_mm:g} mm"
+        return ", ".join(part for part in (self.camera, body, focal) if part)
 
     @property
     def key(self) -> str:

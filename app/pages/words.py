@@ -6,11 +6,11 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from app.pages.pictures import turned
+from app.pages.pictures import turned_box
 from app.pages.shown import WaitingGroup
-from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem
+from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem, Working
 from lensmodel.cli.console import gain_words
 from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
@@ -44,7 +44,7 @@ FILES: Final[Mapping[str, str]] = {
     "jpeg": "JPEG",
     "dng": "Linear DNG",
 }
-ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
+ACTIVE: Final = frozenset(get_args(Working))
 CHECKS: Final[Mapping[str, str]] = {
     "isolated pixels": "single pixels that stand out",
     "re-blur": "detail that does not match the photo",
@@ -157,11 +157,9 @@ def waiting_words(groups: Sequence[WaitingGroup]) -> str:
 
 def group_name(group: WaitingGroup) -> str:
     """Say what the photos of a group have in common."""
-    camera = group.camera or "Unknown camera"
-    body = "" if group.body is None else f", body {group.body}"
-    lens = f", {group.lens_model}" if group.lens_model else ""
-    focal = f", {group.focal_mm:g} mm" if group.focal_mm else ""
-    return f"{camera}{body}{lens}{focal}: {counted(len(group.photos), 'photo')}"
+    body, focal = group.body and f"body {group.body}", group.focal_mm and f"{group.focal_mm:g} mm"
+    parts = (group.camera or "Unknown camera", body, group.lens_model, focal)
+    return f"{', '.join(part for part in parts if part)}: {counted(len(group.photos), 'photo')}"
 
 
 def refusal(status: int, detail: str) -> tuple[str, str]:
@@ -183,13 +181,9 @@ def reason_words(reason: str | None) -> str:
 
 def error_words(error: Mapping[str, float | None] | float | None) -> str:
     """Write a held-out error in percent, one figure a zone."""
-    if not error:
-        return "not yet known"
-    return (
-        ", ".join(percent(error.get(zone)) for zone in ZONES)
-        if isinstance(error, Mapping)
-        else percent(error)
-    )
+    if isinstance(error, Mapping) and error:
+        return ", ".join(percent(error.get(zone)) for zone in ZONES)
+    return percent(error) if isinstance(error, float) else "not yet known"
 
 
 def percent(share: float | None) -> str:
@@ -204,15 +198,12 @@ def coverage_words(coverage: Mapping[str, Any] | None) -> str:
 
 def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> tuple[list[tuple[str, int, str]], int]:
     """Return name, length in percent and words of a bar for each zone, and the decibels at their end."""
-    gains = {zone: zones[zone].get("expected_gain_db") for zone in ZONES if zones.get(zone, {}).get("cells")}
+    known = {name: zones[zone] for zone, name in ZONES.items() if zones.get(zone, {}).get("cells")}
+    gains = {name: zone.get("expected_gain_db") for name, zone in known.items()}
     most = math.ceil(max([3.0, *(gain for gain in gains.values() if gain is not None)]))
     return [
-        (
-            ZONES[zone],
-            round(100 * max(gain or 0.0, 0.0) / most),
-            gain_words(gain) + held_words(zones[zone]),
-        )
-        for zone, gain in gains.items()
+        (name, round(100 * max(gain or 0.0, 0.0) / most), gain_words(gain) + held_words(known[name]))
+        for name, gain in gains.items()
     ], most
 
 
@@ -264,12 +255,9 @@ def held_map(
     rise, run = (extent / max(1, round(extent / side)) for extent in (height, width))
     for tile in audit.get("tiles") or []:
         row, col = round(tile["row"] / rise), round(tile["col"] / run)
-        ends = [
-            turned(round(y * rise), round(x * run), height, width, orientation)
-            for y, x in ((row, col), (row + 1, col + 1))
-        ]
-        (top, bottom), (left, right) = (sorted(places) for places in zip(*ends, strict=True))
-        found.append((left, top, right - left, bottom - top, tile["held_back"]))
+        ends = (round(row * rise), round(col * run), round((row + 1) * rise), round((col + 1) * run))
+        top, left, down, across = turned_box(*ends, height, width, orientation)
+        found.append((left, top, across, down, tile["held_back"]))
     return found
 
 

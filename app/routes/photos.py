@@ -6,7 +6,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import timedelta
-from functools import partial
 from typing import Any, Final
 
 from fastapi import APIRouter, status
@@ -62,9 +61,9 @@ _UPLOAD_BODY: Final = {
     },
 }
 
-_REFUSED: Final = (400, 408, 413, 415, 507)  # of uploads and the checks before them
+# Of uploads and the checks before them
 _RECEIVED: Final = problems(
-    *_REFUSED, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
+    400, 408, 413, 415, 507, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
 )
 
 
@@ -115,9 +114,8 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
         await run_in_threadpool(_admit, call)
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
-        prefix = f"photos/{public_id}/"
-        span = timedelta(seconds=UPLOAD_S)
-        await run_in_threadpool(partial(call.store.photos.expect, prefix, within=span))
+        prefix, span = f"photos/{public_id}/", timedelta(seconds=UPLOAD_S)
+        await run_in_threadpool(call.store.photos.expect, prefix, within=span)
         async with middleware.within(UPLOAD_S):
             yield public_id, f"{prefix}original"
 
@@ -133,16 +131,29 @@ async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
 
 
 def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measured: bool) -> PhotoOut:
-    """Create a photo from an upload."""
+    """Create a photo from an upload, or find that of the same bytes."""
+    fields = uploaded.fields
     try:
-        _check_kind(call, uploaded.fields, measured=measured)
-        photo, fresh = _record(call, public_id, uploaded, key)
+        _check_kind(call, fields, measured=measured)
+        if fields.lens_id is not None:
+            find_lens(call, fields.lens_id)
+        received = recorded(
+            call,
+            public_id,
+            key,
+            sha256=uploaded.sha256,
+            filename=uploaded.filename,
+            kind=uploaded.kind,
+            byte_size=uploaded.size,
+            calibrate=fields.calibrate,
+            given=fields.model_dump(exclude={"calibrate"}, exclude_none=True),
+        )
     except ServiceError:
         call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
         raise
-    call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
-    call.response.headers["Location"] = f"{V1}/photos/{photo.id}"
-    return photo
+    call.response.status_code = status.HTTP_202_ACCEPTED if received.fresh else status.HTTP_200_OK
+    call.response.headers["Location"] = f"{V1}/photos/{received.photo.public_id}"
+    return views.photo_out(received.photo)
 
 
 def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
@@ -158,11 +169,12 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         )
     if fields.reference_id is not None:
         find_photo(call, fields.reference_id)
-    if fields.selector is not None and fields.kind is not None:
-        raise InvalidParameterError(f"selector={fields.selector} and kind exclude each other: leave one out")
-    if fields.selector is not None and fields.selector not in selectors:
-        known = ", ".join(selectors)
-        raise InvalidParameterError(f"no selector {fields.selector[:60]!r}; known: {known}")
+    if fields.selector is not None:
+        if fields.kind is not None:
+            raise InvalidParameterError("selector and kind exclude each other: leave one out")
+        if fields.selector not in selectors:
+            known = ", ".join(selectors)
+            raise InvalidParameterError(f"no selector {fields.selector[:60]!r}; known: {known}")
 
 
 def _admit(call: Call) -> None:
@@ -201,25 +213,6 @@ def most(settings: Settings, usage: Usage) -> tuple[int, int]:
         int(settings.max_stored_gb * GIB) if usage.quota_bytes is None else usage.quota_bytes,
         MAX_PHOTOS if usage.quota_photos is None else usage.quota_photos,
     )
-
-
-def _record(call: Call, public_id: str, uploaded: upload.Uploaded, key: str) -> tuple[PhotoOut, bool]:
-    fields = uploaded.fields
-    given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
-    if fields.lens_id is not None:
-        find_lens(call, fields.lens_id)
-    received = recorded(
-        call,
-        public_id,
-        key,
-        sha256=uploaded.sha256,
-        filename=uploaded.filename,
-        kind=uploaded.kind,
-        byte_size=uploaded.size,
-        calibrate=fields.calibrate,
-        given=given,
-    )
-    return views.photo_out(received.photo), received.fresh
 
 
 def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  # noqa: ANN401 - of `receive`

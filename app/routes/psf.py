@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Response, status
@@ -13,8 +12,7 @@ from app.http import psf_formats
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import Fitted
 from app.routes.common import NOT_CHANGED, Answers, file_answer, found, matches_tag, problems
-from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
-from app.store.samples import LensState
+from app.schemas import FieldQuery, PsfOut, PsfQuery
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.types import FieldPosition, LensSettings
 
@@ -64,7 +62,7 @@ _QUERY: Final = {
 )
 def read_psf(lens_id: str, call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
-    return _answer(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
+    return read_psf_as(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
 
 
 @router.get(
@@ -76,7 +74,23 @@ def read_psf(lens_id: str, call: CallDep) -> Response:
 )
 def read_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
     """Return the PSF in the format of the suffix."""
-    return _answer(lens_id, suffix, call)
+    at = PsfQuery.model_validate(dict(call.request.query_params))
+    fitted, headers = _fitted(lens_id, at, call, suffix)
+    if fitted is None:
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    answer = fitted.model.query(
+        FieldPosition(at.r, at.phi), _setting(at), at.size, pitch_um=at.pixel_pitch_um
+    )
+    if at.strict and answer.extrapolated:
+        raise OutsideSupportError(
+            f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
+            "cover: upload photos that do, or ask without strict"
+        )
+    pitch = at.pixel_pitch_um or fitted.model.pitch_um
+    body, more = psf_formats.psf(
+        suffix, answer.kernel, psf_formats.describe(lens_id, fitted, at, answer, pitch)
+    )
+    return Response(body, media_type=MEDIA_TYPES[suffix], headers={**headers, **more})
 
 
 def accepted(header: str) -> Format:
@@ -95,36 +109,20 @@ def accepted(header: str) -> Format:
     )
 
 
-def _answer(lens_id: str, form: Format, call: Call) -> Response:
-    at = PsfQuery.model_validate(dict(call.request.query_params))
-    fitted = call.models.get(lens_id, at.version, state=_known(call, lens_id))
-    pinned = at.version is not None
+def _fitted(
+    lens_id: str, at: PsfQuery | FieldQuery, call: Call, form: str = ""
+) -> tuple[Fitted | None, dict[str, str]]:
+    """Return the model that answers, None where the browser has its answer already; and the headers."""
+    state = found("lens", lens_id, call.store.lenses.known_of(lens_id, call.owner))
+    fitted = call.models.get(lens_id, at.version, state=state)
     tag = etag(fitted, f"{at.model_dump_json()}{form}")
-    headers = {
-        "ETag": tag,
-        "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
-        "Vary": "Accept",
-    }
-    if matches_tag(call, tag):
-        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    position = FieldPosition(at.r, at.phi)
-    setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
-    answer = fitted.model.query(position, setting, size=at.size, pitch_um=at.pixel_pitch_um)
-    if at.strict and answer.extrapolated:
-        raise OutsideSupportError(
-            f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
-            "cover: upload photos that do, or ask without strict"
-        )
-    phi = at.phi if -math.pi < at.phi <= math.pi else position.phi
-    question = QueryOut.model_validate(at.model_dump(include=set(QueryOut.model_fields)) | {"phi": phi})
-    pitch = at.pixel_pitch_um or fitted.model.pitch_um
-    described = psf_formats.describe(lens_id, fitted, question, answer, pitch)
-    body, more = psf_formats.psf(form, answer.kernel, described)
-    return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
+    fresh = "no-cache" if at.version is None else "max-age=3600"
+    headers = {"ETag": tag, "Cache-Control": f"private, {fresh}", "Vary": "Accept"}
+    return (None if matches_tag(call, tag) else fitted), headers
 
 
-def _known(call: Call, lens_id: str) -> LensState:
-    return found("lens", lens_id, call.store.lenses.known_of(lens_id, call.owner))
+def _setting(at: PsfQuery | FieldQuery) -> LensSettings:
+    return LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 
 
 def etag(fitted: Fitted, question: str) -> str:
@@ -150,20 +148,15 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
             f"grid {at.grid} of size {at.size} are {pixels / 1e6:.1f} million pixels, "
             f"{MAX_FIELD_PIXELS / 1e6:g} may be: ask for fewer or smaller kernels"
         )
-    state = _known(call, lens_id)
-    fitted = call.models.get(lens_id, at.version, state=state)
-    tag = etag(fitted, at.model_dump_json())
-    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if matches_tag(call, tag):
+    fitted, headers = _fitted(lens_id, at, call)
+    if fitted is None:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
-
+    setting, query = _setting(at), fitted.model.query
     picture, more = psf_formats.field_map(
-        lambda place: fitted.model.query(place, setting, at.size),
+        lambda place: query(place, setting, at.size),
         columns=columns,
         rows=rows,
         size=at.size,
-        gamma=at.gamma,
         aspect=at.aspect,
     )
     return Response(picture, media_type="image/png", headers={**headers, **more})

@@ -25,7 +25,7 @@ from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.batch import unused_name
-from app.pages.pictures import in_sensor, upright_point
+from app.pages.pictures import in_sensor, turned_box
 from app.pages.shown import grouped
 from app.pages.words import held_map, plain
 from app.runtime.settings import Settings
@@ -322,8 +322,8 @@ def test_a_part_of_the_upright_photo_is_found_on_the_sensor(orientation: int) ->
     crop = sensor[found.y : found.y + found.height, found.x : found.x + found.width]
     wanted = turned[part.y : part.y + part.height, part.x : part.x + part.width]
     assert sorted(crop.ravel()) == sorted(wanted.ravel())
-    row, col = upright_point(found.y, found.x, 30, 50, orientation)
-    assert turned[row, col] == sensor[found.y, found.x]
+    ends = (found.y, found.x, found.y + found.height, found.x + found.width)
+    assert turned_box(*ends, 30, 50, orientation) == (part.y, part.x, part.height, part.width)
 
 
 def test_a_photo_has_a_thumbnail_before_it_is_developed(

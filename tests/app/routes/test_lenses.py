@@ -16,6 +16,7 @@ from starlette.testclient import TestClient
 
 from app.http.model_cache import ModelCache
 from app.routes.psf import accepted
+from app.schemas import PsfQuery
 from app.store import Store
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -54,12 +55,7 @@ def test_lenses_are_found_by_model_and_serial(client: TestClient, steps: Steps) 
     found = client.get("/v1/lenses?model=EF24mm f/1.4L&serial=2").json()["items"]
     assert [lens["id"] for lens in found] == [second]
     assert client.get("/v1/lenses?serial=3").json()["items"] == []
-
-
-def test_a_blank_filter_asks_for_all_lenses(client: TestClient, lens: str) -> None:
-    found = client.get("/v1/lenses?model=&serial=").json()["items"]
-
-    assert [f"/v1/lenses/{one['id']}" for one in found] == [lens]
+    assert len(client.get("/v1/lenses?model=&serial=").json()["items"]) == 2  # blank asks for all
 
 
 def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> None:
@@ -201,52 +197,42 @@ def test_an_earlier_version_stays_available_until_photos_are_removed(
 
     client.patch(f"/v1/photos/{second.public_id}", json={"excluded": True})
     gone = client.get(f"{lens}/psf?r=0.5&version=1")
-    assert (gone.status_code, gone.json()["code"]) == (409, "conflict")
+    future = client.get(f"{lens}/psf?r=0.5&version=99")
+    for answer in (gone, future):
+        assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
     assert ask(client, lens)["support"]["photos"] == 1
 
 
-def test_a_version_of_the_future_is_refused(client: TestClient, lens: str) -> None:
-    answer = client.get(f"{lens}/psf?r=0.5&version=99")
-
-    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
-
-
-BAD_QUESTIONS = [
-    ("r", "-0.01"),
-    ("r", "1.01"),
-    ("r", "nan"),
-    ("r", "inf"),
-    ("r", ""),
-    ("phi", "nan"),
-    ("phi", "1e300"),
-    ("aperture", "0.49"),
-    ("aperture", "128.5"),
-    ("aperture", "nan"),
-    ("channel", "x"),
-    ("size", "0"),
-    ("size", "1"),
-    ("size", "54"),
-    ("size", "257"),
-    ("size", "5.5"),
-    ("focal_length_mm", "0"),
-    ("focus_distance_m", "-2"),
-    ("focus_distance_m", "5e-324"),
-    ("pixel_pitch_um", "5e-324"),
-    ("version", "0"),
-    ("strict", "maybe"),
-    ("wavelength", "540"),
-]
+BAD_QUESTIONS = {
+    "r": ("-0.01", "1.01", "nan", "inf", ""),
+    "phi": ("nan", "1e300"),
+    "aperture": ("0.49", "128.5", "nan"),
+    "channel": ("x",),
+    "size": ("0", "1", "54", "257", "5.5"),
+    "focal_length_mm": ("0",),
+    "focus_distance_m": ("-2", "5e-324"),
+    "pixel_pitch_um": ("5e-324",),
+    "version": ("0",),
+    "strict": ("maybe",),
+    "wavelength": ("540",),
+}
 
 
 def test_a_bad_question_is_answered_with_the_offending_value(client: TestClient, lens: str) -> None:
-    for name, value in BAD_QUESTIONS:
-        answer = client.get(f"{lens}/psf", params={"r": "0.5"} | {name: value})
+    asked = [(name, {"r": "0.5", name: value}) for name, values in BAD_QUESTIONS.items() for value in values]
+    for name, query in (*asked, ("r", {})):
+        answer = client.get(f"{lens}/psf", params=query)
 
-        assert (name, value, answer.status_code) == (name, value, 422)
+        assert (query, answer.status_code) == (query, 422)
         problem = answer.json()
         assert problem["code"] == "invalid_parameter"
         assert name in problem["errors"][0]["field"]
         assert name in problem["detail"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("focus_distance_m", 0.02), ("pixel_pitch_um", 0.5)])
+def test_the_smallest_of_real_cameras_is_answered(name: str, value: float) -> None:
+    assert getattr(PsfQuery.model_validate({"r": 0.5, name: value}), name) == value
 
 
 def test_phi_is_an_angle_and_comes_round(client: TestClient, lens: str) -> None:
@@ -255,13 +241,6 @@ def test_phi_is_an_angle_and_comes_round(client: TestClient, lens: str) -> None:
 
     assert round_once["query"]["phi"] == pytest.approx(0.59)
     np.testing.assert_allclose(round_once["psf"]["data"], there["psf"]["data"], atol=1e-9)
-
-
-def test_the_place_is_needed(client: TestClient, lens: str) -> None:
-    answer = client.get(f"{lens}/psf")
-
-    assert answer.status_code == 422
-    assert "r" in answer.json()["errors"][0]["field"]
 
 
 def test_a_lens_without_samples_says_what_to_do(client: TestClient, steps: Steps) -> None:

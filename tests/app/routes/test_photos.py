@@ -95,11 +95,11 @@ def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -
     assert [photo["id"] for photo in by_state] == [other.public_id, counted.public_id]
 
 
-@pytest.mark.parametrize("query", ["limit=0", "limit=201", "limit=x", "state=lost", f"cursor={'x' * 50}"])
-def test_a_bad_page_is_refused(client: TestClient, query: str) -> None:
-    answer = client.get(f"/v1/photos?{query}")
+def test_a_bad_page_is_refused(client: TestClient) -> None:
+    for query in ("limit=0", "limit=201", "limit=x", "state=lost", f"cursor={'x' * 50}"):
+        answer = client.get(f"/v1/photos?{query}")
 
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
+        assert (query, answer.status_code, answer.json()["code"]) == (query, 422, "invalid_parameter")
 
 
 @pytest.mark.parametrize("kind", ["photos", "jobs", "lenses", "corrections"])

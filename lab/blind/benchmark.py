@@ -28,7 +28,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lab.blind.judges import Judge, judges, squared_error
+from lab.blind.judge import deconvolved, squared_error
 from lab.blind.methods import BlindMethod, compared
 from lab.cases import HALVES, BlindCase, Half, list_photos, load_psfs, make_cases, observe
 from lab.page import table
@@ -39,8 +39,8 @@ from lensmodel.core.types import Kernel, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 
-PROTOCOL = 3
-"""Part of every cache key; raised when cases, their windows or metrics change."""
+PROTOCOL = 4
+"""Part of every cache key; raised when cases, their windows, metrics or the judge change."""
 
 KERNEL_SIZE: Final = 31  # pixels of an estimate: odd
 
@@ -59,7 +59,6 @@ class BlindBenchmark:
     half: Half = "test"  # which half of photos and PSFs
     cases: int | None = None  # at most so many, spread over photos and PSFs
     patch: int = 256  # sides in pixels
-    judge: str = "hyper-laplacian"  # non-blind deconvolution: "hyper-laplacian" or "epll"
     scenes: int | None = None  # so many windows of the photographs in turn; None means one of each
 
     def __post_init__(self) -> None:
@@ -184,9 +183,8 @@ def plain(row: Mapping[str, object]) -> dict[str, object]:
 class ResultStore:
     """Finished results by the content they came from; one file of JSON lines, only ever appended."""
 
-    def __init__(self, folder: Path | None, photos: Sequence[Path], judge: Judge) -> None:
+    def __init__(self, folder: Path | None, photos: Sequence[Path]) -> None:
         self._content = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
-        self._judge = judge
         self._known: dict[str, CaseResult] = {}
         self._file: Path | None = None
         if folder is not None:
@@ -216,7 +214,6 @@ class ResultStore:
             hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
             (case.psf_number, case.noise, case.patch, case.seed, case.window),
             (name, getattr(method, "version", 0), changed(method), KERNEL_SIZE),
-            (type(self._judge).__name__, self._judge.version, changed(self._judge)),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
@@ -250,7 +247,6 @@ def run_blind_benchmark(
     """Run the benchmark; what the cache folder already holds is not computed again."""
     registry = compared if methods is None else methods
     chosen = {name: registry.create(name) for name in settings.methods}
-    judge = judges.create(settings.judge)
     photos, kernels = list_photos(settings.photos), load_psfs(settings.psfs)
     cases = [
         case
@@ -266,7 +262,7 @@ def run_blind_benchmark(
             scenes=settings.scenes,
         )
     ]
-    store = ResultStore(cache, photos, judge)
+    store = ResultStore(cache, photos)
     jobs = []
     for case in cases:
         kernel = kernels[case.psf_number]
@@ -276,7 +272,7 @@ def run_blind_benchmark(
             if store.find(case, kernel, name, method) is None
         }
         if missing:
-            jobs.append(_Job(case, kernel, missing, judge))
+            jobs.append(_Job(case, kernel, missing))
     done = len(cases) - len(jobs)
     for job, fresh in _run(jobs, workers):
         for result in fresh:
@@ -299,7 +295,6 @@ class _Job:
     case: BlindCase
     kernel: Kernel
     methods: Mapping[str, BlindMethod | None]
-    judge: Judge
 
 
 def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, list[CaseResult]]]:
@@ -317,7 +312,7 @@ def _run(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, list[CaseRe
 def _run_job(job: _Job) -> list[CaseResult]:
     seen = observe(job.case, job.kernel)
     sigma = job.case.noise
-    reference = job.judge.deconvolve(seen.patch, seen.kernel, sigma, (0.0, 0.0))
+    reference = deconvolved(seen.patch, seen.kernel, sigma, (0.0, 0.0))
     floor = max(squared_error(reference, seen.sharp), 1e-12)
     untouched = squared_error(seen.patch, seen.sharp) / floor
     results = []
@@ -338,7 +333,7 @@ def _run_job(job: _Job) -> list[CaseResult]:
         distance = psf.distance(kernel, seen.kernel)
         ratio = untouched
         if estimate is not None:
-            restored = job.judge.deconvolve(seen.patch, kernel, sigma, distance.shift)
+            restored = deconvolved(seen.patch, kernel, sigma, distance.shift)
             ratio = squared_error(restored, seen.sharp) / floor
         results.append(
             CaseResult(

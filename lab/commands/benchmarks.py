@@ -66,9 +66,6 @@ def blind(
         typer.Option(min=1, help="Number of windows, from the photographs in turn. Default: one of each."),
     ] = None,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
-    judge: Annotated[
-        str, typer.Option(help="Prior of the deblurring for ER: hyper-laplacian or epll.")
-    ] = "hyper-laplacian",
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
         Path,
@@ -111,7 +108,6 @@ def blind(
             methods=_names(methods),
             half=half,  # type: ignore[arg-type]  # checked by the benchmark
             cases=cases,
-            judge=judge,
             scenes=scenes,
         )
     with as_usage(), shown.progress() as bars:

@@ -82,7 +82,7 @@ def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
         settings, rows = stored["settings"], stored["summary"]
-        kept = {name: settings[name] for name in ("half", "patch", "judge")}
+        kept = {name: settings[name] for name in ("half", "patch")}
     except (OSError, ValueError, KeyError) as error:
         raise InvalidInputError(f"{path} is no benchmark; run `lensmodel bench blind` again") from error
     pictures.mkdir(parents=True, exist_ok=True)
@@ -232,8 +232,7 @@ def _fig1(page: Page, fig: Mapping[str, Any] | None) -> None:
     page.text(
         "Share of cases whose error ratio stays below a bound, higher is better; from "
         f"`lensmodel bench blind`, half {fig['settings']['half']}, "
-        f"patches of {fig['settings']['patch']} pixels, "
-        f"judged by {fig['settings']['judge']}."
+        f"patches of {fig['settings']['patch']} pixels."
     )
     rows = [
         [

@@ -20,7 +20,7 @@ class EpllDeconvolver:
     """Expected patch log likelihood [1]_ of a whole plane, with the mixture of the benchmark.
 
     `PatchMixture.restored` on a canvas that reaches beyond the frame, the plane scaled as the photographs
-    were that the mixture was fitted to. The judge `lab.blind.judges.Epll` takes a patch in their own light,
+    were that the mixture was fitted to. The judge `lab.blind.judge` takes a patch in their own light,
     padded by mirror images. Slow: minutes per megapixel.
 
     References

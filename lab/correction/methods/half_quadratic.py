@@ -21,13 +21,12 @@ def half_quadratic(
     on_step: StepHook = ignore_step,
     *,
     curvature: NDArray[np.floating[Any]] | float = 1.0,
-    floor: float = 0.0,
 ) -> NDArray[Any]:
     """Alternate between the prior's answer to the latest x and the data, for growing coupling beta.
 
     ::
 
-        X = (data + beta T(x)) / (power + beta C + floor)
+        X = (data + beta T(x)) / (power + beta C)
 
     Returns
     -------
@@ -36,7 +35,7 @@ def half_quadratic(
     """
     x = y
     for turn, beta in enumerate(couplings):
-        spectrum = (data + beta * target(x, turn)) / (power + beta * curvature + floor)
+        spectrum = (data + beta * target(x, turn)) / (power + beta * curvature)
         x = fft.irfft2(spectrum, s=y.shape).astype(y.dtype, copy=False)
         on_step(turn + 1, len(couplings))
     return x

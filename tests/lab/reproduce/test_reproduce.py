@@ -488,7 +488,7 @@ def test_fig1_comes_from_a_stored_benchmark(tmp_path: Path) -> None:
     bench.mkdir()
     assert collected(bench, tmp_path) is None
     row = {"method": "default", "noise": 0.01, "cases": 4, "improved": 0.5, "er_lt_3": 0.25}
-    settings = {"noise": [0.01], "half": "test", "patch": 128, "variant": "bayer", "judge": "epll", "seed": 0}
+    settings = {"noise": [0.01], "half": "test", "patch": 128, "variant": "bayer", "seed": 0}
     stored = {"settings": settings, "summary": [{**row, "er_median": 3.0, "rel_l2": 0.4}]}
     (bench / "blind.json").write_text(json.dumps(stored))
     Image.new("L", (4, 4)).save(bench / "blind-er-1percent.png")

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -48,7 +48,7 @@ _UNSURE: Final = 0.4  # sides that may differ by more, error and all, are not ca
 _CHANCE: Final = 0.01
 _WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
 _Array = NDArray[np.float64]
-_Fit = Callable[[NDArray[np.intp]], _Array]
+_Fit = Callable[[NDArray[np.bool_]], _Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +91,16 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
     h = np.stack([r * np.cos(phi), r * np.sin(phi)], axis=1)  # (right, up)
     widths = [math.sqrt(float(np.trace(second_moments(s.kernel, _WING))) / 2) for s in samples]
     photos = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    weight = np.sqrt(np.array([s.weight for s in samples]))
+    root = np.sqrt(np.array([s.weight for s in samples]))[:, None]
     slope = np.concatenate([h, np.stack([r ** (2 * k) for k in range(3)], axis=1)], axis=1)
-    log_w = np.log(np.maximum(widths, 1e-3))
-    softer = _asymmetry(lambda rows: _solved(slope[rows], log_w[rows], weight[rows]), photos, 2.0 * EDGE_R)
+    softer = _asymmetry((root * slope)[:, None], root * np.log(np.maximum(widths, 1e-3))[:, None], photos)
+    softer = replace(softer, amount=2.0 * EDGE_R * softer.amount, error=2.0 * EDGE_R * softer.error)
     coma = None
     inner = np.flatnonzero(r < _MIDDLE_R)
     if len(inner) >= _FEWEST // 2:
         third = np.array([_third_moment(samples[i]) for i in inner])
-        coma = _asymmetry(_constant(h[inner], third, weight[inner]), photos[inner], 1.0)
+        constant = np.concatenate([np.broadcast_to(np.eye(2), (len(inner), 2, 2)), h[inner, :, None]], axis=2)
+        coma = _asymmetry(root[inner, :, None] * constant, root[inner] * third, photos[inner])
     return _verdict(softer, coma, int(photos.max()) + 1)
 
 
@@ -118,23 +119,6 @@ def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
     return [sample for sample in model.samples if near(sample)]
 
 
-def _constant(h: _Array, value: _Array, weight: _Array) -> _Fit:
-    """Fit of the vector value = m0 + k h to some rows; returns m0 first."""
-
-    def fit(rows: NDArray[np.intp]) -> _Array:
-        one, none = np.ones(len(rows)), np.zeros(len(rows))
-        right, up = (np.stack(c, axis=1) for c in ((one, none, h[rows, 0]), (none, one, h[rows, 1])))
-        both = np.concatenate([value[rows, 0], value[rows, 1]])
-        return _solved(np.concatenate([right, up]), both, np.tile(weight[rows], 2))
-
-    return fit
-
-
-def _solved(design: _Array, value: _Array, weight: _Array) -> _Array:
-    """Weighted least squares; the first two unknowns are the vector that is asked for."""
-    return np.asarray(np.linalg.lstsq(design * weight[:, None], value * weight, rcond=None)[0])[:2]
-
-
 def _third_moment(sample: PsfSample) -> _Array:
     """<|x|^2 x> / w^3 as (right, up), about the centre of mass, wings below a hundredth cut."""
     kernel = np.where(sample.kernel > _WING * sample.kernel.max(), sample.kernel, 0.0)
@@ -147,24 +131,30 @@ def _third_moment(sample: PsfSample) -> _Array:
     return np.array([(kernel * squared * right).sum(), (kernel * squared * up).sum()]) / width**3
 
 
-def _asymmetry(fit: _Fit, groups: NDArray[np.intp], scale: float) -> Asymmetry:
-    """The fitted vector times `scale`, with the larger error of leaving out photos and samples."""
-    rows = np.arange(len(groups))
-    vector = fit(rows)
-    error, freedom = _jackknife(fit, rows)
-    if len(np.unique(groups)) > 1:
-        error, freedom = max((error, freedom), _jackknife(fit, groups))
+def _asymmetry(design: _Array, value: _Array, photos: NDArray[np.intp]) -> Asymmetry:
+    """First two unknowns of equations (sample, each, unknown), with their error.
+
+    The error is the larger of those that leaving out samples and photos show.
+    """
+
+    def fit(rows: NDArray[np.bool_]) -> _Array:
+        equations = design[rows].reshape(-1, design.shape[2])
+        return np.asarray(np.linalg.lstsq(equations, value[rows].ravel(), rcond=None)[0])[:2]
+
+    vector = fit(np.ones(len(photos), dtype=np.bool_))
+    groups = [np.arange(len(photos)), *([photos] if len(np.unique(photos)) > 1 else [])]
+    error, freedom = max(_jackknife(fit, each) for each in groups)
     length = float(np.hypot(*vector))
     # |g|^2 / (2 s^2) is distributed as F with 2 and 2 (n - 1) degrees where there is only chance
     limit = math.sqrt(2.0 * float(special.fdtri(2.0, 2.0 * max(freedom, 1), 1.0 - _CHANCE)))
     direction = math.atan2(float(vector[1]), float(vector[0]))
-    return Asymmetry(scale * length, direction, scale * error, significant=length > limit * error)
+    return Asymmetry(length, direction, error, significant=length > limit * error)
 
 
 def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
     """Standard error of a component and the degrees of freedom, leaving out one group at a time."""
     names = np.unique(groups)
-    others = np.array([fit(np.flatnonzero(groups != name)) for name in names])
+    others = np.array([fit(groups != name) for name in names])
     n = len(names)
     variance = (n - 1) / n * ((others - others.mean(axis=0)) ** 2).sum(axis=0)
     return math.sqrt(float(variance.mean())), n - 1

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
@@ -128,11 +128,6 @@ def test_a_single_place_is_that_kernel(model: LensModel) -> None:
 
     assert (one.rows, one.cols, one.positions) == (1, 1, (place,))
     assert np.hypot(*centroid(one.kernels[0].astype(np.float64))) < 2e-3
-
-
-def test_unknown_formats_are_refused_by_name(psfs: PsfGrid, tmp_path: Path) -> None:
-    with pytest.raises(UnknownMethodError, match="fits, json, npz"):
-        export(tmp_path / "psf.bmp", psfs, "bmp")
 
 
 def test_grids_too_large_for_memory_are_refused(model: LensModel) -> None:

@@ -36,9 +36,7 @@ from lensmodel.photo.values import LinearPhoto
 _DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)
 """Of planes that a converter or a camera made: what the network was trained with."""
 
-_HELD: Final = 0.999
-"""Share of its light that the array of a sample's kernel holds (chosen)."""
-
+_HELD: Final = 0.999  # share of its light that the array of a sample's kernel holds (chosen)
 _LEAST_SIDE: Final = 15  # pixels: of a sample's kernel (chosen)
 _ANYWHERE: Final = FieldPosition(0.5, 0.6)
 """Place of patches of which nobody says where they lie (chosen: between center and corner)."""

@@ -33,8 +33,7 @@ from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, delta, otf, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
-_BORDER = 3
-"""Pixels left out along the rim: fewer patches overlap there (chosen)."""
+_BORDER = 3  # pixels left out along the rim: fewer patches overlap there (chosen)
 _ERROR: Final = 0.61
 """Expected relative L2 error, of every patch alike: its mean on 24 patches of `lensmodel bench blind`."""
 
@@ -42,10 +41,8 @@ ALPHA = 4.0 / 3.0
 """Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
 
 SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
-_COMPONENTS = 10
-"""By which neighbours are found: they hold nearly all of a patch's power (chosen)."""
+_COMPONENTS = 10  # by which neighbours are found: they hold nearly all of a patch's power (chosen)
 _NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
-
 _LEAST_SIDE = 5  # pixels of a kernel on the coarsest level (chosen)
 _STRIDE = 2  # pixels from patch to patch: every pixel is in several (chosen)
 _TOLERANCE = 0.5  # by what share a match may be farther than the nearest one: exact search is slower (chosen)

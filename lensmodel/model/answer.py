@@ -15,8 +15,7 @@ from lensmodel.model.variables import Support
 
 DEFAULT: Final = "default"
 PAPER: Final = "paper"
-MODES: Final = (DEFAULT, PAPER)
-"""Ways to answer from samples, see `ModelSettings.mode`."""
+MODES: Final = (DEFAULT, PAPER)  # ways to answer from samples, see `ModelSettings.mode`
 
 AnsweredBy: TypeAlias = Literal["network", "regression", "network and regression", "paper"]
 """What made an answer."""

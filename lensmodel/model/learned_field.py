@@ -26,8 +26,7 @@ from lensmodel.model import variables as va
 from lensmodel.model.answer import Part
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
 
-NEAREST: Final = 256
-"""Samples that a question attends to (chosen: the patches of three photos)."""
+NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 
 _CANDIDATES: Final = 4 * NEAREST
 """Nearest samples among which the photos share (chosen: a dozen photos at one place)."""

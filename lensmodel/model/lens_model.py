@@ -24,8 +24,7 @@ from lensmodel.model.variables import VARIABLES
 _LEAST_ERROR: Final = 0.01
 """Relative L2 below which no part of an answer is believed (chosen): it would silence the others."""
 
-_LISTED: Final = 1e-3
-"""Share of the weight from which on a photo is counted: less shows in no digit (chosen)."""
+_LISTED: Final = 1e-3  # share of the weight from which on a photo is counted: less shows in no digit (chosen)
 
 _ZONE_RADII: Final[dict[Zone, tuple[float, ...]]] = {
     "center": (0.1, 0.25),

@@ -33,8 +33,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample, resized
 from lensmodel.model.widths import WidthField
 
-FINER = 2
-"""Coefficients for each pixel along an axis; 1 where memory is short."""
+FINER = 2  # coefficients for each pixel along an axis; 1 where memory is short
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 
 # Degrees: near the band limit where light is smooth, short where it is narrow (chosen)
@@ -43,7 +42,6 @@ _ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
 _MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
 _LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
 _REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
-
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
 _STEPS = 6
 """Of centring at most: each lowers what is left many times over, and it ends when little is (chosen)."""

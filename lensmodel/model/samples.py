@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 
-_INFINITY: Final = "infinity"
-"""A focus distance for which JSON has no number."""
+_INFINITY: Final = "infinity"  # a focus distance for which JSON has no number
 
 
 @dataclass(frozen=True, slots=True, eq=False)

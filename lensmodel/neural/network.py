@@ -44,8 +44,7 @@ from lensmodel.neural.symmetry import from_octant_image, octant_of
 
 Array = NDArray[np.float32]
 
-FINE: Final = 33
-"""Pixels: side of the part of a kernel that is told pixel by pixel."""
+FINE: Final = 33  # pixels: side of the part of a kernel that is told pixel by pixel
 COARSE: Final = 25
 BLOCK: Final = 3
 SIDE: Final = COARSE * BLOCK
@@ -53,8 +52,7 @@ SIDE: Final = COARSE * BLOCK
 RINGS: Final = 8
 """Rings of frequency, 1/16 cycles/pixel wide, for which the error of the transfer function is told."""
 
-WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"
-"""The weights of the package."""
+WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"  # the weights of the package
 _CLAMP: Final = 6.0  # standard deviations that a statistic may lie off the population's mean
 _LAYER_EPSILON: Final = 1e-5
 

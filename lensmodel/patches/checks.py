@@ -249,8 +249,7 @@ LEAST_PATCHES: Final = 6
 LEAST_PARTS: Final = 3
 """Parts of the picture that they lie in: three places off one line determine a plane over the field."""
 
-PARTS: Final = 9
-"""The center, the four quarters of the picture around it, and the outer end of each."""
+PARTS: Final = 9  # the center, the four quarters of the picture around it, and the outer end of each
 
 
 def part_of(position: FieldPosition) -> int:

@@ -15,9 +15,7 @@ from lensmodel.core.types import Plane
 SMOOTHING_PX: Final = 1.0
 """Standard deviation of the Gaussian that precedes every gradient: noise would enter r's denominator."""
 
-FLAT_CONSTANT: Final = 0.5
-"""Suppresses flat regions, for intensities of 0..1 and a window of 25 px."""
-
+FLAT_CONSTANT: Final = 0.5  # suppresses flat regions, for intensities of 0..1 and a window of 25 px
 FLAT_WINDOW: Final = 25  # pixels: the window for which Xu and Jia's 0.5 was chosen, see `FLAT_CONSTANT`
 
 R_BINS: Final = 16

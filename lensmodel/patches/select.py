@@ -32,8 +32,7 @@ from lensmodel.patches.windows import (
 logger = logging.getLogger(__name__)
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
-CLIPPED_LIMIT: Final = 0.005
-"""Share of a window's pixels (chosen): a few specular points do little harm."""
+CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen): a few specular points do little harm
 BLOB_LIMIT: Final = 20
 """Connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)."""
 DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
@@ -48,8 +47,7 @@ PERIOD_LIMIT: Final = 0.8
 """See `Details.period`: a repetition is as alike as that, other scenes seldom (chosen)."""
 BLOCKINESS_LIMIT: Final = 1.8
 """See `Details.blockiness`, 1 without any: chance gives a little more, and twice is plain to see (chosen)."""
-JPEG_WEIGHT: Final = 0.3
-"""JPEG files were sharpened and gamma-coded: their patches count for less."""
+JPEG_WEIGHT: Final = 0.3  # JPEG files were sharpened and gamma-coded: their patches count for less
 EVIDENCE_FLOOR: Final = 0.25
 """Bits a frequency from 0.1 to 0.4 cycles/pixel: signal as strong as noise over a quarter of them."""
 SHORTLIST_A_SECTOR: Final = 8

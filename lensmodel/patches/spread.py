@@ -25,12 +25,10 @@ RINGS: Final = 8  # of equal width in r: as many as are needed to follow blur al
 OCTANTS: Final = 8  # eighths of a turn, by definition
 PATCHES_A_CELL: Final = 3
 """Of all asked for, on average: more leave places without any, one alone is a poor estimate (chosen)."""
-MOST_A_CELL: Final = 4
-"""Pooling the normal equations of four patches is worth most of what twelve give."""
+MOST_A_CELL: Final = 4  # pooling the normal equations of four patches is worth most of what twelve give
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
 CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre, where blur changes less (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
-
 SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
 MOST_STEPS: Final = 4
 """Distances to the nearest seed count in window sides up to this; beyond, the better one wins (chosen)."""

@@ -31,8 +31,7 @@ Reason: TypeAlias = Literal[
 ]
 """Why a window was not taken; `duplicate` means that a better one lies too near or the quota is full."""
 
-MAX_REJECTIONS: Final = 2000
-"""A photo has ten thousand windows; a report needs no more than this."""
+MAX_REJECTIONS: Final = 2000  # a photo has ten thousand windows; a report needs no more than this
 
 
 @dataclass(frozen=True, slots=True)

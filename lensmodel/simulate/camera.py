@@ -160,9 +160,7 @@ def photograph(
     )
 
 
-DEFAULT_STEP: Final = 0.1
-"""Distance in half diagonals of the nodes where kernels are exact."""
-
+DEFAULT_STEP: Final = 0.1  # distance in half diagonals of the nodes where kernels are exact
 _REFINED: Final = 2  # nodes of the windows per exact node
 
 

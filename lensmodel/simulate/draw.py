@@ -52,8 +52,7 @@ _UNUSUAL: Final[Mapping[str, Mapping[str, float | _Range]]] = {
 _PRIME_MM: Final = (24.0, 35.0, 50.0, 85.0)
 _ZOOM_MM: Final = ((18.0, 24.0, 28.0), (70.0, 85.0, 105.0))
 
-LENS_KINDS: Final = tuple(_BLUR)
-"""Kinds of lenses that `draw_lens` knows."""
+LENS_KINDS: Final = tuple(_BLUR)  # kinds of lenses that `draw_lens` knows
 
 
 def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:

@@ -49,7 +49,6 @@ from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, 
 
 DEFAULT_PITCH_UM: Final = 4.5  # micrometres: a full-frame sensor of 42 megapixels
 DEFAULT_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
-
 _BAND_UM: Final = 0.035  # half the distance between the outer wavelengths of one colour channel
 
 
@@ -228,9 +227,7 @@ def _kernel(
     return lens.kernel(position, settings, size, pitch_um=pitch_um)
 
 
-REFERENCE_UM: Final = 0.54
-"""Wavelength in micrometres in which wavefront errors are counted."""
-
+REFERENCE_UM: Final = 0.54  # wavelength in micrometres in which wavefront errors are counted
 _MIN_SAMPLES: Final = 96  # across the pupil, to draw its edge well
 _MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
 _WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
@@ -350,8 +347,7 @@ def pixel_otf(
     return PixelOtf(otf, period)
 
 
-SMALLEST_F: Final = 32.0
-"""Largest f-number that any simulated lens can be set to."""
+SMALLEST_F: Final = 32.0  # largest f-number that any simulated lens can be set to
 
 
 @dataclass(frozen=True, slots=True)

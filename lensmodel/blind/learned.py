@@ -27,7 +27,7 @@ from lensmodel.core.types import (
     StepHook,
     ignore_step,
 )
-from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
+from lensmodel.neural import Conditions, FieldNetwork
 from lensmodel.neural.statistics import WINDOW, patch_statistics, to_octant
 from lensmodel.patches.spread import spread_evenly
 from lensmodel.patches.windows import Patch, Selection
@@ -81,7 +81,9 @@ class LearnedEstimator:
         samples = []
         for patch, own, token, place in zip(patches, statistics, tokens, xy, strict=True):
             encoded = EncodedPatch(own, token, kind)
-            answer = _alone(network, token, place, conditions)
+            # what the network says of the place of a patch from that patch alone
+            alone = network.memory(token[None].astype(np.float32), place[None], [conditions])
+            answer = network.query(alone, place, conditions)
             side = _side(answer.kernels, size)
             for channel, kernel, error in zip(CHANNELS, answer.kernels, answer.error, strict=True):
                 samples.append(
@@ -127,14 +129,6 @@ class LearnedEstimator:
         answer = network.query(memory, xy[0], conditions)
         on_step(1, 1)
         return finished(answer.kernels[1], size=size, error=float(answer.error[1]), diagnostics={})
-
-
-def _alone(
-    network: FieldNetwork, token: NDArray[np.float16], place: NDArray[np.float64], conditions: Conditions
-) -> FieldAnswer:
-    """What the network says of the place of a patch from that patch alone."""
-    memory = network.memory(token[None].astype(np.float32), place[None], [conditions])
-    return network.query(memory, place, conditions)
 
 
 def _kind_of(developed: LinearPhoto) -> PatchKind:

@@ -143,7 +143,7 @@ class Regression:
         near = self.neighbourhood.near([position], settings)
         support = va.Support.of(self.where[near.rows], va.in_units(position, settings))
         return Part(
-            self._kernels(near, [position], settings, size, pitch_um)[0],
+            self.kernels([position], settings, size, pitch_um)[0],
             self._error(near, support),
             near.weights,
             self.photos[near.rows],
@@ -154,18 +154,7 @@ class Regression:
         self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
     ) -> NDArray[np.float64]:
         """Return the kernels of many places, shape (q, size, size)."""
-        return self._kernels(
-            self.neighbourhood.near(positions, settings), positions, settings, size, pitch_um
-        )
-
-    def _kernels(
-        self,
-        near: Answers,
-        positions: Sequence[FieldPosition],
-        settings: LensSettings,
-        size: int,
-        pitch_um: float | None,
-    ) -> NDArray[np.float64]:
+        near = self.neighbourhood.near(positions, settings)
         widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
         own = self.pitch_um

@@ -106,9 +106,10 @@ class FieldNetwork:
     name: str  # fingerprint of the weights
 
     @classmethod
+    @cache
     def load(cls) -> FieldNetwork:
         """Return the network with the weights of the package; read once a process."""
-        return _packaged()
+        return cls.from_bytes(WEIGHTS.read_bytes())
 
     @classmethod
     def from_bytes(cls, data: bytes) -> FieldNetwork:
@@ -253,8 +254,3 @@ def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
         part = np.clip(np.abs(shift), 0.0, 1.0)
         moving = (1 - part) * moving + part * moved
     return moving
-
-
-@cache
-def _packaged() -> FieldNetwork:
-    return FieldNetwork.from_bytes(WEIGHTS.read_bytes())

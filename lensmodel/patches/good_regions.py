@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -97,8 +97,9 @@ class TreeEnsemble:
     value: NDArray[np.float32]  # (trees, nodes), what a leaf adds, the learning rate included
 
     @classmethod
+    @cache
     def load(cls, path: Path = MODEL) -> TreeEnsemble:
-        """Read arrays of these names from an .npz file; nothing is unpickled."""
+        """Read arrays of these names from an .npz file, once a process; nothing is unpickled."""
         with np.load(path, allow_pickle=False) as stored:
             parts = {name: stored[name] for name in ("feature", "threshold", "left", "right", "value")}
             return cls(start=float(stored["start"]), **parts)
@@ -124,11 +125,6 @@ class TreeEnsemble:
             node = np.where(goes_left, self.left[trees, node], self.right[trees, node]).astype(np.intp)
 
 
-@lru_cache(maxsize=1)
-def _model() -> TreeEnsemble:
-    return TreeEnsemble.load()
-
-
 @dataclass(frozen=True, slots=True)
 class GoodRegionsSelector:
     """Predicts from the window's features how similar an estimated kernel will be to the truth.
@@ -141,4 +137,4 @@ class GoodRegionsSelector:
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
         """Return one score a window; see `Selector`."""
-        return np.clip(1.0 - np.exp(_model().predict(features_of(windows, looked))), 0.0, 1.0)
+        return np.clip(1.0 - np.exp(TreeEnsemble.load().predict(features_of(windows, looked))), 0.0, 1.0)

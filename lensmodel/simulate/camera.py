@@ -82,22 +82,6 @@ class SimulatedCamera:
             shot=1.0 / self.full_well_electrons, read=read + 1.0 / (12.0 * (self.white - self.black) ** 2)
         )
 
-    @property
-    def as_shot_neutral(self) -> tuple[float, float, float]:
-        """What the sensor sees of a grey scene, as DNG wants it."""
-        r, g, b = self.white_balance
-        return 1.0 / r, 1.0 / g, 1.0 / b
-
-    @property
-    def color_matrix(self) -> NDArray[np.float64]:
-        """CIE XYZ (D65) to sensor colours: scenes are linear sRGB, the sensor sees them unbalanced."""
-        return np.asarray(XYZ_TO_SRGB) / np.asarray(self.white_balance)[:, None]
-
-    def channel_map(self) -> NDArray[np.intp]:
-        """Index into r, g, b of the colour filter over every pixel, `(height, width)`."""
-        pattern = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
-        return np.tile(pattern, (self.height // 2, self.width // 2))
-
     def balanced(self, planes: Planes) -> Planes:
         """What the sensor sees of a scene: each channel over its white balance multiplier."""
         gains = np.asarray(self.white_balance, dtype=np.float32)[:, None, None]
@@ -108,7 +92,9 @@ class SimulatedCamera:
         expected = (len(CHANNELS), self.height, self.width)
         if planes.shape != expected:
             raise InvalidInputError(f"planes must have the camera's shape {expected}, got {planes.shape}")
-        level: NDArray[np.floating] = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
+        pattern = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
+        filters = np.tile(pattern, (self.height // 2, self.width // 2))
+        level: NDArray[np.floating] = np.take_along_axis(planes, filters[None], axis=0)[0]
         if rng is not None:
             electrons = rng.poisson(np.maximum(level, 0.0) * self.full_well_electrons).astype(np.float64)
             electrons += rng.normal(0.0, self.read_noise, level.shape)
@@ -306,6 +292,7 @@ _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100
 def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
     """Write the mosaic of a simulated photo as DNG."""
     camera, lens, settings = photo.camera, photo.lens, photo.settings
+    r, g, b = camera.white_balance
     metadata = PhotoMetadata(
         camera_maker=camera.maker,
         camera_model=camera.model,
@@ -324,7 +311,8 @@ def write_photo(path: str | Path, photo: SimulatedPhoto) -> None:
         black=camera.black,
         white=camera.white,
         pattern=camera.pattern,
-        color_matrix=camera.color_matrix,
-        as_shot_neutral=camera.as_shot_neutral,
+        # scenes are linear sRGB, the sensor sees them unbalanced
+        color_matrix=np.asarray(XYZ_TO_SRGB) / np.asarray(camera.white_balance)[:, None],
+        as_shot_neutral=(1.0 / r, 1.0 / g, 1.0 / b),
         metadata=metadata,
     )

@@ -83,104 +83,61 @@ def _ring_means(spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
     return (np.bincount(_BIN[_INSIDE], power[_INSIDE]) / _COUNT).astype(np.float32)
 
 
-@jit
 def _green_everywhere(mosaic: Plane, colours: NDArray[np.int8]) -> Plane:
     """Green at every pixel but those of the border: its sample, else the mean of green neighbours."""
-    rows, cols = mosaic.shape
-    green = np.zeros((rows, cols), np.float32)
-    for i in range(1, rows - 1):
-        for j in range(1, cols - 1):
-            if colours[i, j] == 1:
-                green[i, j] = mosaic[i, j]
-                continue
-            total, count = np.float32(0), 0
-            for di, dj in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-                if colours[i + di, j + dj] == 1:
-                    total += mosaic[i + di, j + dj]
-                    count += 1
-            green[i, j] = total / max(count, 1)
+    mask = (colours == 1).astype(np.float32)
+    total, count = (
+        part[:-2, 1:-1] + part[2:, 1:-1] + part[1:-1, :-2] + part[1:-1, 2:] for part in (mosaic * mask, mask)
+    )
+    green = np.zeros_like(mosaic)
+    green[1:-1, 1:-1] = np.where(mask[1:-1, 1:-1] > 0, mosaic[1:-1, 1:-1], total / np.maximum(count, 1.0))
     return green
 
 
 @jit
-def _edge_correlations(
-    green: Plane, cosines: NDArray[np.float32], sines: NDArray[np.float32],
-    dx: NDArray[np.int64], dy: NDArray[np.int64],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+def _correlated(g: Plane, margin: int, right: int, up: int) -> tuple[float, float, float]:
+    """Sums of |g|^p s g(x + d), p = 1, 3, 7, over pixels farther than `margin` from the rim; see below."""
+    a, b, e = np.float64(0), np.float64(0), np.float64(0)
+    for i in range(margin, g.shape[0] - margin):
+        ra, rb, re = np.float32(0), np.float32(0), np.float32(0)
+        for j in range(margin, g.shape[1] - margin):
+            u, v = g[i, j], g[i - up, j + right]
+            square = u * u
+            ra += abs(u) * abs(v)
+            rb += square * u * v
+            re += square * square * square * u * v
+        a += ra
+        b += rb
+        e += re
+    return a, b, e
+
+
+def _edge_correlations(green: Plane) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Correlations (direction, shift, power, side) and kurtoses (direction, 3) of the gradient of green.
 
     c_p(d) = <|g|^p s g(x + d)> / <|g|^(p+1)> with s the sign of g: p = 1 of magnitudes, 3 and 7 signed; the
     gradient g is across edges of one direction, by Sobel differences; rows grow downwards, y upwards.
     """
-    rows, cols = green.shape
-    reach = 13
-    directions, shifts = cosines.size, dx.shape[1]
-    gx = np.zeros((rows, cols), np.float32)
-    gy = np.zeros((rows, cols), np.float32)
-    for i in range(2, rows - 2):
-        for j in range(2, cols - 2):
-            gx[i, j] = (
-                0.5 * (green[i, j + 1] - green[i, j - 1])
-                + 0.25 * (green[i - 1, j + 1] - green[i - 1, j - 1])
-                + 0.25 * (green[i + 1, j + 1] - green[i + 1, j - 1])
-            )
-            gy[i, j] = (
-                0.5 * (green[i - 1, j] - green[i + 1, j])
-                + 0.25 * (green[i - 1, j - 1] - green[i + 1, j - 1])
-                + 0.25 * (green[i - 1, j + 1] - green[i + 1, j + 1])
-            )
-    low, high_row, high_col = reach + 2, rows - reach - 2, cols - reach - 2
-    out = np.zeros((directions, shifts, 3, 2), np.float32)
-    kurtosis = np.zeros((directions, 3), np.float32)
-    g = np.zeros((rows, cols), np.float32)
-    third = np.zeros((rows, cols), np.float32)
-    seventh = np.zeros((rows, cols), np.float32)
-    for k in range(directions):
-        c, s = cosines[k], sines[k]
-        m1, m2, m4, m8 = np.float64(0), np.float64(0), np.float64(0), np.float64(0)
-        for i in range(2, rows - 2):
-            for j in range(2, cols - 2):
-                g[i, j] = c * gx[i, j] + s * gy[i, j]
-        largest = np.float32(1e-9)
-        for i in range(low, high_row):
-            for j in range(low, high_col):
-                largest = max(largest, abs(g[i, j]))
-        for i in range(2, rows - 2):
-            for j in range(2, cols - 2):
-                g[i, j] /= largest
-        for i in range(low, high_row):
-            for j in range(low, high_col):
-                v = g[i, j]
-                v2 = v * v
-                third[i, j] = v2 * v
-                seventh[i, j] = v2 * v2 * v2 * v
-                m1 += abs(v)
-                m2 += v2
-                m4 += v2 * v2
-                m8 += v2 * v2 * v2 * v2
-        count = (high_row - low) * (high_col - low)
-        m2, m4, m8 = m2 + 1e-12, m4 + 1e-12, m8 + 1e-12
-        kurtosis[k, 0] = np.log(m4 * count / (m2 * m2))
-        kurtosis[k, 1] = np.log(m2 * count / (m1 * m1 + 1e-12))
-        kurtosis[k, 2] = np.log(m8 * count / (m4 * m4))
-        for d in range(shifts):
-            for side in range(2):
-                sign = 1 - 2 * side
-                right, up = sign * dx[k, d], sign * dy[k, d]
-                a, b, e = np.float64(0), np.float64(0), np.float64(0)
-                for i in range(low, high_row):
-                    ra, rb, re = np.float32(0), np.float32(0), np.float32(0)
-                    for j in range(low, high_col):
-                        v = g[i - up, j + right]
-                        ra += abs(g[i, j]) * abs(v)
-                        rb += third[i, j] * v
-                        re += seventh[i, j] * v
-                    a += ra
-                    b += rb
-                    e += re
-                out[k, d, 0, side] = a / m2
-                out[k, d, 1, side] = b / m4
-                out[k, d, 2, side] = e / m8
+    across, upwards = 0.5 * (green[:, 2:] - green[:, :-2]), 0.5 * (green[:-2] - green[2:])
+    gx = (across[1:-1] + 0.5 * (across[:-2] + across[2:]))[1:-1, 1:-1]  # green is not known along the border
+    gy = (upwards[:, 1:-1] + 0.5 * (upwards[:, :-2] + upwards[:, 2:]))[1:-1, 1:-1]
+    margin = _SHIFTS[-1]
+    out = np.zeros((_HALF, len(_SHIFTS), _POWERS, 2), np.float32)
+    kurtosis = np.zeros((_HALF, 3), np.float32)
+    for k in range(_HALF):
+        g = _COSINES[k] * gx + _SINES[k] * gy
+        inner = g[margin:-margin, margin:-margin]
+        scale = max(np.abs(inner).max(), np.float32(1e-9))
+        g, inner = g / scale, inner / scale
+        square = inner * inner
+        m1, m2 = np.abs(inner).sum(dtype=np.float64), square.sum(dtype=np.float64) + 1e-12
+        m4, m8 = (np.square(square**n).sum(dtype=np.float64) + 1e-12 for n in (1, 2))
+        moments = m4 / (m2 * m2), m2 / (m1 * m1 + 1e-12), m8 / (m4 * m4)
+        kurtosis[k] = np.log(np.multiply(moments, inner.size))
+        for d in range(len(_SHIFTS)):
+            for side, sign in enumerate((1, -1)):
+                sums = _correlated(g, margin, sign * _DX[k, d], sign * _DY[k, d])
+                out[k, d, :, side] = np.divide(sums, (m2, m4, m8))
     return out, kurtosis
 
 
@@ -224,7 +181,7 @@ def patch_statistics(
         low = float(np.log(power[: _LOW_RINGS * _HALF].mean()))
         powers.append(log_power[: rings * _HALF] - low)
         level += [np.log(noise) - low, 0.5 * low - np.log(max(mean, 0.0) + 1e-3) - 3.0]
-    sides, kurtosis = _edge_correlations(_green_everywhere(mosaic, colours), _COSINES, _SINES, _DX, _DY)
+    sides, kurtosis = _edge_correlations(_green_everywhere(mosaic, colours))
     even, odd = 0.5 * (sides[..., 0] + sides[..., 1]), sides[..., 0] - sides[..., 1]
     edges = [even[..., 0], even[..., 1], odd[..., 1], even[..., 2], odd[..., 2], kurtosis]
     return np.concatenate([*powers, *(edge.T.ravel() for edge in edges), np.array(level)]).astype(np.float32)

@@ -40,6 +40,7 @@ _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 _SMOOTH, _NARROW = 7, 3
 _ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
 _MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
+_RIM = 3  # coefficients around the grid, zeros: so far out a spline is not zero yet
 _LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
 _REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
@@ -68,7 +69,7 @@ class LocalKernels:
     """Splines of the samples with the frames that they belong to."""
 
     side: int  # odd side of the stored kernels
-    splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1)^2), coefficients
+    splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1 + 2 rims)^2), coefficients
     # (n,), phi of the places in radians; radius of the light in steps of the grid
     angles: NDArray[np.float64]
     radii: NDArray[np.float64]
@@ -80,12 +81,12 @@ class LocalKernels:
         """Keep samples at points `where` (n, 7)."""
         side = max(s.kernel.shape[0] for s in samples)
         finer = FINER if 4 * (FINER * (side - 1) + 1) ** 2 * len(samples) <= _MOST_BYTES else 1
-        stored = np.empty((len(samples), (finer * (side - 1) + 1) ** 2), dtype=np.float32)
+        stored = np.empty((len(samples), (finer * (side - 1) + 1 + 2 * _RIM) ** 2), dtype=np.float32)
         radii = np.empty(len(samples))
         for i, sample in enumerate(samples):
             spline = coefficients(resized(sample.kernel, side), finer)
             lit = np.argwhere(np.abs(spline) > _LIGHT * np.abs(spline).max()) - spline.shape[0] // 2
-            stored[i], radii[i] = spline.ravel(), np.hypot(*lit.T).max() + _REACH
+            stored[i], radii[i] = np.pad(spline, _RIM).ravel(), np.hypot(*lit.T).max() + _REACH
         angles = np.array([s.position.phi for s in samples])
         return cls(side, stored, angles, radii, field.over(where), finer)
 

@@ -35,8 +35,10 @@ def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.floa
 
 
 @jit
-def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
-    """Value of a spline at (y, x), at least two steps inside its grid."""
+def _value(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x); 0 where not all of its coefficients lie on the grid."""
+    if not (1.0 <= y < side - 2 and 1.0 <= x < side - 2):
+        return np.float32(0.0)
     row, col = int(y), int(x)
     v0, v1, v2, v3 = _weights(np.float32(y - row))
     h0, h1, h2, h3 = _weights(np.float32(x - col))
@@ -48,19 +50,6 @@ def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.flo
         + v2 * (h0 * spline[r] + h1 * spline[r + 1] + h2 * spline[r + 2] + h3 * spline[r + 3])
         + v3 * (h0 * spline[o] + h1 * spline[o + 1] + h2 * spline[o + 2] + h3 * spline[o + 3])
     )
-
-
-@jit
-def _anywhere(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
-    """Value of a spline at (y, x), zero coefficients around its grid."""
-    row, col = math.floor(y), math.floor(x)
-    total = np.float32(0.0)
-    for i, v in enumerate(_weights(np.float32(y - row))):
-        for j, h in enumerate(_weights(np.float32(x - col))):
-            line, place = row - 1 + i, col - 1 + j
-            if 0 <= line < side and 0 <= place < side:
-                total += v * h * spline[line * side + place]
-    return total
 
 
 @jit
@@ -87,7 +76,6 @@ def sums(
         for k in range(starts[answer], starts[answer + 1]):
             row, weight = chosen[k], weights[k]
             spline, reach = rows[row], radii[row]
-            inner = reach < half - 2.0
             dy, dx = maps[k, 0, 1], maps[k, 1, 1]
             for i in range(size):
                 down = i - middle - shifts[answer, 0]
@@ -95,9 +83,5 @@ def sums(
                 x = maps[k, 1, 0] * down + dx * left
                 first, last = _inside(dy * dy + dx * dx, y * dy + x * dx, y * y + x * x - reach * reach, size)
                 y, x = y + half, x + half
-                if inner:
-                    for j in range(first, last):
-                        out[answer, i, j] += weight * _inner(spline, side, y + j * dy, x + j * dx)
-                else:
-                    for j in range(first, last):
-                        out[answer, i, j] += weight * _anywhere(spline, side, y + j * dy, x + j * dx)
+                for j in range(first, last):
+                    out[answer, i, j] += weight * _value(spline, side, y + j * dy, x + j * dx)

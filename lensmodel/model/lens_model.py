@@ -47,15 +47,18 @@ class LensModel:
     """
 
     def __init__(
-        self,
-        samples: tuple[PsfSample, ...],
-        settings: ModelSettings,
-        attention: LearnedField | None,
-        regression: Regression | None,
+        self, samples: tuple[PsfSample, ...], settings: ModelSettings, before: Regression | None = None
     ) -> None:
-        self.samples = samples
-        self.settings = settings
-        self._attention, self._regression = attention, regression
+        if not samples:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        encoded, kernels = _parted(samples, settings)
+        if not (encoded or kernels):
+            raise NoSamplesError(f"all photos of the {len(samples)} samples are excluded; include one again")
+        self.samples, self.settings = samples, settings
+        self._attention = LearnedField(encoded) if encoded else None
+        self._regression = before if before is not None and before.samples == kernels else None
+        if kernels and self._regression is None:
+            self._regression = Regression.of(kernels, settings)
 
     # --- building -------------------------------------------------------------------------------
 
@@ -74,27 +77,15 @@ class LensModel:
         NoSamplesError
             If there are none, or all photos are excluded.
         """
-        return cls._of(_distinct(camera_bodies.on_one_circle(samples)), settings or ModelSettings())
+        return cls(_distinct(camera_bodies.on_one_circle(samples)), settings or ModelSettings())
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples; a regression is fitted anew where these are of its kind."""
         placed = camera_bodies.on_one_circle((*self.samples, *samples))
         every = _distinct(placed, known=len(self.samples))
-        return self if len(every) == len(self.samples) else self._of(every, self.settings, self._regression)
-
-    @classmethod
-    def _of(
-        cls, samples: tuple[PsfSample, ...], settings: ModelSettings, before: Regression | None = None
-    ) -> LensModel:
-        if not samples:
-            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        encoded, kernels = _parted(samples, settings)
-        if not (encoded or kernels):
-            raise NoSamplesError(f"all photos of the {len(samples)} samples are excluded; include one again")
-        attention = LearnedField(encoded) if encoded else None
-        if before is not None and before.samples == kernels:
-            return cls(samples, settings, attention, before)
-        return cls(samples, settings, attention, Regression.of(kernels, settings) if kernels else None)
+        if len(every) == len(self.samples):
+            return self
+        return LensModel(every, self.settings, self._regression)
 
     # --- asking ---------------------------------------------------------------------------------
 

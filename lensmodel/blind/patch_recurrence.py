@@ -171,23 +171,13 @@ def window_products(
 def _of_rows(windows: NDArray[np.float32], lag: int, n: int) -> NDArray[np.float64]:
     """Sums over the n rows from t on of windows[t]' windows[t + lag], shape (side - lag, side, side)."""
     side = windows.shape[2]
-    starts = side - lag
-    if n < starts:  # no row that all sums share
-        all_rows = np.matmul(
-            windows[: n + starts - 1].transpose(0, 2, 1), windows[lag : n + starts - 1 + lag]
-        )
-        up_to = np.add.accumulate(np.pad(all_rows.astype(np.float64), ((1, 0), (0, 0), (0, 0))), axis=0)
-        return np.asarray(up_to[n:] - up_to[:-n])
-    inner = windows[starts - 1 : n].reshape(-1, side)
-    shared = inner.T @ windows[starts - 1 + lag : n + lag].reshape(-1, side)
-    tops = np.matmul(windows[: starts - 1].transpose(0, 2, 1), windows[lag : starts - 1 + lag])
-    ends = np.matmul(windows[n : n + starts - 1].transpose(0, 2, 1), windows[n + lag : n + lag + starts - 1])
-    sums = np.empty((starts, side, side))
-    sums[:] = shared
-    # From the first row of a sum on, down to the rows that all sums share; and beyond those.
-    sums[:-1] += np.add.accumulate(tops[::-1].astype(np.float64), axis=0)[::-1]
-    sums[1:] += np.add.accumulate(ends.astype(np.float64), axis=0)
-    return sums
+    more = side - lag - 1  # sums after the first, each of which a row leaves and a row enters
+    first = windows[:n].reshape(-1, side).T @ windows[lag : n + lag].reshape(-1, side)
+    leaving, entering = (
+        np.matmul(windows[t : t + more].transpose(0, 2, 1), windows[t + lag : t + lag + more]) for t in (0, n)
+    )
+    changes = entering.astype(np.float64) - leaving
+    return np.add.accumulate(np.concatenate([first[None].astype(np.float64), changes]), axis=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

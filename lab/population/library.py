@@ -20,7 +20,8 @@ from lab.population.photos import Camera, Scenes
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
-from lensmodel.neural.features import FAR_M, KINDS, Kind
+from lensmodel.core.psf import KINDS, PatchKind
+from lensmodel.neural.features import FAR_M
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import to_octant
 
@@ -132,7 +133,7 @@ def make_lens(
     stacked = np.array([kernels_of(state.lens, on_lens, state.f_number) for state in states])
     if not plain:
         stacked = behind_sensor(stacked, *draw_sensor(rng))
-    kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    kind: PatchKind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     set_so = np.array([(s.f_number, s.focal_mm, s.focus_m) for s in states], np.float32)
     return _photographed(rng, scenes, kind, xy, stacked, set_so, states[0].lens.pitch_um, plain=plain)
 
@@ -157,7 +158,7 @@ def retake(
     if rescaled:
         scale = float(np.exp(rng.uniform(*np.log(_RESCALED))))
         kernels, pitch = scaled(kernels, scale), pitch / scale
-    other: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    other: PatchKind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     xy = stored["xy"].astype(np.float64)
     states = stored["states"].astype(np.float32)
     return _photographed(
@@ -168,7 +169,7 @@ def retake(
 def _photographed(
     rng: np.random.Generator,
     scenes: Scenes,
-    kind: Kind,
+    kind: PatchKind,
     xy: NDArray[np.float64],
     stacked: NDArray[np.float32],
     states: NDArray[np.float32],

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lab.population.scenes import busiest
-from lensmodel.neural.features import Kind
+from lensmodel.core.psf import PatchKind
 from lensmodel.neural.network import FINE, SIDE
 from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
 
@@ -83,7 +83,7 @@ class Processing:
     mosaicked: bool
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, kind: Kind) -> Processing:
+    def draw(cls, rng: np.random.Generator, kind: PatchKind) -> Processing:
         """Draw what converters ("tiff") or cameras ("jpeg") do."""
         if kind == "tiff":
             return cls(
@@ -214,7 +214,7 @@ class Camera:
 
     rng: np.random.Generator
     scenes: Scenes
-    kind: Kind
+    kind: PatchKind
     xy: NDArray[np.float64]  # (places, 2)
     kernels: NDArray[np.float32]  # (states, places, 3, SIDE, SIDE), of the lens alone
     plain: bool = False  # base sensitivity, all in focus and still: what the best photos are like

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lab.population.library import FAMILIES, Family, load_shard
 from lensmodel.core.files import atomic
+from lensmodel.core.psf import KINDS
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
-from lensmodel.neural.features import KINDS
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import group
 from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image

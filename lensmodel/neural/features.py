@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import KINDS, PatchKind
 from lensmodel.core.types import LensSettings
 from lensmodel.neural.symmetry import OCTANTS, octant_of, relative_octant, to_octant_place
-
-Kind = Literal["raw", "tiff", "jpeg"]
-KINDS: Final[tuple[Kind, ...]] = ("raw", "tiff", "jpeg")
 
 FAR_M: Final = 50.0
 """Metres: focus farther away is as good as infinite: a lens of 300 mm moves less than 2 mm for it."""
@@ -52,10 +50,10 @@ class Conditions:
     pitch_um: float | None = None
     focal_mm: float | None = None
     focus_m: float | None = None
-    kind: Kind = "raw"
+    kind: PatchKind = "raw"
 
     @classmethod
-    def of(cls, settings: LensSettings, pitch_um: float | None, kind: Kind) -> Conditions:
+    def of(cls, settings: LensSettings, pitch_um: float | None, kind: PatchKind) -> Conditions:
         """Take them from settings of a lens; infinite focus is that of `FAR_M`."""
         focus_m = None if settings.focus_m is None else min(settings.focus_m, FAR_M)
         return cls(settings.aperture, pitch_um, settings.focal_mm, focus_m, kind)

@@ -11,7 +11,8 @@ from lab.population.grids import grid_of
 from lab.population.photos import Processing, Scenes, bayer, demosaic
 from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
 from lab.population.traced import draw
-from lensmodel.neural.features import FAR_M, KINDS, relation_features
+from lensmodel.core.psf import KINDS
+from lensmodel.neural.features import FAR_M, relation_features
 from lensmodel.neural.network import SIDE
 
 

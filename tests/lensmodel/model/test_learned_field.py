@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, distance, gaussian, rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, ModelSettings, learned_field, load_profile, save_profile
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.learned_field import NEAREST
 from lensmodel.neural import FieldAnswer, FieldNetwork
 
@@ -241,14 +241,3 @@ def test_a_profile_gives_the_same_answers(network: SmallNetwork, tmp_path: Path)
         a, b = before.query(place, F2, 31), after.query(place, F2, 31)
         assert np.abs(a.kernel - b.kernel).max() < 1e-6
         assert a.predicted_error == pytest.approx(b.predicted_error, rel=1e-6)
-
-
-def test_a_million_samples_are_asked_as_fast_as_some(
-    network: SmallNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What a warm question looks at does not grow: the trees are asked once for each neighbourhood."""
-    model = LensModel.fit([s for k in range(8) for s in photo(f"p{k}", k, count=96)])
-    model.query(FieldPosition(0.5, 0.3), F2)
-    monkeypatch.setattr(learned_field._Group, "nearest", None)
-
-    assert model.query(FieldPosition(0.501, 0.3), F2).photos == 8

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from itertools import accumulate
+from itertools import accumulate, zip_longest
 from pathlib import Path
 from typing import Any, Final
 
@@ -264,61 +264,43 @@ def _by_aperture(shots: Sequence[Shot]) -> list[Shot]:
     by_aperture: dict[float, list[Shot]] = {}
     # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
     for shot in sorted(shots, key=lambda shot: -round(shot.half_diagonal_mm)):
-        by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
-    ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
-    longest = max(map(len, ordered), default=0)
-    return [group[i] for i in range(longest) for group in ordered if i < len(group)]
+        by_aperture.setdefault(shot.metadata.aperture or math.inf, []).append(shot)
+    turns = zip_longest(*(by_aperture[aperture] for aperture in sorted(by_aperture)))
+    return [shot for turn in turns for shot in turn if shot is not None]
 
 
 def _bursts(shots: Sequence[Shot]) -> tuple[list[Shot], list[Shot]]:
     """Part the photos into the first of each burst, and those that follow it at the same settings."""
-    first: list[Shot] = []
-    again: list[Shot] = []
+    parts: tuple[list[Shot], list[Shot]] = [], []
     last: dict[tuple[float | None, float | None], datetime] = {}
     for shot in sorted(shots, key=lambda shot: (shot.metadata.taken_at or datetime.min, shot.path)):  # noqa: DTZ901  cameras' clocks have no zone
         said = shot.metadata
-        settings = said.aperture, said.focal_mm
-        before = last.get(settings)
-        follows = said.taken_at is not None and before is not None and said.taken_at - before <= BURST
-        (again if follows else first).append(shot)
-        if said.taken_at is not None:
-            last[settings] = said.taken_at
-    return sorted(first, key=lambda shot: shot.path), sorted(again, key=lambda shot: shot.path)
+        settings, time = (said.aperture, said.focal_mm), said.taken_at
+        follows = time is not None and settings in last and time - last[settings] <= BURST
+        parts[follows].append(shot)
+        if time is not None:
+            last[settings] = time
+    return sorted(parts[0], key=lambda shot: shot.path), sorted(parts[1], key=lambda shot: shot.path)
 
 
 def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
-    """Sort photos by body, lens and focal length."""
-    owners: dict[tuple[str, ...], list[Shot]] = {}
-    for shot in shots:
-        owners.setdefault(shot.owner, []).append(shot)
-    all_groups: list[PhotoGroup] = []
-    names: set[str] = set()
-    for owner in sorted(owners):
-        runs = _by_focal(owners[owner])
-        shared = _free(_name(runs[0][0], with_focal=False), names) if runs[0][0].names_lens else None
-        for run in runs:
-            name = shared or _free(_name(run[0], with_focal=True), names)
-            names.add(name)
-            all_groups.append(PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name))
-    return all_groups
+    """Sort photos by body, lens and focal length; lengths within `SAME_FOCAL` of the shortest are one."""
+    runs: list[tuple[str, list[Shot]]] = []
+    for shot in sorted(shots, key=lambda shot: (shot.owner, shot.metadata.focal_mm or 0.0)):
+        name, run = runs[-1] if runs else ("", [])
+        same = bool(run) and run[0].owner == shot.owner
+        if same and (shot.metadata.focal_mm or 0.0) <= (run[0].metadata.focal_mm or 0.0) * SAME_FOCAL:
+            run.append(shot)
+            continue
+        if not (same and shot.names_lens):
+            name = _free(_name(shot), {taken for taken, _ in runs})
+        runs.append((name, [shot]))
+    return [PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name) for name, run in runs]
 
 
-def _by_focal(shots: Sequence[Shot]) -> list[list[Shot]]:
-    """Cut into runs in which no focal length is more than `SAME_FOCAL` times the shortest."""
-    runs: list[list[Shot]] = []
-    start = -1.0
-    for shot in sorted(shots, key=lambda shot: shot.metadata.focal_mm or 0.0):
-        focal = shot.metadata.focal_mm or 0.0
-        if not runs or focal > start * SAME_FOCAL:
-            runs.append([])
-            start = focal
-        runs[-1].append(shot)
-    return runs
-
-
-def _name(shot: Shot, *, with_focal: bool) -> str:
+def _name(shot: Shot) -> str:
     said = shot.metadata
-    focal = f"{said.focal_mm:g}mm" if with_focal and said.focal_mm else None
+    focal = f"{said.focal_mm:g}mm" if said.focal_mm and not shot.names_lens else None
     words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], focal]
     plain = re.sub(r"[^\w.+-]+", "-", "-".join(word for word in words if word)).strip("-.")
     return plain[:MOST_IN_NAME] or "unknown-camera"

@@ -298,13 +298,6 @@ def test_a_question_outside_what_the_photos_show_warns(r: float, aperture: float
         lens.psf(r, 0.6, aperture=aperture)
 
 
-def test_a_question_that_no_photo_can_answer_warns() -> None:
-    stack = [gaussian(9, np.eye(2))] * 4
-    known = Lens.from_kernels(stack, [0.1, 0.12, 0.14, 0.16], [0.0, 0.1, 0.2, 0.3], aperture=2.0)
-    with pytest.warns(UserWarning, match="no photo shows"):
-        known.psf(0.95, 3.0, aperture=22.0, size=9)
-
-
 def test_a_lens_comes_back_from_its_file(tmp_path: Path) -> None:
     lens, _ = field_of_gaussians()
     lens.save(tmp_path / "a.lensprofile")

@@ -411,6 +411,12 @@ REFUSED = {
         2,
         "known: .*michaeli-irani",
     ),
+    "unknown selector": (
+        ["calibrate", "one.dng", "-p", "new", "--selector", "best"],
+        2,
+        "known: .*good-regions",
+    ),
+    "unknown channel": (["export", PROFILE, "-o", "new.npz", "--channel", "x"], 2, "r, g or b"),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
     "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 1, "would both"),
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),

@@ -61,12 +61,3 @@ def test_the_command_passes_its_option_on(
     )
 
     assert asked == [taken]
-
-
-def test_a_selector_that_is_not_there_is_refused_by_name(folder: Path, asked: list[object]) -> None:
-    words = ("calibrate", "holiday/one.dng", "--profile", "new.lensprofile", "--selector", "best")
-    done = command(*words, cwd=folder)
-
-    assert done.returncode == 2
-    assert "good-regions" in done.stderr
-    assert asked == []

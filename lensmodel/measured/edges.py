@@ -22,7 +22,6 @@ Source of the edge spread: ISO 12233:2017, annex D, in `quality.edge`.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,10 +33,10 @@ from numpy.typing import NDArray
 from scipy import fft, optimize
 from scipy.sparse.csgraph import connected_components
 
-from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require
 from lensmodel.measured.solve import even_variance, measured_pixels, on_simplex
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality.edge import OVERSAMPLING, EdgeResponse, crossing, edge_area, slanted_edge
@@ -88,20 +87,13 @@ class SlantedEdges:
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
         """Measure a PSF at every square of which two edges and their corner are seen; see `Measurer`."""
-        require_photos(self, photos)
-        squares = squares_of(chart_edges(photos[0]))
-        measured_psfs = []
-        for done, square in enumerate(squares, start=1):
-            for channel in channels:
-                with contextlib.suppress(LensModelError):
-                    measured_psfs.append(_square_psf(photos[0], channel, square, size))
-            on_step(done, len(squares))
-        if not measured_psfs:
-            raise NotEnoughEvidenceError(
-                "no square could be measured, which takes two of its edges and the corner between them; "
-                "photograph dark squares or a checkerboard, in focus and unclipped"
-            )
-        return measured_psfs
+        require(self, photos, size)
+        return at_each(
+            squares_of(chart_edges(photos[0])), channels,
+            lambda square, channel: _square_psf(photos[0], channel, square, size), on_step,
+            none="no square could be measured, which takes two of its edges and the corner between them; "
+            "photograph dark squares or a checkerboard, in focus and unclipped",
+        )  # fmt: skip
 
 
 def chart_edges(photo: LinearPhoto) -> tuple[FoundEdge, ...]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, TypeVar
 
-from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto
 
+_Place = TypeVar("_Place")
 PREFIX = "measured-"  # How the names of measuring estimators begin: blind ones never do
 
 
@@ -111,10 +113,39 @@ def is_measured(sample: PsfSample) -> bool:
     return sample.estimator.startswith(PREFIX)
 
 
-def require_photos(method: Measurer, photos: Sequence[LinearPhoto]) -> None:
-    """Refuse a wrong number of photos."""
+def require(method: Measurer, photos: Sequence[LinearPhoto], size: int) -> None:
+    """Refuse a wrong number of photos, and sides that no kernel has."""
     if len(photos) != method.photos:
         raise InvalidInputError(
             f"measuring by {method.name} takes {method.photos} photo{'s' * (method.photos > 1)} at a time, "
             f"got {len(photos)}"
         )
+    if size < 3 or size % 2 == 0:
+        raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
+
+
+def at_each(
+    places: Sequence[_Place],
+    channels: Sequence[Channel],
+    measured_at: Callable[[_Place, Channel], MeasuredPsf],
+    on_step: StepHook,
+    *,
+    none: str,
+) -> list[MeasuredPsf]:
+    """Measure at each place in each colour where that is possible; `none` says what is missing if nowhere."""
+    psfs = []
+    for done, place in enumerate(places, start=1):
+        for channel in channels:
+            with contextlib.suppress(LensModelError):
+                psfs.append(measured_at(place, channel))
+        on_step(done, len(places))
+    if not psfs:
+        raise NotEnoughEvidenceError(none)
+    return psfs
+
+
+def sure(psf: MeasuredPsf, most: float) -> MeasuredPsf:
+    """Return a PSF; refuse one whose expected error is as large as that of a blind one."""
+    if psf.error >= most:
+        raise NotEnoughEvidenceError(f"the kernel is expected to be wrong by {psf.error:.0%}")
+    return psf

@@ -32,7 +32,7 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
 from lensmodel.measured.registration import Warp, match, matched
 from lensmodel.measured.solve import measured_pixels, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
@@ -86,22 +86,17 @@ class AperturePair:
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
         """Measure the PSF of the first photo; see `Measurer`."""
-        require_photos(self, photos)
+        require(self, photos, size)
         _require_pair(*photos)
         opened, closed = _with_bounded_noise(photos)
         warp = self.register(opened, closed)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
-        psfs = []
-        for done, corner in enumerate(corners, start=1):
-            solved = [self._window(opened, closed, warp, corner, size, channel) for channel in channels]
-            psfs += [psf for psf in solved if psf is not None]
-            on_step(done, len(corners))
-        if not psfs:
-            raise NotEnoughEvidenceError(
-                "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat "
-                "and in focus"
-            )
-        return psfs
+        return at_each(
+            corners, channels,
+            lambda corner, channel: self._window(opened, closed, warp, corner, size, channel), on_step,
+            none="no part of the pair determines a PSF; photograph a scene with fine detail everywhere, "
+            "flat and in focus",
+        )  # fmt: skip
 
     def register(self, opened: LinearPhoto, closed: LinearPhoto) -> Warp:
         """Lay the closed photo under the open one."""
@@ -134,29 +129,25 @@ class AperturePair:
         corner: tuple[int, int],
         size: int,
         channel: Channel,
-    ) -> MeasuredPsf | None:
-        """PSF of one window, or None where it does not determine one."""
+    ) -> MeasuredPsf:
+        """PSF of one window."""
         around = size // 2
         scene = _Scene(closed, warp, corner, self.side, around, channel)
+        light = _falloff(opened, scene, corner, self.side, around, channel)
 
         def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
             cut = around - margin
             whole = scene.moved(shift) * light
             return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
 
-        try:
-            light = _falloff(opened, scene, corner, self.side, around, channel)
-            noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
-            kernel, solved, _ = window_psf(
-                opened, channel, corner, (self.side, self.side), latent, size, latent_noise=noise
-            )
-        except NotEnoughEvidenceError:
-            return None
+        noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
+        kernel, solved, _ = window_psf(
+            opened, channel, corner, (self.side, self.side), latent, size, latent_noise=noise
+        )
         error = float(np.hypot(solved.error, FLOOR))
         pixel = corner[0] + (self.side - 1) / 2.0, corner[1] + (self.side - 1) / 2.0
-        if error >= _SURE:
-            return None
-        return MeasuredPsf(kernel, opened.frame.position(*pixel), channel, error, pixel, self.side)
+        position = opened.frame.position(*pixel)
+        return sure(MeasuredPsf(kernel, position, channel, error, pixel, self.side), _SURE)
 
 
 def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:

@@ -26,7 +26,7 @@ from scipy import ndimage
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
 from lensmodel.measured.solve import NEAR_CLIP, Solved, measured_pixels, photo_noise, solve
 from lensmodel.photo import LinearPhoto
 
@@ -61,7 +61,7 @@ class Points:
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
         """Measure the PSF wherever there are points; see `Measurer`."""
-        require_photos(self, photos)
+        require(self, photos, size)
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
         lights = isolated_lights(find_lights(plane), size)
@@ -80,14 +80,11 @@ class Points:
         skies = {
             c: sky_of(np.asarray(photo.planes[CHANNELS.index(c)], dtype=np.float64))[0] for c in channels
         }
-        psfs = []
-        for done, cell in enumerate(good, start=1):
-            solved = [_cell_psf(photo, c, cell[:_MOST], size, skies[c]) for c in channels]
-            psfs += [psf for psf in solved if psf is not None]
-            on_step(done, len(good))
-        if not psfs:
-            raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
-        return psfs
+        return at_each(
+            good, channels,
+            lambda cell, channel: _cell_psf(photo, channel, cell[:_MOST], size, skies[channel]), on_step,
+            none="the points of light are too faint; expose longer",
+        )  # fmt: skip
 
 
 def _whole(light: PointLight, photo: LinearPhoto, size: int) -> bool:
@@ -125,26 +122,23 @@ class _Stamp:
 
 def _cell_psf(
     photo: LinearPhoto, channel: Channel, lights: Sequence[PointLight], size: int, sky: NDArray[np.float64]
-) -> MeasuredPsf | None:
+) -> MeasuredPsf:
+    """Stack the lights of a cell, and solve for their kernel."""
     stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
     stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.measured.sum() > size]
     if len(stamps) < _FEWEST:
-        return None
-    try:
-        solved = _stacked(photo, channel, stamps, size, None)
-        for _ in range(_ROUNDS - 1):
-            kernel = np.asarray(solved.kernel)
-            stamps = [_refined(stamp, kernel) for stamp in stamps]
-            solved = _stacked(photo, channel, stamps, size, kernel)
-    except NotEnoughEvidenceError:
-        return None
+        raise NotEnoughEvidenceError("fewer lights than a cell must have are seen in this colour")
+    solved = _stacked(photo, channel, stamps, size, None)
+    for _ in range(_ROUNDS - 1):
+        kernel = np.asarray(solved.kernel)
+        stamps = [_refined(stamp, kernel) for stamp in stamps]
+        solved = _stacked(photo, channel, stamps, size, kernel)
     error = float(np.hypot(solved.error, FLOOR))
-    if error >= _SURE:
-        return None
     weights = np.array([stamp.flux for stamp in stamps])
     middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
     pixel = float(middle[0]), float(middle[1])
-    return MeasuredPsf(centred(solved.kernel), photo.frame.position(*pixel), channel, error, pixel, size)
+    position = photo.frame.position(*pixel)
+    return sure(MeasuredPsf(centred(solved.kernel), position, channel, error, pixel, size), _SURE)
 
 
 def _stamp(

@@ -32,7 +32,7 @@ from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, require_photos
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
 from lensmodel.measured.page import DETAILS, MEAN, TargetPage
 from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
@@ -89,7 +89,7 @@ class Target:
         on_step: StepHook = ignore_step,
     ) -> list[MeasuredPsf]:
         """Measure the PSF all over the page; see `Measurer`."""
-        require_photos(self, photos)
+        require(self, photos, size)
         photo = photos[0]
         placed = self.find(photo)
         height, width = photo.planes.shape[1:]
@@ -105,14 +105,11 @@ class Target:
             raise NotEnoughEvidenceError(_TOO_SMALL)
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         placed = replace(placed, tones=tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side))
-        psfs = []
-        for done, corner in enumerate(corners, start=1):
-            solved = [self._window(photo, placed, corner, size, channel) for channel in channels]
-            psfs += [psf for psf in solved if psf is not None]
-            on_step(done, len(corners))
-        if not psfs:
-            raise NotEnoughEvidenceError("no window of the page determines a PSF; is the photo in focus?")
-        return psfs
+        return at_each(
+            corners, channels,
+            lambda corner, channel: self._window(photo, placed, corner, size, channel), on_step,
+            none="no window of the page determines a PSF; is the photo in focus?",
+        )  # fmt: skip
 
     def find(self, photo: LinearPhoto) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
@@ -129,24 +126,20 @@ class Target:
 
     def _window(
         self, photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], size: int, channel: Channel
-    ) -> MeasuredPsf | None:
+    ) -> MeasuredPsf:
         """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
-        try:
-            best = solve_window(photo, placed, channel, corner, self.side, size)
-            for part in _SMALLER:
-                side = round(self.side * part)
-                few = _pixels(photo, channel, side) < _LEAST_PIXELS * size * size
-                if best.solved.misfit <= EXPLAINED or few:
-                    break
-                inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
-                best = solve_window(photo, placed, channel, inner, side, size)
-        except NotEnoughEvidenceError:
-            return None
+        best = solve_window(photo, placed, channel, corner, self.side, size)
+        for part in _SMALLER:
+            side = round(self.side * part)
+            few = _pixels(photo, channel, side) < _LEAST_PIXELS * size * size
+            if best.solved.misfit <= EXPLAINED or few:
+                break
+            inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
+            best = solve_window(photo, placed, channel, inner, side, size)
         error = float(np.hypot(best.solved.error, FLOOR))
         pixel = best.corner[0] + (best.side - 1) / 2.0, best.corner[1] + (best.side - 1) / 2.0
-        if error >= _SURE:
-            return None
-        return MeasuredPsf(best.kernel, photo.frame.position(*pixel), channel, error, pixel, best.side)
+        position = photo.frame.position(*pixel)
+        return sure(MeasuredPsf(best.kernel, position, channel, error, pixel, best.side), _SURE)
 
 
 def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:

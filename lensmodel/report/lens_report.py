@@ -65,10 +65,16 @@ _RING: Final = 2  # places in each quarter of a ring whose mean is its value (ch
 _LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals (chosen: curves are smooth)
 # Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
 # (chosen: a fifth less is hardly seen in a print, half as much at a glance)
-_EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
-# MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and a
-# little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)
-_CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
+_EVEN: Final = 0.95
+_FALLS: Final = ((0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much softer"))
+# MTF50 in cycles/pixel of the centre, and what it is called (chosen: an ideal pixel behind an ideal lens
+# reaches .6, a demosaiced photo about .3)
+_LEVELS: Final = (
+    (0.35, "as sharp as the sensor can show"),
+    (0.2, "sharp"),
+    (0.1, "a little soft"),
+    (0.0, "soft"),
+)
 _ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
 _FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
 _ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
@@ -235,7 +241,6 @@ class LateralColourCurve:
     radii: tuple[float, ...]
     red: tuple[float, ...]
     blue: tuple[float, ...]
-    photos: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -512,10 +517,7 @@ def sharpness(found: ApertureReport) -> str:
     """Say in one sentence how sharp a copy is in the centre and in its worst corner."""
     center, worst = found.spots[0].mean, found.worst
     figure = SensorGeometry().words(center, "c/px", found.spots[0].mean_range)
-    if center >= _CRISP:
-        level = "as sharp as the sensor can show"
-    else:
-        level = "sharp" if center >= _SHARP else "a little soft" if center >= _SOFT else "soft"
+    level = next(words for least, words in _LEVELS if center >= least)
     words = f"this copy is {level} in the centre (MTF50 {figure})"
     share = worst.mean / max(center, 1e-6)
     # surely softer only where even the top of its range lies below the middle of the centre's
@@ -523,11 +525,8 @@ def sharpness(found: ApertureReport) -> str:
     if share >= _EVEN:
         fall = f"its corners {'seem' if worst.unknown else 'are'} just as sharp"
     else:
-        how = (
-            "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
-        )
-        verb = "is" if sure else "seems"
-        fall = f"its worst corner, the {worst.side}, {verb} {how} ({worst.words})"
+        how = next(words for least, words in _FALLS if share >= least)
+        fall = f"its worst corner, the {worst.side}, {'is' if sure else 'seems'} {how} ({worst.words})"
     if worst.unknown:
         fall += ", but too little is known there"
     begin = f"At {found.at} {words}" if found.at else f"{words[0].upper()}{words[1:]}"
@@ -544,20 +543,15 @@ def _chosen(model: LensModel) -> list[float]:
     """Apertures to test: all, or where there are many the ends and those between with most samples."""
     numbers = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
     known = sorted(set(numbers))
-    if len(known) <= MOST_APERTURES:
-        return known
-    inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))
-    return sorted([known[0], known[-1], *inner[: MOST_APERTURES - 2]])
+    inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))[: MOST_APERTURES - 2]
+    return sorted({*known[:1], *known[-1:], *inner})
 
 
 def _best(tested: Sequence[ApertureReport]) -> float | None:
     """Aperture with the largest mean MTF50 over the picture; None where one was tested."""
     own = [one for one in tested if one.settings.channel == tested[0].settings.channel]
-    if len(own) < 2:
-        return None
-    return max(
-        own, key=lambda one: (np.mean([spot.mean for spot in one.map]), -(one.settings.aperture or 0.0))
-    ).settings.aperture
+    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in own}
+    return max(means, key=lambda n: (means[n], -(n or 0.0))) if len(own) > 1 else None
 
 
 def _shared(values: object) -> float | None:
@@ -599,7 +593,6 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
         _LATERAL_R,
         tuple(median(each.displacement(r, "r") for each in red) for r in _LATERAL_R),
         tuple(median(each.displacement(r, "b") for each in blue) for r in _LATERAL_R),
-        min(len(red), len(blue)),
     )
 
 

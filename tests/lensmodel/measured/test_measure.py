@@ -321,6 +321,8 @@ def test_a_pair_of_one_aperture_is_refused() -> None:
         AperturePair().measure([photo, photo], size=21)
     with pytest.raises(InvalidInputError, match="takes 2 photos"):
         AperturePair().measure([photo], size=21)
+    with pytest.raises(InvalidInputError, match="an odd side of 3 pixels or more, got 20"):
+        AperturePair().measure([photo, photo], size=20)
 
 
 @pytest.mark.parametrize("covariance", [[[3.0, 0.0], [0.0, 0.8]], [[1.9, 1.1], [1.1, 1.9]]])
@@ -349,7 +351,7 @@ def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) 
             [place], method, target_photo, photo_id=photo, settings=LensSettings(aperture=f_number)
         )
     ]
-    blind = [type(s)(**{**{f: getattr(s, f) for f in s.__slots__}, "estimator": "blind/1"}) for s in blind]
+    blind = [replace(sample, estimator="blind/1") for sample in blind]
     samples = measure.samples_of(
         [place], method, target_photo, photo_id="new", settings=LensSettings(aperture=2.0)
     )

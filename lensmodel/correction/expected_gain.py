@@ -18,7 +18,13 @@ from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
-from lensmodel.correction.scene_power import frequency_counts, ring_power, scene_power
+from lensmodel.correction.scene_power import (
+    frequency_counts,
+    ring_power,
+    scene_law,
+    scene_power,
+    softness,
+)
 from lensmodel.correction.tiles.lattice import Cell
 
 WORTH_DB: Final = 0.1
@@ -31,6 +37,10 @@ _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1], 
 """Shares of a kernel to try; finer steps change the expected error by less than a hundredth."""
 
 _GRID: Final = GRID
+_SHARPER: Final = 2.0
+"""Standard deviations z by which the true kernel may be sharper where all is out of focus (chosen: two of a
+hundred are)."""
+
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 _MOST: Final = 0.7
@@ -130,6 +140,10 @@ def plan(
         K_s = s K + (1 - s),    W = K_s* S / (|K_s|² S + n),    G = W + t (1 - K_s W)
         before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
 
+    Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
+    gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
+    that would do harm if the true kernel were sharper by z standard deviations, H = K + z D^(1/2) K / |K|.
+
     Parameters
     ----------
     offsets : sequence of tuple of float
@@ -149,10 +163,13 @@ def plan(
             else UniformBlur(posterior.kernel, offset).spectrum(_GRID)
         )
         D, n = posterior.variance, float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
-        S = scene_power(measured[c], K.real**2 + K.imag**2 + D, n)
-        remaining = np.empty(_SHARES.size)
-        before += _remaining(K, point, S, D, times, np.float32(n), _SHARES, np.float32(returned), remaining)
-        best = int(np.argmin(remaining))
+        level, slope = scene_law(measured[c], K.real**2 + K.imag**2 + D, n)
+        S, z = scene_power(level, slope), np.float32(_SHARPER * softness(slope))
+        remaining, harm = np.empty((2, _SHARES.size))
+        before += _remaining(
+            K, point, S, D, times, np.float32(n), _SHARES, np.float32(returned), z, remaining, harm
+        )
+        best = int(np.argmin(np.where(harm > 0.0, np.inf, remaining)))
         shares.append(float(_SHARES[best]))
         after += float(remaining[best])
     error = float(np.mean([posterior.error for posterior in posteriors]))
@@ -169,9 +186,14 @@ def _remaining(
     noise: np.float32,
     shares: NDArray[np.float32],
     returned: np.float32,
+    z: np.float32,
     out: NDArray[np.float64],
+    harm: NDArray[np.float64],
 ) -> float:
-    """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`."""
+    """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`.
+
+    `harm` receives by how much the error rises if the kernel is sharper by z standard deviations.
+    """
     one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
     for i in range(K.shape[0]):
         part = np.float32(0.0)
@@ -180,9 +202,9 @@ def _remaining(
             part += times[i, j] * (S[i, j] * (a * a + b * b + D[i, j]) + noise)
         before += part
     for number in range(shares.size):
-        share, total = shares[number], np.float64(0.0)
+        share, total, rise = shares[number], np.float64(0.0), np.float64(0.0)
         for i in range(K.shape[0]):
-            part = np.float32(0.0)
+            part, more = np.float32(0.0), np.float32(0.0)
             for j in range(K.shape[1]):
                 a, b, s = K[i, j].real, K[i, j].imag, S[i, j]
                 p = share * a + (one - share) * point[i, j].real
@@ -194,8 +216,16 @@ def _remaining(
                 kept = re * re + im * im
                 error = s * (missed * missed + turned * turned + kept * D[i, j]) + kept * noise
                 part += times[i, j] * error
+                size = np.sqrt(a * a + b * b)
+                sharper = min(size + z * np.sqrt(D[i, j]), max(one, size)) / max(size, least)
+                u, v = sharper * a, sharper * b
+                missed, turned = one - re * u + im * v, re * v + im * u
+                change = missed * missed + turned * turned - (one - u) * (one - u) - v * v
+                more += times[i, j] * (s * change + (kept - one) * noise)
             total += part
+            rise += more
         out[number] = total
+        harm[number] = rise if z > np.float32(0.0) else np.float64(0.0)
     return before
 
 

@@ -28,15 +28,20 @@ it (chosen)."""
 _SLOPES: Final = (2.0, 5.0)
 """Least and greatest slope a: of sharp photographs of detail, and of what is out of focus (chosen)."""
 
+_SOFT: Final = (3.0, 4.0)
+"""Slopes between which a scene counts more and more as out of focus (chosen: detail in focus lies below)."""
+
 _BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 
 
-def scene_power(
-    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
-) -> NDArray[np.float32]:
-    """Power of the scene behind a blur on the `rfft2` grid of `GRID`, S = c |f|^-a by `scene_law`."""
-    level, slope = scene_law(measured, transferred, noise)
+def scene_power(level: float, slope: float) -> NDArray[np.float32]:
+    """Power of a scene on the `rfft2` grid of `GRID`, S = c |f|^-a with c and a of `scene_law`."""
     return np.asarray(level * np.exp(np.float32(-0.5 * slope) * _log_squared()), dtype=np.float32)
+
+
+def softness(slope: float) -> float:
+    """How far a scene of this slope is out of focus, 0 to 1."""
+    return min(max((slope - _SOFT[0]) / (_SOFT[1] - _SOFT[0]), 0.0), 1.0)
 
 
 def scene_law(

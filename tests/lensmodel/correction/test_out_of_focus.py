@@ -1,0 +1,31 @@
+"""A scene out of focus holds nothing that a correction could bring back: it must not lose."""
+
+import numpy as np
+from scipy import ndimage
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import Channel, FieldPosition, NoiseModel
+from lensmodel.correction import PsfPosterior, correct_planes
+
+
+class TooWide:
+    """Kernels that are thought to be wider than the true one, whose s.d. is 1.5 pixels."""
+
+    def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
+        return PsfPosterior.of_error(gaussian(25, 2.3**2 * np.eye(2)), 0.4)
+
+
+def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide() -> None:
+    rng = np.random.default_rng(5)
+    blocks = rng.uniform(0.1, 0.7, (3, 26, 26)).repeat(14, axis=1).repeat(14, axis=2)
+    scene = ndimage.gaussian_filter(blocks, (0, 4.0, 4.0))
+    seen = ndimage.gaussian_filter(scene, (0, 1.5, 1.5)) + 0.004 * rng.standard_normal(scene.shape)
+    photo = seen.astype(np.float32)
+    frame = Frame(*photo.shape[1:])
+
+    made = correct_planes(photo, TooWide(), frame, noise=[NoiseModel(0.0, 0.004**2)] * 3)
+
+    inner = np.s_[:, 20:-20, 20:-20]
+    before, after = (np.square(planes - scene)[inner].mean() for planes in (photo, made.planes))
+    assert after <= 1.01 * before

@@ -241,6 +241,7 @@ class LateralColourCurve:
     radii: tuple[float, ...]
     red: tuple[float, ...]
     blue: tuple[float, ...]
+    photos: int  # that show it
 
 
 @dataclass(frozen=True, slots=True)
@@ -593,6 +594,7 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
         _LATERAL_R,
         tuple(median(each.displacement(r, "r") for each in red) for r in _LATERAL_R),
         tuple(median(each.displacement(r, "b") for each in blue) for r in _LATERAL_R),
+        min(len(red), len(blue)),
     )
 
 

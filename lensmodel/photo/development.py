@@ -111,9 +111,12 @@ def _suspects(
 ) -> tuple[tuple[str, ...], Suspects] | None:
     """The body of a photo and what its mosaic shows; None without a mosaic or a known body."""
     del changed_ns, size  # a file that changed is another one
-    with _opened(path, limits) as (said, raw):
-        body = _body(said.metadata())
-        mosaic = None if raw is None or not body[0] else Mosaic.of(raw)
+    with opened_header(path, limits) as header:
+        body = _body(Said.of(header).metadata())
+    if not body[0]:
+        return None
+    with _opened(path, limits) as (_, raw):
+        mosaic = None if raw is None else Mosaic.of(raw)
         return None if mosaic is None else (body, mosaic.suspects())
 
 

@@ -7,18 +7,18 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from app.commands.service import Data, opened, settings_from
-from app.store import migrate
-from app.store.accounts import Accounts
-from app.store.owners import ANY_OWNER
-from app.store.tables import KeyRow
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from app.store.accounts import Accounts
+    from app.store.tables import KeyRow
 
 keys = typer.Typer(
     help="""Make, list and revoke the keys of a service that others can reach.
@@ -48,6 +48,8 @@ def _span(text: str) -> timedelta:
 @contextmanager
 def _opened(data: Data) -> Iterator[Accounts]:
     """Open the keys of an installation, its schema brought up to date."""
+    from app.store import migrate  # noqa: PLC0415 - the list of commands does not wait for it
+
     with opened(settings_from(data)) as store:
         migrate.upgrade(store.database)
         yield store.accounts
@@ -128,6 +130,8 @@ def listed(
 
     Exit status: 0 listed, 1 it failed, 2 wrong usage.
     """
+    from app.store.owners import ANY_OWNER  # noqa: PLC0415 - the list of commands does not wait for it
+
     with _opened(data) as store:
         rows = [_described(key) for key in store.keys(owner or ANY_OWNER)]
     if json_output:

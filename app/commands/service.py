@@ -7,16 +7,16 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import ValidationError
 
-from app.runtime import supervisor
 from app.runtime.settings import PREFIX, Settings, described
-from app.sandbox import confine
-from app.store import Store
 from lensmodel.cli.ending import UsageError
+
+if TYPE_CHECKING:
+    from app.store import Store
 
 Data = Annotated[
     Path | None,
@@ -48,6 +48,8 @@ def settings_from(data: Path | None, host: str | None = None, port: int | None =
 @contextlib.contextmanager
 def opened(settings: Settings) -> Iterator[Store]:
     """Open the tables of an installation."""
+    from app.store import Store  # noqa: PLC0415 - the list of commands does not wait for it
+
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Store(settings)) as store:
         yield store
@@ -69,16 +71,22 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
     """
     settings = settings_from(data, host, port)
     typer.echo("lensmodel is starting ...", err=True)
+    from app.runtime import supervisor  # noqa: PLC0415 - the list of commands does not wait for it
+
     raise typer.Exit(supervisor.serve(settings))
 
 
 def api(port: Port = None, host: Host = None, data: Data = None) -> None:
     """Run only the API process, for installations on many machines."""
+    from app.runtime import supervisor  # noqa: PLC0415 - the list of commands does not wait for it
+
     supervisor.run_api(settings_from(data, host, port))
 
 
 def worker(data: Data = None) -> None:
     """Run only a worker process, for installations on many machines."""
+    from app.runtime import supervisor  # noqa: PLC0415 - the list of commands does not wait for it
+
     supervisor.run_worker(settings_from(data))
 
 
@@ -98,6 +106,8 @@ def config(
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
+    from app.sandbox import confine  # noqa: PLC0415 - the list of commands does not wait for it
+
     settings = settings_from(data)
     # up to the last @: a password may hold any sign, and need not be quoted everywhere
     shown = {

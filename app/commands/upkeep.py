@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.blobs.storage import Storage
 from app.commands.service import Data, opened, settings_from
-from app.runtime import backup as copies
-from app.runtime import doctor as examination
 from app.runtime.settings import Settings
-from app.store import migrate
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, Quiet
+
+if TYPE_CHECKING:
+    from app.blobs.storage import Storage
 
 
 def doctor(
@@ -38,6 +37,9 @@ def doctor(
 
     Exit status: 0 all is well, 1 something is not, 2 wrong usage.
     """
+    from app.runtime import doctor as examination  # noqa: PLC0415 - the list of commands does not wait for it
+    from app.store import migrate  # noqa: PLC0415 - the list of commands does not wait for it
+
     shown = Display.of(context, quiet=quiet, as_json=json_output)
     settings = _existing(data)
     with opened(settings) as store:
@@ -76,6 +78,8 @@ def backup(
 
     Exit status: 0 there is a new backup, 1 there is none, 2 wrong usage.
     """
+    from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
+
     shown = Display.of(context, quiet=quiet, as_json=json_output)
     settings = _existing(data)
     with opened(settings) as store, shown.progress() as bars:
@@ -101,4 +105,6 @@ def _existing(data: Path | None) -> Settings:
 
 
 def _storage(settings: Settings) -> Storage:
+    from app.blobs.storage import Storage  # noqa: PLC0415 - the list of commands does not wait for it
+
     return Storage(settings.storage, patience_s=settings.storage_seconds, create=False)

@@ -149,8 +149,7 @@ class Row:
         inner = (slice(_RIM, -_RIM), slice(_RIM, -_RIM))
         self.gains.append(psnr(new[inner], sharp[inner]) - psnr(old[inner], sharp[inner]))
         self.edges.append(figures.overshoots(old, new, sharp))
-        grey = [np.repeat(figures.luma(p)[..., None], 3, axis=-1) for p in (old, new)]
-        self.grain.append(figures.grain(*grey))
+        self.grain.append(figures.grain(old, new, sharp))
         self.faults["dots"] += int(figures.dots(old, new, sharp)[inner].sum())
         self.faults["flips"] += int(figures.hue_flips(old, new, sharp)[inner].sum())
 

@@ -41,6 +41,7 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 _BLOCK: Final = 32  # pixels of a square whose grain is taken: holds two periods of `BANDS` (chosen)
 _SPECTRUM_OF_GRAIN: Final = 8.0
 """Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
+_TEXTURE: Final = 0.1  # of the original's power in the truth, from which a place is not even (chosen)
 _FLAT_SHARE: Final = 0.1  # of the squares, the flattest; so many at least (chosen: medians of fewer jump)
 _FLAT_BLOCKS: Final = 8
 _LEAST_GRAIN: Final = 1e-3
@@ -250,13 +251,15 @@ def _profiles(
     return total / 5.0
 
 
-def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
-    """Noise power of each even place in each band of frequency, in both pictures.
+def grain(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.float64]:
+    """Noise power of lightness in each even place and band of frequency, in both pictures.
 
     Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
-    the original, more of it than rounding. Which of them are the flattest `grain_ratio` decides.
+    the original, more of it than rounding. Where the truth is known and has a tenth of that power in a band,
+    it is texture. Which of them are the flattest `grain_ratio` decides.
     """
     height, width = (n // _BLOCK for n in before.shape[:2])
+    lights = [None if p is None else luma(p) for p in (before, after, truth)]
     found = []
     for down in range(height):
         for across in range(width):
@@ -264,17 +267,17 @@ def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
                 slice(down * _BLOCK, (down + 1) * _BLOCK),
                 slice(across * _BLOCK, (across + 1) * _BLOCK),
             )
-            old = np.asarray(before[window], dtype=np.float64)
-            if not (old.min() > 0.02 and old.max() < 0.98):
+            if not (before[window].min() > 0.02 and before[window].max() < 0.98):
                 continue
-            old = _detrended(old)
-            variance = float(np.square(old).mean())
-            if variance < _LEAST_GRAIN**2:
+            old, new, true = (None if p is None else _detrended(p[window]) for p in lights)
+            assert old is not None
+            assert new is not None
+            variance, powers = float(np.square(old).mean()), _powers(old)
+            if variance < _LEAST_GRAIN**2 or powers[0] > _SPECTRUM_OF_GRAIN * powers[-1]:
                 continue
-            powers = _powers(old)
-            if powers[0] > _SPECTRUM_OF_GRAIN * powers[-1]:
+            if true is not None and any(t > _TEXTURE * p for t, p in zip(_powers(true), powers, strict=True)):
                 continue
-            found.append([variance, *powers, *_powers(_detrended(np.asarray(after[window], np.float64)))])
+            found.append([variance, *powers, *_powers(new)])
     return np.array(found).reshape(-1, 1 + 2 * len(BANDS))
 
 
@@ -297,18 +300,17 @@ def percentile_of_edges(found: NDArray[np.float64]) -> tuple[float, float] | Non
 
 
 def _detrended(block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A square less its plane of best fit, channel by channel."""
+    """A square less its plane of best fit."""
     t = np.arange(_BLOCK) - (_BLOCK - 1) / 2.0
     scale = float(np.square(t).sum()) * _BLOCK
-    block = block - block.mean(axis=(0, 1))
-    down = np.einsum("ijk,i->k", block, t) / scale
-    across = np.einsum("ijk,j->k", block, t) / scale
-    return block - t[:, None, None] * down - t[None, :, None] * across
+    block = block - block.mean()
+    down, across = (block.sum(axis=1) @ t) / scale, (block.sum(axis=0) @ t) / scale
+    return np.asarray(block - t[:, None] * down - t[None, :] * across)
 
 
 def _powers(block: NDArray[np.float64]) -> list[float]:
-    """Mean power density of a square in each band, all channels together."""
-    spectrum = np.square(np.abs(np.fft.fft2(block * _WINDOW[:, :, None], axes=(0, 1)))).mean(axis=-1)
+    """Mean power density of a square in each band."""
+    spectrum = np.square(np.abs(np.fft.fft2(block * _WINDOW)))
     return [float(spectrum[mask].mean()) for mask in _MASKS]
 
 

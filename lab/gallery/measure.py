@@ -17,7 +17,7 @@ TILE: Final = 1024
 """Side of a tile: a multiple of the squares of the figures; bounds the memory."""
 
 OVERSHOOT_PERCENT: Final = 12.0
-GRAIN: Final = (0.7, 1.0)
+GRAIN: Final = (0.8, 1.0)
 ZONE_LOSS_DB: Final = 0.05
 LOSS_SHARE: Final = 0.01
 """Bars (chosen): most overshoot in percent, grain over the original's, a zone's loss, losing blocks."""
@@ -38,7 +38,7 @@ def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figur
         for name, find in (("dots", figures.dots), ("hue_flips", figures.hue_flips)):
             faults[name].append(np.argwhere(find(old, new, true)[inner]) + np.array([row, col]))
         edges.append(figures.overshoots(old, new, true))
-        places.append(figures.grain(old[inner], new[inner]))
+        places.append(figures.grain(old[inner], new[inner], None if true is None else true[inner]))
         changed += int((np.abs(new[inner] - old[inner]).max(axis=-1) > 1.0 / 255.0).sum())
     counts: Figures = {}
     for name, tiles in faults.items():

@@ -49,8 +49,9 @@ MIN_HALO, MORE = 12, 6
 """Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
 
 SHARE: Final = 0.87
-"""Share of what the prior took that is added back: three quarters of the power of the grain, so that together
-with grain that the inverse of the blur amplifies it is no more than there was (chosen)."""
+"""Share of what the prior took that is added back to full planes: three quarters of the power of the grain,
+so that with grain that the inverse of the blur amplifies it is no more than there was (chosen). Of a mosaic
+all comes back that `spread_grain` leaves, where a plan counts on as much: coloured grain stays away."""
 
 
 HALF, BEST = 0.5, 0.25
@@ -249,7 +250,8 @@ def _checked(
     photo, sensors, errors = tile.photo, tile.sensors, [posterior.error for posterior in tile.posteriors]
     restored = solution.planes
     if solution.unexplained is not None and bounds.texture > 0.0:
-        share = np.float32(SHARE * bounds.texture) * texture_share(
+        most = SHARE if job.cfa is None else 1.0
+        share = np.float32(most * bounds.texture) * texture_share(
             photo, solution.unexplained, sensors, bounds.denoise
         )
         restored = restored + share * solution.unexplained

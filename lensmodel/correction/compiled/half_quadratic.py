@@ -166,7 +166,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     steepness: Number,
     terms: Real,
     ridge: Real,
-    left: Real,
+    explained: Real,
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
 
@@ -174,7 +174,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
     the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
     `ridge` is one more term of the denominators, noise over the power of a scene out of focus.
-    `left` receives what the result does not explain of the data, 0 where there are none.
+    `explained` receives what the result makes of the data, blurred again.
     """
     channels, height, width = x.shape
     half = width // 2 + 1
@@ -242,4 +242,4 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
         to_plane(P, work)
         for i in range(height):
             for j in range(width):
-                left[c, i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO
+                explained[c, i, j] = work[i, j]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def half_quadratic_on_device(
     device: Device, p: SparseProblem
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The planes and what they leave of the data; see `compiled.half_quadratic.half_quadratic`."""
+    """The planes and what they make of the data; see `compiled.half_quadratic.half_quadratic`."""
     xp, shape, whole, noise, variance = device.xp, (*p.y.shape[1:],), bool(p.known.all()), p.noise, p.variance
     decay, prior_power = prior((shape[0], shape[1]))
     data, mask, transfer, zero = (device.send(a) for a in (p.y, p.known, p.K, np.zeros_like(p.y)))
@@ -71,4 +71,4 @@ def half_quadratic_on_device(
         x = back(X)
     X = forward(x) if whole else X
     predicted = back(transfer * X if change is None else transfer * X + change)
-    return device.fetch(x), device.fetch(xp.where(mask, data - predicted, zero))
+    return device.fetch(x), device.fetch(predicted)

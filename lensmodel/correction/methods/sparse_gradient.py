@@ -122,10 +122,11 @@ class SparseGradient:
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas.around(blurred, blurs, sensors)
         problem = self._problem(rest, blurs, sensors, light, canvas, glow)
-        x, left = _solved(problem)
+        x, explained = _solved(problem)
         inner = (slice(None), *canvas.data)
         restored = x[inner] * light[:, None, None]
-        unexplained = self._unexplained(blurred, left[inner] * light[:, None, None], sensors, light)
+        left = rest - explained[inner] * light[:, None, None]
+        unexplained = self._unexplained(blurred, left, sensors, light)
         return Solution(restored if lights is None else lights.put_back(blurred, restored), unexplained)
 
     @staticmethod
@@ -134,12 +135,17 @@ class SparseGradient:
     ) -> Planes:
         """What the prior took: the residual of each colour, or, of a mosaic, its grain in light of no colour.
 
-        In a mosaic each pixel measures one colour k. The means S_k of its residual over 5 x 5 pixels are
-        detail of that colour; the rest, within three standard deviations of the noise, counts for all,
-        e_k L_c / L_k, with L their mean light, but never as more than the grain n of a colour, or grain would
-        be coloured and coarse::
+        In a mosaic each pixel measures one colour k; L is the mean light, n the noise of a colour over it,
+        and w weighs colours as they are seen. Of the measured residual e, the means S over 5 x 5 pixels are
+        coarse grain and detail, their chroma as far as it exceeds its noise (a share q). Fine grain is that
+        which one sees in the photo: of the demosaiced residual d, in light of no colour, within a few
+        standard deviations of the noise, f = sum w_k ( d_k - mean d_k ) / L_k. Where more than noise is in
+        it, t = 0, demosaicing made detail of its own, and the measured residual counts for all colours.
+        Either is never more than the grain of a colour, or grain would be coloured::
 
-            r_c = S_c + L_c min(1, n_c / n_k) ( e_k - S_k ) / L_k
+            s = sum w_k S_k / L_k,    m² = sum w_k n_k²
+            r_c / L_c = s + q ( S_c / L_c - s )
+                          + t min(1, n_c / m) f + (1 - t) min(1, n_c / n_k) ( e_k - S_k ) / L_k
         """
         clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
         clipped = blurred >= clip[:, None, None]
@@ -310,12 +316,12 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
 
 
 def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
-    """The planes on the canvas, and what they do not explain of the data."""
+    """The planes on the canvas, and what they make of the data, blurred again."""
     device = chosen()
     if device is not None:
         return half_quadratic_on_device(device, p)
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
-    x, left = np.empty_like(p.y), np.empty_like(p.y)
+    x, explained = np.empty_like(p.y), np.empty_like(p.y)
     half_quadratic(
         x,
         p.y,
@@ -339,9 +345,9 @@ def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
         np.float32(p.prox.steepness),
         p.prox.terms,
         p.ridge,
-        left,
+        explained,
     )
-    return x, left
+    return x, explained
 
 
 def _ridge(

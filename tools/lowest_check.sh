@@ -17,5 +17,5 @@ cd "$here"
 "$work/venv/bin/python" -m pytest -q -p no:cacheprovider -o filterwarnings=default \
   -m "not slow and not tools" \
   tests/lensmodel/core tests/lensmodel/quality tests/lensmodel/photo/test_dng.py tests/lensmodel/photo/test_write.py \
-  tests/lensmodel/correction/test_blur.py tests/lensmodel/model/test_lens_model.py tests/lensmodel/neural \
+  tests/lensmodel/correction/test_blur.py tests/lensmodel/model/test_regression.py tests/lensmodel/neural \
   tests/lensmodel/report

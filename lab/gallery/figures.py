@@ -41,7 +41,6 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 _BLOCK: Final = 32  # pixels of a square whose grain is taken: holds two periods of `BANDS` (chosen)
 _SPECTRUM_OF_GRAIN: Final = 8.0
 """Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
-_TEXTURE: Final = 0.1  # of the original's power in the truth, from which a place is not even (chosen)
 _FLAT_SHARE: Final = 0.1  # of the squares, the flattest; so many at least (chosen: medians of fewer jump)
 _FLAT_BLOCKS: Final = 8
 _LEAST_GRAIN: Final = 1e-3
@@ -255,8 +254,8 @@ def grain(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np
     """Noise power of lightness in each even place and band of frequency, in both pictures.
 
     Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
-    the original, more of it than rounding. Where the truth is known and has a tenth of that power in a band,
-    it is texture. Which of them are the flattest `grain_ratio` decides.
+    the original, more of it than rounding. Where the truth is known and has as much in a band, it is texture.
+    Which of them are the flattest `grain_ratio` decides.
     """
     height, width = (n // _BLOCK for n in before.shape[:2])
     lights = [None if p is None else luma(p) for p in (before, after, truth)]
@@ -275,7 +274,7 @@ def grain(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np
             variance, powers = float(np.square(old).mean()), _powers(old)
             if variance < _LEAST_GRAIN**2 or powers[0] > _SPECTRUM_OF_GRAIN * powers[-1]:
                 continue
-            if true is not None and any(t > _TEXTURE * p for t, p in zip(_powers(true), powers, strict=True)):
+            if true is not None and any(t >= p for t, p in zip(_powers(true), powers, strict=True)):
                 continue
             found.append([variance, *powers, *_powers(new)])
     return np.array(found).reshape(-1, 1 + 2 * len(BANDS))

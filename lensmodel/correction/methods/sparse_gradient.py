@@ -54,8 +54,8 @@ class SparseGradient:
 
     Four departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
     local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
-    because edges of all colours coincide; what is out of focus has the power S of its own spectrum,
-    anything else S = inf; and unmeasured pixels take the model's own prediction as
+    because edges of all colours coincide; a mosaic's tile that is all out of focus has the power S of its
+    own spectrum, any other S = inf; and unmeasured pixels take the model's own prediction as
     data, Y~ = F x, which maximises the likelihood of what was measured. Such a guess converges too
     slowly for lights above the clipping level: see `Lights`, which removes them first.
 
@@ -231,7 +231,7 @@ class SparseGradient:
             across=ramp(1),
             rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
             prox=prox,
-            ridge=_ridge(blurred / light[:, None, None], blurs, noise, canvas.shape),
+            ridge=_ridge(blurred / light[:, None, None], blurs, sensors, noise, canvas.shape),
         )
 
 
@@ -351,13 +351,20 @@ def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
 
 
 def _ridge(
-    planes: Planes, blurs: Sequence[UniformBlur], noise: NDArray[np.float32], shape: tuple[int, int]
+    planes: Planes,
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    noise: NDArray[np.float32],
+    shape: tuple[int, int],
 ) -> NDArray[np.float32]:
-    """Noise over the power of the scene, as far as all of the tile is out of focus: Wiener's term.
+    """Noise over the power of the scene, as far as all of a mosaic's tile is out of focus: Wiener's term.
 
-    A prior of sparse gradients takes a soft edge for a blurred hard one, and draws stairs.
+    A prior of sparse gradients takes a soft edge for a blurred hard one, and draws stairs. Of a developed
+    file more counts as noise than there is (`LinearPhoto.correction_noise`): detail of skies would be lost.
     """
     ridge = np.zeros((len(planes), shape[0], shape[1] // 2 + 1), np.float32)
+    if all(sensor.measured is None for sensor in sensors):
+        return ridge
     greatest = ring_power(planes).max(axis=1)  # of the blocks: one in focus keeps its detail
     for c, blur in enumerate(blurs):
         if blur.kernel.shape[0] > WIDEST:

@@ -262,10 +262,11 @@ def test_smoothed_grain_shows_in_the_fine_band_most() -> None:
 
 def test_what_the_truth_has_is_texture_and_no_grain() -> None:
     before = even(256, 256)
-    texture = GREY + 0.5 * (before - GREY)
+    weaker = GREY + 0.5 * (before - GREY)
 
     assert grain_ratio(grain(before, before, np.full_like(before, GREY))) is not None
-    assert grain_ratio(grain(before, before, texture)) is None
+    assert grain_ratio(grain(before, before, weaker)) is not None
+    assert grain_ratio(grain(before, before, before)) is None
 
 
 def test_a_scene_without_an_even_place_has_no_grain_ratio() -> None:

@@ -1,11 +1,12 @@
 """A scene out of focus holds nothing that a correction could bring back: it must not lose."""
 
 import numpy as np
+import pytest
 from scipy import ndimage
 
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import gaussian
-from lensmodel.core.types import Channel, FieldPosition, NoiseModel
+from lensmodel.core.types import BayerPattern, Channel, FieldPosition, NoiseModel
 from lensmodel.correction import PsfPosterior, correct_planes
 
 
@@ -16,7 +17,8 @@ class TooWide:
         return PsfPosterior.of_error(gaussian(25, 2.3**2 * np.eye(2)), 0.4)
 
 
-def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide() -> None:
+@pytest.mark.parametrize("cfa", [None, ((0, 1), (1, 2))])
+def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide(cfa: BayerPattern | None) -> None:
     rng = np.random.default_rng(5)
     blocks = rng.uniform(0.1, 0.7, (3, 26, 26)).repeat(14, axis=1).repeat(14, axis=2)
     scene = ndimage.gaussian_filter(blocks, (0, 4.0, 4.0))
@@ -24,7 +26,7 @@ def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide() -> No
     photo = seen.astype(np.float32)
     frame = Frame(*photo.shape[1:])
 
-    made = correct_planes(photo, TooWide(), frame, noise=[NoiseModel(0.0, 0.004**2)] * 3)
+    made = correct_planes(photo, TooWide(), frame, noise=[NoiseModel(0.0, 0.004**2)] * 3, cfa=cfa)
 
     inner = np.s_[:, 20:-20, 20:-20]
     before, after = (np.square(planes - scene)[inner].mean() for planes in (photo, made.planes))

@@ -50,9 +50,8 @@ class Gate:
         self._settings, self._store = settings, store
         self._closed = settings.needs_keys
         self._looked = -FRESH_S
-        self._known: dict[
-            str, tuple[float, Who]
-        ] = {}  # each use of it is one step, which threads do not part
+        # each use of it is one step, which threads do not part
+        self._known: dict[str, tuple[float, Who]] = {}
 
     def is_closed(self) -> bool:
         """Whether a key is required: always, or since one was created."""

@@ -106,9 +106,9 @@ _INTRODUCTION: Final = (
     "Each picture is calibrated from itself and corrected with default settings. "
     f"Crops show {SIDE} pixels at {ZOOM}:1. Figures are taken from the pictures as shown: dots are single "
     "pixels outside what the original has around them, hue flips colours that it has nowhere near; overshoot "
-    "is the 99th percentile beside clean edges, in percent of the step; grain is noise power of lightness "
-    "in even places, corrected over original, coarse, middle and fine; gains are against the truth, after each block's own "
-    "best shift. A figure in bold misses its bar."
+    "is the 99th percentile beside clean edges, in percent of the step; grain is noise power of lightness in "
+    "even places, corrected over original, coarse, middle and fine; gains are against the truth, after each "
+    "block's own best shift. A figure in bold misses its bar."
 )
 
 

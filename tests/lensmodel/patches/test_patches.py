@@ -290,6 +290,7 @@ def test_every_selector_scores_within_zero_and_one(part: Plane) -> None:
         patches = select(part, NOISE, Frame(*part.shape), count=12, selector=name).patches
         assert len(patches) == 12
         assert all(0.0 <= p.score <= 1.0 for p in patches)
+        assert len({p.score for p in patches}) > 1
 
 
 # ---- evidence

@@ -72,6 +72,20 @@ def test_light_inside_the_kernel_is_the_encircled_energy_of_theory() -> None:
     assert inside == pytest.approx(1.0 - special.j0(x) ** 2 - special.j1(x) ** 2, abs=4e-3)
 
 
+def test_half_a_wave_of_defocus_makes_the_strehl_ratio_of_theory() -> None:
+    # on the axis of a defocused lens I / I0 = sinc^2(W020), whatever the aperture
+    peak = {}
+    for w in (0.0, 0.5):
+        otf = otf_of(16.0, 0.54, defocus=w)
+        row_f = np.fft.fftfreq(otf.values.shape[0], 1.0 / otf.values.shape[0]) / otf.period
+        col_f = np.arange(otf.values.shape[1]) / otf.period
+        pixel = np.sinc(row_f)[:, None] * np.sinc(col_f)[None, :]
+        bare = otf.values.real / np.where(np.abs(pixel) > 1e-3, pixel, 1.0)
+        peak[w] = bare[:, 0].sum() + 2.0 * bare[:, 1:].sum()
+
+    assert peak[0.5] / peak[0.0] == pytest.approx(np.sinc(0.5) ** 2, rel=0.01)
+
+
 def test_kernel_is_normalised_non_negative_and_centred() -> None:
     for kind in LENS_KINDS:
         kernel = draw_lens(3, kind).kernel(FieldPosition(0.8, 0.6), size=41)

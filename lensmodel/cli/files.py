@@ -103,7 +103,8 @@ def profile_at(path: Path, *, replaceable: bool = False) -> LensProfile:
     except InvalidInputError as error:
         if not replaceable:
             raise
-        damaged = path.read_bytes().startswith(b"PK")  # a ZIP file, as profiles are
+        with path.open("rb") as file:
+            damaged = file.read(2) == b"PK"  # a ZIP file, as profiles are
         remedy = "--force replaces the file" if damaged else "name a new file after --profile"
         raise InvalidInputError(f"{error}; {remedy}") from error
 

@@ -225,7 +225,7 @@ def _within(
     if job.unguarded:
         made = _weakened(tile.cell_pixels, solution.planes[tile.inner], job.strength)
         return RestoredCell(made, expected, None)
-    restored, audit = _checked(job, tile, bounds, blurs, solution)
+    restored, audit = _checked(job, tile, bounds, blurs, solution, plans.softness)
     photo, least = tile.cell_pixels, WORTH_DB if bounds.denoise == 0.0 else 0.0
     changed = expected.changed(
         photo, solution.planes[tile.inner], restored, mosaic=job.cfa is not None, least=least
@@ -245,6 +245,7 @@ def _checked(
     bounds: Bounds,
     blurs: Sequence[UniformBlur],
     solution: Solution,
+    softness: float,
 ) -> tuple[Planes, TileAudit | None]:
     """Add back what the prior took, limit, audit; the cell without its halo."""
     photo, sensors, errors = tile.photo, tile.sensors, [posterior.error for posterior in tile.posteriors]
@@ -254,6 +255,8 @@ def _checked(
         share = np.float32(most * bounds.texture) * texture_share(
             photo, solution.unexplained, sensors, bounds.denoise
         )
+        if softness > 0.0:
+            share = share * _without_own_grain(photo, restored, softness)
         restored = restored + share * solution.unexplained
     if job.stored is not None:
         restored = job.stored.held(photo, restored)
@@ -266,6 +269,19 @@ def _checked(
     evidence = Evidence(job.noise, job.clip, known, errors, [sensor.measured for sensor in sensors])
     restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
     return restored, verdict.without_map()
+
+
+def _without_own_grain(photo: Planes, restored: Planes, softness: float) -> NDArray[np.float32]:
+    """1 where the solution lacks the photo's fine contrast, less where it has it in a scene out of focus.
+
+    There nothing fine is but grain, which the inverse of the blur has amplified: more would be too much.
+    """
+    fine = []
+    for planes in (restored, photo):
+        light = planes.mean(axis=0)
+        fine.append(ndimage.uniform_filter(np.square(light - ndimage.uniform_filter(light, 3)), _WINDOW))
+    own = np.clip(fine[0] / np.maximum(fine[1], np.float32(1e-12)), 0.0, 1.0)
+    return np.asarray(1.0 - softness * own, dtype=np.float32)
 
 
 def texture_share(

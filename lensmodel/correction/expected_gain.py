@@ -117,10 +117,14 @@ class ZoneReport:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The share of each channel's kernel to use in a cell (the rest is a point), and the expected error."""
+    """The share of each channel's kernel to use in a cell (the rest is a point), and the expected error.
+
+    `softness` says how far the scene is out of focus, 0 to 1.
+    """
 
     shares: tuple[float, ...]
     forecast: CellForecast
+    softness: float
 
 
 def plan(
@@ -142,7 +146,8 @@ def plan(
 
     Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
     gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
-    that would do harm if the true kernel were sharper by z standard deviations, H = K + z D^(1/2) K / |K|.
+    that would do harm if the true kernel were sharper by z standard deviations, H = K + z D^(1/2) K / |K|,
+    and t is 0: nothing fine is there but grain, of which the solution has enough.
 
     Parameters
     ----------
@@ -153,6 +158,7 @@ def plan(
     """
     before = after = 0.0
     shares: list[float] = []
+    softs: list[float] = []
     times = frequency_counts(_GRID)
     measured = ring_power(tile).mean(axis=1)
     for c, (posterior, offset, sensor) in enumerate(zip(posteriors, offsets, sensors, strict=True)):
@@ -164,16 +170,17 @@ def plan(
         )
         D, n = posterior.variance, float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
         level, slope = scene_law(measured[c], K.real**2 + K.imag**2 + D, n)
-        S, z = scene_power(level, slope), np.float32(_SHARPER * softness(slope))
+        softs.append(softness(slope))
+        S, z = scene_power(level, slope), np.float32(_SHARPER * softs[c])
+        back = np.float32(returned * (1.0 - softs[c]))
         remaining, harm = np.empty((2, _SHARES.size))
-        before += _remaining(
-            K, point, S, D, times, np.float32(n), _SHARES, np.float32(returned), z, remaining, harm
-        )
+        before += _remaining(K, point, S, D, times, np.float32(n), _SHARES, back, z, remaining, harm)
         best = int(np.argmin(np.where(harm > 0.0, np.inf, remaining)))
         shares.append(float(_SHARES[best]))
         after += float(remaining[best])
     error = float(np.mean([posterior.error for posterior in posteriors]))
-    return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
+    forecast = CellForecast(zone_of(cell.position.r), before, after, error)
+    return Plan(tuple(shares), forecast, float(np.mean(softs)))
 
 
 @jit

@@ -165,7 +165,6 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     edge: Number,
     steepness: Number,
     terms: Real,
-    ridge: Real,
     explained: Real,
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
@@ -173,7 +172,6 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
     `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
     the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
-    `ridge` is one more term of the denominators, noise over the power of a scene out of focus.
     `explained` receives what the result makes of the data, blurred again.
     """
     channels, height, width = x.shape
@@ -218,7 +216,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                         if drift.shape[0] > 0:
                             spectrum -= E[c, i, j]
                         P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
-                            ONE / (power + ridge[c, i, j] + weight * smooth[i, j])
+                            ONE / (power + weight * smooth[i, j])
                         )
             else:
                 for i in range(height):
@@ -226,9 +224,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                         k = K[c, i, j]
                         power = k.real * k.real + k.imag * k.imag
                         data = power * X[c, i, j] + np.conj(k) * D[i, j]
-                        P[i, j] = (data + weight * P[i, j]) * (
-                            ONE / (power + ridge[c, i, j] + weight * smooth[i, j])
-                        )
+                        P[i, j] = (data + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
                 X[c] = P
             to_plane(P, x[c])
     for c in range(channels):

@@ -24,7 +24,7 @@ def half_quadratic_on_device(
     xp, shape, whole, noise, variance = device.xp, (*p.y.shape[1:],), bool(p.known.all()), p.noise, p.variance
     decay, prior_power = prior((shape[0], shape[1]))
     data, mask, transfer, zero = (device.send(a) for a in (p.y, p.known, p.K, np.zeros_like(p.y)))
-    smoothness, ridge, scales, turn = (device.send(a) for a in (p.smooth, p.ridge, p.scale, p.rotation))
+    smoothness, scales, turn = (device.send(a) for a in (p.smooth, p.scale, p.rotation))
     levels = np.maximum(variance - noise, np.float32(0.005) * variance + np.float32(1e-12))
 
     def forward(planes: Array) -> Array:
@@ -67,7 +67,7 @@ def half_quadratic_on_device(
         else:
             predicted = back(transfer * X if change is None else transfer * X + change)
             fit = power * X + conjugate * forward(xp.where(mask, data - predicted, zero))
-        X = (fit + weight * forward(pull)) / (power + ridge + weight * smoothness)
+        X = (fit + weight * forward(pull)) / (power + weight * smoothness)
         x = back(X)
     X = forward(x) if whole else X
     predicted = back(transfer * X if change is None else transfer * X + change)

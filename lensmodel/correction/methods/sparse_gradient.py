@@ -21,8 +21,7 @@ from lensmodel.correction.deconvolver import Restored, Sensor, Solution
 from lensmodel.correction.devices import chosen
 from lensmodel.correction.methods.half_quadratic_on_device import half_quadratic_on_device
 from lensmodel.correction.methods.shrinkage import Shrinkage
-from lensmodel.correction.posterior import GRID, WIDEST
-from lensmodel.correction.scene_power import frequency_squared, prior, ring_power, scene_law, softness
+from lensmodel.correction.scene_power import prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
 from lensmodel.correction.tiles.local_statistics import BlockMeans, signal_variance, smoothed, spread_blocks
@@ -50,12 +49,11 @@ class SparseGradient:
     solved by half-quadratic splitting [1]_ with auxiliary gradients w, whose coupling b grows::
 
         w = T' prox( T f_j * x ; kappa / b ),
-        X_c = ( conj(K) Y~ + b var sum_j conj(F_j) W_j ) / ( |K|² + b var sum_j |F_j|² + var / S )
+        X_c = ( conj(K) Y~ + b var sum_j conj(F_j) W_j ) / ( |K|² + b var sum_j |F_j|² )
 
-    Four departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
+    Three departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
     local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
-    because edges of all colours coincide; a mosaic's tile that is all out of focus has the power S of its
-    own spectrum, any other S = inf; and unmeasured pixels take the model's own prediction as
+    because edges of all colours coincide; and unmeasured pixels take the model's own prediction as
     data, Y~ = F x, which maximises the likelihood of what was measured. Such a guess converges too
     slowly for lights above the clipping level: see `Lights`, which removes them first.
 
@@ -231,7 +229,6 @@ class SparseGradient:
             across=ramp(1),
             rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
             prox=prox,
-            ridge=_ridge(blurred / light[:, None, None], blurs, sensors, noise, canvas.shape),
         )
 
 
@@ -273,7 +270,6 @@ class SparseProblem:
     across: NDArray[np.float32]
     rotation: NDArray[np.float32]
     prox: Shrinkage
-    ridge: NDArray[np.float32]
 
 
 def _determined_share(
@@ -344,38 +340,9 @@ def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
         np.float32(p.prox.edge),
         np.float32(p.prox.steepness),
         p.prox.terms,
-        p.ridge,
         explained,
     )
     return x, explained
-
-
-def _ridge(
-    planes: Planes,
-    blurs: Sequence[UniformBlur],
-    sensors: Sequence[Sensor],
-    noise: NDArray[np.float32],
-    shape: tuple[int, int],
-) -> NDArray[np.float32]:
-    """Noise over the power of the scene, as far as all of a mosaic's tile is out of focus: Wiener's term.
-
-    A prior of sparse gradients takes a soft edge for a blurred hard one, and draws stairs. Of a developed
-    file more counts as noise than there is (`LinearPhoto.correction_noise`): detail of skies would be lost.
-    """
-    ridge = np.zeros((len(planes), shape[0], shape[1] // 2 + 1), np.float32)
-    if all(sensor.measured is None for sensor in sensors):
-        return ridge
-    greatest = ring_power(planes).max(axis=1)  # of the blocks: one in focus keeps its detail
-    for c, blur in enumerate(blurs):
-        if blur.kernel.shape[0] > WIDEST:
-            continue  # the grid does not hold it
-        H = blur.spectrum(GRID)
-        level, slope = scene_law(greatest[c], H.real**2 + H.imag**2, float(noise[c]))
-        if (soft := softness(slope)) > 0.0:
-            scale = np.float32(soft * float(noise[c]) / level)
-            ridge[c] = scale * frequency_squared(shape) ** np.float32(slope / 2)
-            ridge[c, 0, 0] = 0.0
-    return ridge
 
 
 def _calm(

@@ -17,6 +17,13 @@ class TooWide:
         return PsfPosterior.of_error(gaussian(25, 2.3**2 * np.eye(2)), 0.4)
 
 
+class Exact:
+    """The true kernel."""
+
+    def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
+        return PsfPosterior.of_error(gaussian(25, 1.5**2 * np.eye(2)), 0.0)
+
+
 @pytest.mark.parametrize("cfa", [None, ((0, 1), (1, 2))])
 def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide(cfa: BayerPattern | None) -> None:
     rng = np.random.default_rng(5)
@@ -31,3 +38,23 @@ def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide(cfa: Ba
     inner = np.s_[:, 20:-20, 20:-20]
     before, after = (np.square(planes - scene)[inner].mean() for planes in (photo, made.planes))
     assert after <= 1.01 * before
+
+
+def test_an_edge_in_focus_before_what_is_not_is_sharpened() -> None:
+    rng, sigma = np.random.default_rng(7), 0.004
+    blobs = ndimage.gaussian_filter(rng.standard_normal((3, 300, 300)), (0, 7.0, 7.0))
+    scene = 0.2 + 0.06 * blobs / blobs.std()
+    scene[:, 150:] += 0.2
+    seen = ndimage.gaussian_filter(scene, (0, 1.5, 1.5)) + sigma * rng.standard_normal(scene.shape)
+
+    made = correct_planes(
+        seen.astype(np.float32),
+        Exact(),
+        Frame(300, 300),
+        noise=[NoiseModel(0.0, sigma**2)] * 3,
+        cfa=((0, 1), (1, 2)),
+    )
+
+    beside = np.s_[:, 144:156, 30:-30]
+    before, after = (np.square(planes - scene)[beside].mean() for planes in (seen, made.planes))
+    assert after < 0.25 * before

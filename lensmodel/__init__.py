@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from lensmodel.model import ModelSettings, PsfAnswer
     from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
-    from lensmodel.photo.arrays import photo_from_array
+    from lensmodel.photo.development import photo_from_array
     from lensmodel.workflow.lens import Lens
     from lensmodel.workflow.sampling import CalibrationEvent
 
@@ -69,7 +69,7 @@ __all__ = [
 
 _HOMES: Final = {
     "lensmodel.api": ("calibrate", "correct"),
-    "lensmodel.photo.arrays": ("photo_from_array",),
+    "lensmodel.photo.development": ("photo_from_array",),
     "lensmodel.blind": ("PsfEstimate", "PsfEstimator", "estimators"),
     "lensmodel.patches": ("Selector", "selectors"),
     "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),

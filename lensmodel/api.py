@@ -19,7 +19,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.model import ModelSettings
 from lensmodel.patches import Selector
-from lensmodel.photo.arrays import photo_from_array
+from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.location import gps_directory
 from lensmodel.workflow.calibrating import Calibration, LensStore
 from lensmodel.workflow.correcting import correct_photo, lateral_of

@@ -18,7 +18,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import imagecodecs
 import numpy as np
@@ -217,20 +217,6 @@ DeclaredCurve: TypeAlias = float | NDArray[np.float64] | None
 """An exponent, a table of linear light, or that of sRGB."""
 
 
-def _declared_profile(white: tuple[float, float], primaries: Sequence[float], curve: DeclaredCurve) -> bytes:
-    """Make a profile of chromaticities x, y and a curve."""
-    if curve is None:
-        curve = srgb_to_linear(np.linspace(0.0, 1.0, _CURVE_POINTS))
-    chosen = (
-        {"gamma": curve}
-        if isinstance(curve, float)
-        else {"transferfunction": np.rint(np.asarray(curve) * 65535.0).astype(np.uint16)}
-    )
-    xy = np.asarray(primaries, dtype=np.float64).reshape(3, 2)
-    places = [*white, 1.0], np.hstack([xy, np.ones((3, 1))]).ravel().tolist()
-    return _undated(imagecodecs.cms_profile("rgb", whitepoint=places[0], primaries=places[1], **chosen))
-
-
 def named_profile(name: Literal["srgb", "adobergb"]) -> bytes:
     """Return the profile of a standard colour space."""
     return _undated(imagecodecs.cms_profile(name))
@@ -269,7 +255,14 @@ class ColourSpace:
         usual = curve is None or (isinstance(curve, float) and abs(curve - USUAL_GAMMA) < 0.02)
         if usual and max(abs(a - b) for a, b in pairs) < 0.002:  # files round them
             return None
-        return _declared_profile(self.white, self.primaries, curve)
+        chosen: dict[str, Any] = {"gamma": curve}
+        if not isinstance(curve, float):
+            table = srgb_to_linear(np.linspace(0.0, 1.0, _CURVE_POINTS)) if curve is None else curve
+            chosen = {"transferfunction": np.rint(table * 65535.0).astype(np.uint16)}
+        xy = np.reshape(self.primaries, (3, 2))
+        primaries = np.hstack([xy, np.ones((3, 1))]).ravel().tolist()
+        white = [*self.white, 1.0]
+        return _undated(imagecodecs.cms_profile("rgb", whitepoint=white, primaries=primaries, **chosen))
 
 
 def _bt709(codes: NDArray[np.float64]) -> NDArray[np.float64]:

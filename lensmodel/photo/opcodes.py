@@ -6,7 +6,6 @@ Source: Adobe, "Digital Negative (DNG) Specification" 1.6, 2021, chapter 7.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -41,19 +40,16 @@ class Opcode:
 
 def read(block: bytes) -> list[Opcode]:
     """Take a list apart; one that is damaged gives what came before the damage."""
-    return list(_steps(block))
-
-
-def _steps(block: bytes) -> Iterator[Opcode]:
-    at = 4
-    for _ in range(min(struct.unpack(">I", block[:4])[0], _MOST) if len(block) >= 4 else 0):
+    steps, at = list[Opcode](), 4
+    for _ in range(min(int.from_bytes(block[:4], "big"), _MOST) if len(block) >= 4 else 0):
         if at + 16 > len(block):
-            return
+            break
         number, version, flags, size = struct.unpack_from(">4I", block, at)
-        if at + 16 + size > len(block):
-            return
-        yield Opcode(number, version, flags, block[at + 16 : at + 16 + size])
         at += 16 + size
+        if at > len(block):
+            break
+        steps.append(Opcode(number, version, flags, block[at - size : at]))
+    return steps
 
 
 def written(steps: list[Opcode]) -> bytes:
@@ -67,20 +63,17 @@ def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opco
 
     A gain map of every second pixel of a mosaic is that of a colour; of the two greens the mean is taken.
     """
-    kept: list[Opcode] = []
-    lost: list[Opcode] = []
-    greens: list[int] = []
+    kept, lost, green = list[Opcode](), list[Opcode](), -1
     for step in steps:
         mapped = _gain_of_colours(step, cfa) if step.number == _GAIN_MAP else None
         if mapped is None:
             lost.append(step)
             continue
         colour, whole = mapped
-        if colour == 1 and greens and len(kept[greens[-1]].data) == len(whole.data):
-            kept[greens[-1]] = _mean(kept[greens[-1]], whole)
+        if colour == 1 and green >= 0 and len(kept[green].data) == len(whole.data):
+            kept[green] = _mean(kept[green], whole)
             continue
-        if colour == 1:
-            greens.append(len(kept))
+        green = len(kept) if colour == 1 else green
         kept.append(whole)
     return kept, lost
 

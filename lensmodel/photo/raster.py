@@ -1,7 +1,9 @@
-"""TIFF, PNG and JPEG: their numbers in full precision, and developed to linear light."""
+"""TIFF, PNG and JPEG: their numbers in full precision, laid as on the sensor, developed to linear light."""
 
 from __future__ import annotations
 
+import io
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ from lensmodel.core.errors import (
     LensModelError,
     NotAnImageError,
     TruncatedImageError,
+    TurnedPixelsError,
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
@@ -28,7 +31,7 @@ from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_p
 from lensmodel.photo.containers import Header
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
-from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, Transfer
+from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, PhotoMetadata, Transfer
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col)` or `(row, col, channel)`."""
@@ -230,3 +233,84 @@ def _three_channels(pixels: Pixels) -> Pixels:
     if pixels.shape[2] > 4:
         raise UnsupportedFormatError(f"a picture of {pixels.shape[2]} channels is no photo; give RGB")
     return pixels[:, :, :3]
+
+
+# --- pixels that a program has turned upright ---------------------------------------------------
+
+ORIENTATION: Final = {1: 6, 3: 8}
+"""EXIF orientation of the sensor's pixels, by the quarter turns that lead from the upright ones to them."""
+
+_OFFSET, _LENGTH = 0x0201, 0x0202  # of a JPEG thumbnail in the second directory of EXIF
+_MOST_BYTES: Final = 1 << 20  # of a thumbnail: the block of EXIF in a JPEG holds 64 KiB
+_MOST_PIXELS: Final = 1 << 20
+_ROWS: Final = 48  # of both pictures when they are compared (chosen)
+_ALIKE: Final = 0.9
+"""Correlation of a picture with its own thumbnail, at least (chosen: compression leaves more than .98)."""
+_CLEARER: Final = 0.2  # by which the other turn correlates less, at least (chosen)
+
+
+def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int | None:
+    """Quarter turns, counter-clockwise, from the stored pixels to the sensor's; None if nothing tells.
+
+    Cameras store pixels as the sensor lies, wider than high, and say by EXIF how to turn them. A program that
+    turns them and sets the orientation to 1 hides which side of the picture was the top of the sensor. Most
+    leave the camera's thumbnail as it was: of both quarter turns that one is right which lays the picture
+    over it.
+    """
+    if header.height <= header.width or metadata.orientation != 1 or metadata.camera_model is None:
+        return 0
+    thumbnail = _thumbnail(header)
+    if thumbnail is None or thumbnail.height >= thumbnail.width:
+        return None
+    try:
+        with unwarned(), Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+            image.draft("L", (256, 256))
+            picture = np.asarray(image.convert("L"), dtype=np.float64)
+    except UNDECODABLE:
+        return None
+    aspect = picture.shape[0] / picture.shape[1]
+    seen = _sized(_without_bars(np.asarray(thumbnail, dtype=np.float64), aspect), aspect)
+    turned = {k: _sized(np.rot90(picture, k), aspect) for k in ORIENTATION}
+    if min(float(each.std()) for each in (seen, *turned.values())) == 0.0:
+        return None
+    alike = {k: float(np.corrcoef(each.ravel(), seen.ravel())[0, 1]) for k, each in turned.items()}
+    best, other = sorted(alike, key=alike.__getitem__, reverse=True)
+    return best if alike[best] > _ALIKE and alike[best] - alike[other] > _CLEARER else None
+
+
+def require_known_turn(info: PhotoInfo) -> None:
+    """Refuse to learn from a photo of which nobody can tell how it lay on the sensor."""
+    if info.turns is None:
+        raise TurnedPixelsError(
+            "a program has turned its pixels upright, and nothing tells which way: no place of it is "
+            "known on the sensor; give the file as the camera wrote it"
+        )
+
+
+def _thumbnail(header: Header) -> Image.Image | None:
+    for reader in header.tiff:
+        tags, _ = reader.directory(reader.directory(reader.first)[1])
+        if start := tags.integer(_OFFSET):
+            begin = reader.base + start
+            data = bytes(reader.buffer[begin : begin + min(tags.integer(_LENGTH), _MOST_BYTES)])
+            try:
+                with unwarned():
+                    image = Image.open(io.BytesIO(data), formats=("JPEG",))
+                if image.width * image.height <= _MOST_PIXELS:
+                    return image.convert("L")
+            except UNDECODABLE:
+                continue
+    return None
+
+
+def _without_bars(thumbnail: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
+    """The middle of a thumbnail of 4 : 3 that holds a wider picture between black bars."""
+    rows = min(thumbnail.shape[0], round(thumbnail.shape[1] / aspect))
+    top = (thumbnail.shape[0] - rows) // 2
+    return thumbnail[top : top + rows]
+
+
+def _sized(picture: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
+    size = (math.ceil(_ROWS * aspect), _ROWS)
+    small = Image.fromarray(picture.astype(np.float32)).resize(size, Image.Resampling.BOX)
+    return np.asarray(small, dtype=np.float64)

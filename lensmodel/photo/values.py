@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
@@ -268,16 +269,8 @@ class LinearPhoto:
         coarser grain; what compression adds is seen only where there is detail.
         """
         if self.sensor_noise is not None:
-            factors, base = _DEMOSAICED, self.sensor_noise
-        else:
-            red, green, blue = (min(max(grain, 1.0), _COARSEST_POWER) for grain in self.grain)
-            factors, base = (red, green, blue), self.noise
-        coded = self.coding_noise or NoiseModel(0.0, 0.0)
-        r, g, b = (
-            NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
-            for n, factor in zip(base, factors, strict=True)
-        )
-        return r, g, b
+            return self._noise_of(self.sensor_noise, _DEMOSAICED)
+        return self._noise_of(self.noise, [min(max(grain, 1.0), _COARSEST_POWER) for grain in self.grain])
 
     @property
     def correction_noise(self) -> PlaneNoise:
@@ -292,10 +285,14 @@ class LinearPhoto:
         """
         if self.sensor_noise is not None:
             return self.sensor_noise
+        coarser = [min(max(grain / _USUAL_GRAIN, 1.0), _COARSEST) for grain in self.grain]
+        return self._noise_of(self.noise, [_PROCESSED * factor for factor in coarser])
+
+    def _noise_of(self, base: PlaneNoise, factors: Sequence[float]) -> PlaneNoise:
+        """Noise of each plane times a factor, and no less than compression adds."""
         coded = self.coding_noise or NoiseModel(0.0, 0.0)
-        factors = [_PROCESSED * min(max(grain / _USUAL_GRAIN, 1.0), _COARSEST) for grain in self.grain]
         r, g, b = (
             NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
-            for n, factor in zip(self.noise, factors, strict=True)
+            for n, factor in zip(base, factors, strict=True)
         )
         return r, g, b

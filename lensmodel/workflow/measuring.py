@@ -11,7 +11,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto, inspect
-from lensmodel.photo.turned import require_known_turn
+from lensmodel.photo.raster import require_known_turn
 from lensmodel.workflow.sampling import require_aperture, settings_of
 
 DEFAULT_SIZE: Final = 31  # pixels: that of an estimate

@@ -42,7 +42,7 @@ from lensmodel.model import LensModel
 from lensmodel.model.answer import DEFAULT, PAPER
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto, PhotoMetadata
-from lensmodel.photo.turned import require_known_turn
+from lensmodel.photo.raster import require_known_turn
 from lensmodel.workflow.lens import Lens
 
 log = logging.getLogger(__name__)

@@ -167,6 +167,8 @@ def test_a_linear_dng_keeps_its_planes(tmp_path: Path) -> None:
 
     agree(developed.planes, planes, atol=1e-4)
     assert developed.sensor_noise is None
+    assert developed.coding_noise is None
+    assert not developed.lossy
 
 
 @pytest.mark.parametrize("black", [(512,) * 3, (2048,) * 3, (512, 600, 700)])
@@ -245,15 +247,22 @@ def test_raw_data_that_are_no_picture_are_refused(
 
 @pytest.mark.parametrize("kind", ["tiff", "png"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_srgb_is_decoded_in_full_precision(tmp_path: Path, kind: str, dtype: type) -> None:
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_srgb_is_decoded_in_full_precision_grey_to_three_planes_and_alpha_dropped_with_a_word(
+    tmp_path: Path, kind: str, dtype: type, channels: int, caplog: pytest.LogCaptureFixture
+) -> None:
     top = np.iinfo(dtype).max
-    pixels = np.rint(np.stack([textured(40, 60, k) for k in range(3)], axis=-1) * top).astype(dtype)
-    developed = photo.develop(save(tmp_path, kind, pixels))
+    pixels = np.rint(np.stack([textured(40, 60, k) for k in range(channels)], axis=-1) * top).astype(dtype)
+    clear = {"photometric": "rgb", "extrasamples": ["unassalpha"]} if (kind, channels) == ("tiff", 4) else {}
+    stored = pixels[..., 0] if channels == 1 else pixels
+    developed = photo.develop(save(tmp_path, kind, stored, **clear))
 
-    truth = srgb_to_linear(np.moveaxis(pixels, -1, 0) / top)
-    agree(developed.planes, truth, atol=1e-6)
+    truth = srgb_to_linear(np.moveaxis(pixels[..., :3], -1, 0) / top)
+    agree(developed.planes, np.broadcast_to(truth, (3, 40, 60)), atol=1e-6)
     assert developed.encoding.bit_depth == 8 * np.dtype(dtype).itemsize
     assert developed.clip == (1.0, 1.0, 1.0)
+    assert developed.remarks == (("its transparency is dropped",) if channels == 4 else ())
+    assert (f"x.{kind}: its transparency" in caplog.text) == (channels == 4)
 
 
 def test_jpeg_is_decoded_by_the_srgb_curve(tmp_path: Path) -> None:
@@ -272,32 +281,6 @@ def test_tiffs_of_all_layouts_are_read(tmp_path: Path, compression: str | None, 
 
     truth = srgb_to_linear(np.moveaxis(pixels, -1, 0) / 65535)
     agree(photo.develop(path).planes, truth, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["tiff", "png"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_grey_becomes_three_equal_planes(tmp_path: Path, kind: str, dtype: type) -> None:
-    pixels = np.rint(textured(40, 60) * np.iinfo(dtype).max).astype(dtype)
-    planes = photo.develop(save(tmp_path, kind, pixels)).planes
-
-    agree(planes[0], srgb_to_linear(pixels / np.iinfo(dtype).max), atol=1e-6)
-    assert (planes[1] == planes[0]).all()
-    assert (planes[2] == planes[0]).all()
-
-
-@pytest.mark.parametrize("kind", ["tiff", "png"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_alpha_is_dropped_with_a_word_and_changes_no_colour(
-    tmp_path: Path, kind: str, dtype: type, caplog: pytest.LogCaptureFixture
-) -> None:
-    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (40, 60, 4), dtype=dtype)
-    options = {"photometric": "rgb", "extrasamples": ["unassalpha"]} if kind == "tiff" else {}
-    developed = photo.develop(save(tmp_path, kind, pixels, **options))
-
-    truth = srgb_to_linear(np.moveaxis(pixels[..., :3], -1, 0) / np.iinfo(dtype).max)
-    agree(developed.planes, truth, atol=1e-6)
-    assert developed.remarks == ("its transparency is dropped",)
-    assert f"x.{kind}: its transparency" in caplog.text
 
 
 @pytest.mark.parametrize("mode", ["P", "RGB", "L", "opaque", "LA"])

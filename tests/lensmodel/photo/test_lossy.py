@@ -14,7 +14,6 @@ from scipy import ndimage
 
 from lensmodel import photo
 from lensmodel.photo.containers import opened_header
-from lensmodel.photo.dng import write_linear_dng
 
 SIDE = 256
 
@@ -72,16 +71,6 @@ def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(quality: int, 
     error = planes[1] - planes[0]
     expected = float(coded.variance(planes[0]).mean())
     assert 0.3 < float(np.square(error).mean()) / expected < 3.0
-
-
-def test_a_linear_dng_without_loss_is_not_lossy(tmp_path: Path) -> None:
-    write_linear_dng(
-        tmp_path / "x.dng",
-        np.moveaxis(scene().astype(np.uint16) * 200, 2, 0),
-    )
-    developed = photo.develop(tmp_path / "x.dng")
-    assert developed.coding_noise is None
-    assert not developed.lossy
 
 
 @pytest.mark.parametrize(

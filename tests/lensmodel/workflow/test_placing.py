@@ -20,7 +20,7 @@ from lensmodel.core.psf import PsfField, PsfSample, gaussian, resized, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
 from lensmodel.model import LensModel
 from lensmodel.model.camera_bodies import circle_mm, on_one_circle
-from lensmodel.photo.arrays import photo_from_array
+from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.workflow import correcting
 from lensmodel.workflow.correcting import placed

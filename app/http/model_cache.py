@@ -50,7 +50,7 @@ class ModelCache:
     def get(self, lens_id: str, version: int | None = None, *, state: LensState | None = None) -> Fitted:
         """Return the model of a lens, current or of an earlier version."""
         # `state` is that of the lens if the caller has just read it
-        state = self._store.lenses.state_of(lens_id) if state is None else state
+        state = self._store.lenses.state_of(lens_id, ANY_OWNER) if state is None else state
         if state is None:
             raise UnknownError("lens", lens_id)
         wanted = replace(state, version=state.version if version is None else version)
@@ -63,7 +63,7 @@ class ModelCache:
             return fitted
         with self._lock_of(lens_id):  # one thread fits, the others wait for its result
             fitted = self._recall(key)
-            newest = wanted if wanted != state else self._store.lenses.state_of(lens_id)
+            newest = wanted if wanted != state else self._store.lenses.state_of(lens_id, ANY_OWNER)
             if fitted is not None and fitted.state == newest:
                 return fitted
             metrics.MODELS.labels("fitted" if fitted is None else "extended").inc()

@@ -46,7 +46,7 @@ class CorrectionWork:
     def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
         run = self._jobs.start(correction_id, epoch)
-        row = None if run is None else self._jobs.correction(correction_id, ANY_OWNER)
+        row = None if run is None else self._jobs.get(correction_id, ANY_OWNER)
         if run is None or row is None:
             return
         try:
@@ -54,7 +54,7 @@ class CorrectionWork:
         except NotWantedError:
             log.info("correction %s is not wanted any more", correction_id)
         except JobFailedError as error:
-            self._jobs.fail(correction_id, error.code, error.detail, epoch=epoch)
+            self._jobs.fail(correction_id, epoch, error.code, error.detail)
 
     def _correct(self, run: Run, row: CorrectionRow) -> None:
         photo, params, settings = row.photo, row.params, self._context.settings

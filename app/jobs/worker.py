@@ -177,7 +177,7 @@ class Worker:
             "pid": os.getpid(),
             "pid_started": started_at(os.getpid()),
         }
-        _insist(partial(self._store.jobs.register, self.id, confined=self._confined, **about))
+        _insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined), **about))
         self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
@@ -222,7 +222,7 @@ class Worker:
         why, subject = (ending.code, ending.detail), str(job.arguments[0])
         number = int(job.arguments[1])
         if job.kind == "correction":
-            self._store.jobs.fail(subject, *why, epoch=number)
+            self._store.jobs.fail(subject, number, *why)
         elif job.kind == "measure":
             unknown = {"error": None, "coverage": None, "problem": ending.code}
             self._store.lenses.record_metrics(subject, number, unknown)

@@ -145,7 +145,7 @@ def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
 
 def find_correction(call: Call, correction_id: str) -> CorrectionRow:
     """Return a correction of the owner with its photo and lens."""
-    return found("correction", correction_id, call.store.jobs.correction(correction_id, call.owner))
+    return found("correction", correction_id, call.store.jobs.get(correction_id, call.owner))
 
 
 @router.get("/corrections", operation_id="listCorrections")
@@ -154,7 +154,7 @@ def list_corrections(
 ) -> Page[CorrectionOut]:
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)
-    rows = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1, photo=photo)
+    rows = call.store.jobs.page(call.owner, before=cursor, limit=limit + 1, photo=photo)
     return paged(call, rows, limit, views.correction_out)
 
 

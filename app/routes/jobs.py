@@ -33,7 +33,7 @@ def find_job(call: Call, job_id: str) -> JobOut:
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None:
         return views.photo_job(photo)
-    return views.correction_job(found("job", job_id, call.store.jobs.correction(job_id, call.owner)))
+    return views.correction_job(found("job", job_id, call.store.jobs.get(job_id, call.owner)))
 
 
 def fingerprint(job: JobOut) -> str:
@@ -45,7 +45,7 @@ def fingerprint(job: JobOut) -> str:
 def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> Page[JobOut]:
     """List jobs of photos and corrections, newest first."""
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
-    corrections = call.store.jobs.corrections(call.owner, before=cursor, limit=limit + 1)
+    corrections = call.store.jobs.page(call.owner, before=cursor, limit=limit + 1)
     jobs = [*map(views.photo_job, photos), *map(views.correction_job, corrections)]
     newest = sorted(jobs, key=lambda job: job.id, reverse=True)
     following = newest[limit - 1].id if len(newest) > limit else None

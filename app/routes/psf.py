@@ -113,7 +113,7 @@ def _fitted(
     lens_id: str, at: PsfQuery | FieldQuery, call: Call, form: str = ""
 ) -> tuple[Fitted | None, dict[str, str]]:
     """Return the model that answers, None where the browser has its answer already; and the headers."""
-    state = found("lens", lens_id, call.store.lenses.known_of(lens_id, call.owner))
+    state = found("lens", lens_id, call.store.lenses.state_of(lens_id, call.owner))
     fitted = call.models.get(lens_id, at.version, state=state)
     tag = etag(fitted, f"{at.model_dump_json()}{form}")
     fresh = "no-cache" if at.version is None else "max-age=3600"

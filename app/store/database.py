@@ -16,10 +16,10 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar
+from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar, cast
 from uuid import UUID
 
-from sqlalchemy import Connection, Engine, Executable, Select, create_engine, event, make_url
+from sqlalchemy import Connection, CursorResult, Engine, Executable, Select, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -73,20 +73,23 @@ class Database:
     @contextmanager
     def scope(self) -> Iterator[None]:
         """Let all that is read in the block be read in one session: that of a request."""
-        scope = _Scope(self)
-        token = _SCOPE.set(scope)
-        try:
-            yield
-        finally:
-            _SCOPE.reset(token)
-            scope.end()
+        with Session(self.reader, expire_on_commit=False) as session:
+            token = _SCOPE.set(session)
+            try:
+                yield
+            finally:
+                _SCOPE.reset(token)
+
+    def _in_scope(self) -> Session | None:
+        session = _SCOPE.get()
+        return session if session is not None and session.bind is self.reader else None
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
         """Give the session of the request, or one of its own, which sees one state and cannot change it."""
-        scope = _SCOPE.get()
-        if scope is not None and scope.database is self:
-            yield scope.session
+        session = self._in_scope()
+        if session is not None:
+            yield session
             return
         with Session(self.reader, expire_on_commit=False) as session, session.begin():
             yield session
@@ -96,11 +99,12 @@ class Database:
         """Give a session whose changes are committed together at the end, or not at all."""
         # `durable` also survives loss of power: for what a caller may rely on afterwards, such as an accepted
         # upload whose memory card is formatted next
-        engine, scope = self.durable if durable else self.writer, _SCOPE.get()
+        engine = self.durable if durable else self.writer
         with Session(engine, expire_on_commit=False) as session, session.begin():
             yield session
-        if scope is not None and scope.database is self:
-            scope.end()  # what the request reads next is of after the change
+        reads = self._in_scope()
+        if reads is not None:
+            reads.close()  # what the request reads next is of after the change
 
     def close(self) -> None:
         """Close all connections."""
@@ -108,26 +112,7 @@ class Database:
             engine.dispose()
 
 
-class _Scope:
-    """The reading session of one request, opened when it first reads."""
-
-    def __init__(self, database: Database) -> None:
-        self.database = database
-        self._session: Session | None = None
-
-    @property
-    def session(self) -> Session:
-        if self._session is None:
-            self._session = Session(self.database.reader, expire_on_commit=False)
-        return self._session
-
-    def end(self) -> None:
-        if self._session is not None:
-            self._session.close()
-        self._session = None
-
-
-_SCOPE: ContextVar[_Scope | None] = ContextVar("scope", default=None)
+_SCOPE: ContextVar[Session | None] = ContextVar("scope", default=None)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -200,8 +185,7 @@ def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) 
 
 def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any]]) -> int:
     """Insert the rows that break no unique key, leave the others; return how many went in."""
-    if not rows:
-        return 0
+    session.flush()
     dialect = session.get_bind().dialect.name
     insert = sqlite.insert if dialect == "sqlite" else postgresql.insert
     # RETURNING shows on both databases what went in; on PostgreSQL the row count does not
@@ -227,7 +211,7 @@ def insert_or_find(
 
 def changed(session: Session, statement: Executable) -> int:
     """Execute an UPDATE or DELETE; return how many rows it changed."""
-    return session.connection().execute(statement).rowcount
+    return cast("CursorResult[Any]", session.execute(statement)).rowcount
 
 
 def new_id() -> str:

@@ -101,7 +101,7 @@ INVARIANTS: Final = (
         """
         SELECT photo.public_id FROM photo LEFT JOIN lens ON lens.id = photo.lens_id
         WHERE photo.deleted_at IS NULL AND (
-            (state = 'counted' AND (lens.id IS NULL OR counted_at IS NULL OR lens.deleted_at IS NOT NULL))
+            (state = 'counted' AND (lens.id IS NULL OR finished_at IS NULL OR lens.deleted_at IS NOT NULL))
             OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))
         )""",
     ),

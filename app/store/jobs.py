@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias
 
@@ -13,8 +13,8 @@ from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import ConflictError, UnknownError
-from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, owned, present
+from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
+from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of, present
 from app.store.tables import (
     CORRECTION_ACTIVE,
     PHOTO_WORKED_ON,
@@ -26,16 +26,17 @@ from app.store.tables import (
     PhotoRow,
     WorkerRow,
 )
+from app.store.work import Works
 
 Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
 
 ENDED_BADLY: Final = ("failed", "cancelled")
+_REQUEST: Final = ("photo_id", "lens_id", "lens_version", "params_hash")
 
-# States of unfinished work by its kind, of work that nobody began first
-_STATES: Final[Mapping[str, tuple[str, ...]]] = {"photo": PHOTO_WORKED_ON, "correction": CORRECTION_ACTIVE}
-_TABLES: Final[Mapping[Kind, type[PhotoRow | CorrectionRow]]] = {
-    "photo": PhotoRow,
-    "correction": CorrectionRow,
+# Tables of unfinished work by its kind, and its states, that of work which nobody began first
+_TABLES: Final[Mapping[Kind, tuple[type[PhotoRow | CorrectionRow], tuple[str, ...]]]] = {
+    "photo": (PhotoRow, PHOTO_WORKED_ON),
+    "correction": (CorrectionRow, CORRECTION_ACTIVE),
 }
 
 
@@ -66,12 +67,12 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A finished file and how to hand it out."""
+    """A finished file and how to hand it out, as the columns `result_` of its correction have it."""
 
     key: str
     etag: str
     media_type: str
-    size: int
+    bytes: int
     name: str
 
 
@@ -80,8 +81,10 @@ def params_hash(params: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-class Jobs(Repository):
-    """Work of all owners, and who does it. `ANY_OWNER` asks as the service itself."""
+class Jobs(Works[CorrectionRow]):
+    """Corrections, and who does the work of all owners."""
+
+    table, active, unfinished = CorrectionRow, CORRECTION_ACTIVE, CORRECTION_ACTIVE
 
     # --- corrections ------------------------------------------------------------------------------
 
@@ -90,20 +93,14 @@ class Jobs(Repository):
         self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:
         """Create a correction, or return the one of the same request; True if it is new."""
-        request = {
-            "photo_id": photo.id,
-            "lens_id": lens.id,
-            "lens_version": version,
-            "params_hash": params_hash(params),
-        }
+        request = dict(zip(_REQUEST, (photo.id, lens.id, version, params_hash(params)), strict=True))
         fresh = {
             **request,
             "public_id": new_id(),
             "owner_id": photo.owner_id,
             "params": dict(params),
             "state": "queued",
-            "created_at": now(),
-            **dict.fromkeys(("attempt", "progress_done", "progress_total"), 0),
+            **dict.fromkeys(("created_at", "stage_at"), now()),
         }
         current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
         # by its public id: SQLite may have given the key of a deleted photo to another one
@@ -116,59 +113,24 @@ class Jobs(Repository):
         return row, created
 
     @reads
-    def correction(self, session: Session, correction_id: str, owner: Owner) -> CorrectionRow | None:
-        """Return one correction with its photo and its lens, or None."""
-        return find_owned(session, CorrectionRow, correction_id, owner)
-
-    @reads
-    def corrections(
+    def page(
         self, session: Session, owner: str, *, before: str | None, limit: int, photo: PhotoRow | None = None
     ) -> list[CorrectionRow]:
         """Return corrections with their photos and lenses, newest first."""
-        query = owned(CorrectionRow, owner).order_by(CorrectionRow.public_id.desc()).limit(limit)
-        if before is not None:
-            query = query.where(CorrectionRow.public_id < before)
-        if photo is not None:
-            query = query.where(CorrectionRow.photo_id == photo.id)
-        return list(session.scalars(query))
-
-    def is_live(self, correction_id: str, epoch: int | None = None) -> bool:
-        """Say whether the correction is still wanted: the cancel poll."""
-        row = self.correction(correction_id, ANY_OWNER)
-        return row is not None and row.state in CORRECTION_ACTIVE and epoch in {None, row.epoch}
+        of_photo = [] if photo is None else [CorrectionRow.photo_id == photo.id]
+        return page_of(session, CorrectionRow, owner, *of_photo, before=before, limit=limit)
 
     @writes
-    def set_state(
-        self,
-        session: Session,
-        /,
-        correction_id: str,
-        from_states: Sequence[str],
-        to: str,
-        *,
-        epoch: int | None = None,
-        run: Run | None = None,
-        **fields: object,
-    ) -> bool:
-        """Move a correction from one of `from_states` to `to`; False where it was in none of them."""
-        # With `epoch` only if it was not started anew since, with `run` only if that is its last one
-        conditions = [CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states)]
-        if epoch is not None:
-            conditions.append(CorrectionRow.epoch == epoch)
-        if run is not None:
-            conditions += [CorrectionRow.epoch == run.epoch, CorrectionRow.attempt == run.attempt]
-        return changed(session, update(CorrectionRow).where(*conditions).values(state=to, **fields)) == 1
-
-    @writes
-    def start(self, session: Session, correction_id: str, epoch: int | None = None) -> Run | None:
+    def start(self, session: Session, correction_id: str, epoch: int) -> Run | None:
         """Begin, or begin again after the death of a worker; None if it is not to be done any more."""
         # What an earlier run has stored becomes garbage
-        row = find_to_change(session, CorrectionRow, correction_id, ANY_OWNER)
-        if row is None or row.state not in CORRECTION_ACTIVE or epoch not in {None, row.epoch}:
+        begun = {"started_at": now()}
+        row = self.move(session, correction_id, ANY_OWNER, CORRECTION_ACTIVE, "running", begun, epoch=epoch)
+        if row is None:
             return None
         if row.attempt:
             discard(session, row.run_folder)
-        row.state, row.started_at, row.attempt = "running", now(), row.attempt + 1
+        row.attempt += 1
         return Run(row.public_id, row.epoch, row.attempt)
 
     @writes
@@ -178,47 +140,34 @@ class Jobs(Repository):
         row = find_to_change(session, CorrectionRow, correction_id, owner)
         if row is None or row.state not in ENDED_BADLY:
             return False
-        columns = ("photo_id", "lens_id", "lens_version", "params_hash")
-        if session.scalar(_same({name: getattr(row, name) for name in columns})) is not None:
+        if session.scalar(_same({name: getattr(row, name) for name in _REQUEST})) is not None:
             return False
         discard(session, row.run_folder)
         row.epoch += 1
-        row.state, row.stage = "queued", None
+        row.state, row.stage, row.stage_at = "queued", None, now()
         row.error_code = row.error_detail = row.started_at = row.finished_at = None
         row.attempt = row.progress_done = row.progress_total = 0
         return True
 
-    def progress(self, run: Run, done: int, total: int, stage: str = "correcting") -> None:
+    @writes
+    def progress(self, session: Session, run: Run, done: int, total: int, stage: str = "correcting") -> None:
         """Record how far a running correction is."""
-        how_far: dict[str, Any] = {"progress_done": done, "progress_total": total, "stage": stage}
-        self.set_state(run.correction_id, ("running",), "running", run=run, **how_far)
+        fields = {"progress_done": done, "progress_total": total, "stage": stage}
+        self._move_run(session, run, "running", fields)
 
-    def finish(self, run: Run, result: Result, report: Mapping[str, Any]) -> bool:
+    @writes
+    def finish(self, session: Session, run: Run, result: Result, report: Mapping[str, Any]) -> bool:
         """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
-        return self.set_state(
-            run.correction_id,
-            ("running",),
-            "succeeded",
-            run=run,
-            report=dict(report),
-            result_key=result.key,
-            result_etag=result.etag,
-            result_media_type=result.media_type,
-            result_bytes=result.size,
-            result_name=result.name,
-            finished_at=now(),
+        fields = {f"result_{name}": value for name, value in asdict(result).items()}
+        fields |= {"report": dict(report), "finished_at": now()}
+        return self._move_run(session, run, "succeeded", fields)
+
+    def _move_run(self, session: Session, run: Run, state: str, fields: Mapping[str, object]) -> bool:
+        key, epoch, attempt = run.correction_id, run.epoch, run.attempt
+        return (
+            self.move(session, key, ANY_OWNER, ("running",), state, fields, epoch=epoch, attempt=attempt)
+            is not None
         )
-
-    def fail(self, correction_id: str, code: str, detail: str, *, epoch: int | None = None) -> bool:
-        """End with a reason."""
-        why: dict[str, Any] = {"error_code": code, "error_detail": detail, "finished_at": now()}
-        return self.set_state(correction_id, CORRECTION_ACTIVE, "failed", epoch=epoch, **why)
-
-    def cancel(self, correction_id: str, owner: Owner) -> bool:
-        """Cancel an unfinished correction; False if it was finished already."""
-        if self.correction(correction_id, owner) is None:
-            return False
-        return self.set_state(correction_id, CORRECTION_ACTIVE, "cancelled", finished_at=now())
 
     @reads
     def ended_before(self, session: Session, moment: datetime, limit: int = 100) -> list[str]:
@@ -247,12 +196,11 @@ class Jobs(Repository):
             .where(EventRow.metrics.is_(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
         )
         jobs = [Job("measure", (row[0], row[1])) for row in session.execute(query.limit(limit))]
-        for kind, table in _TABLES.items():
-            states = _STATES[kind] if begun else _STATES[kind][:1]
+        for kind, (table, states) in _TABLES.items():
             rows = session.execute(
                 select(table.public_id, table.epoch, OwnerRow.name)
                 .join(OwnerRow, OwnerRow.id == table.owner_id)
-                .where(table.state.in_(states), *present(table))
+                .where(table.state.in_(states if begun else states[:1]), *present(table))
                 .order_by(table.id)
                 .limit(10 * limit if begun else limit)
             )
@@ -262,18 +210,15 @@ class Jobs(Repository):
     @reads
     def load(self, session: Session) -> tuple[dict[tuple[str, str], int], dict[str, float]]:
         """Return unfinished jobs by kind and state, and for how many seconds the oldest of a kind waits."""
-        jobs = {(kind, state): 0 for kind, states in _STATES.items() for state in states}
-        oldest = dict.fromkeys(_STATES, 0.0)
-        for kind, table, since in (
-            ("photo", PhotoRow, PhotoRow.stage_at),
-            ("correction", CorrectionRow, CorrectionRow.created_at),
-        ):
-            unfinished = (table.state.in_(_STATES[kind]), *present(table))
-            counted = select(table.state, func.count(), func.min(since)).where(*unfinished)
-            for state, count, first in session.execute(counted.group_by(table.state)):
-                jobs[kind, state] = count
-                if state == _STATES[kind][0]:
-                    oldest[kind] = max((now() - first).total_seconds(), 0.0)
+        jobs: dict[tuple[str, str], int] = {}
+        oldest: dict[str, float] = {}
+        for kind, (table, states) in _TABLES.items():
+            unfinished = (table.state.in_(states), *present(table))
+            query = select(table.state, func.count(), func.min(table.stage_at)).where(*unfinished)
+            found = {row[0]: row for row in session.execute(query.group_by(table.state))}
+            jobs |= {(kind, state): found[state][1] if state in found else 0 for state in states}
+            waits = now() - found[states[0]][2] if states[0] in found else timedelta(0)
+            oldest[kind] = max(waits.total_seconds(), 0.0)
         return jobs, oldest
 
     # --- workers ----------------------------------------------------------------------------------
@@ -284,29 +229,12 @@ class Jobs(Repository):
 
     @writes
     def register(
-        self,
-        session: Session,
-        worker_id: str,
-        *,
-        host: str,
-        pid: int,
-        pid_started: float,
-        confined: Iterable[str] = (),
+        self, session: Session, worker_id: str, *, host: str, pid: int, pid_started: float, confined: str = ""
     ) -> None:
         """Enter a new worker, with the measures that confine its children."""
-        at = self._now(session)
-        session.add(
-            WorkerRow(
-                id=worker_id,
-                host=host,
-                pid=pid,
-                pid_started=pid_started,
-                confined=" ".join(confined),
-                state="live",
-                started_at=at,
-                heartbeat_at=at,
-            )
-        )
+        times = dict.fromkeys(("started_at", "heartbeat_at"), self._now(session))
+        process = {"host": host, "pid": pid, "pid_started": pid_started, "confined": confined}
+        session.add(WorkerRow(id=worker_id, **process, **times))
 
     @writes
     def beat(self, session: Session, worker_id: str) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from sqlalchemy import and_, bindparam, delete, func, select, update
 from sqlalchemy.orm import Session
@@ -24,7 +24,7 @@ from app.store.owners import (
     find_to_change,
     is_id,
     now,
-    owned,
+    page_of,
 )
 from app.store.samples import COLUMNS, LensState, sample_in
 from app.store.tables import (
@@ -46,6 +46,13 @@ NO_RESULT: Final = ("failed", "cancelled")
 
 # How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
+# Whether an event lets the samples of its photo join the model, or takes them out
+_JOINS: Final = {
+    "photo_added": True,
+    "photo_included": True,
+    "photo_excluded": False,
+    "photo_removed": False,
+}
 _STATE: Final = select(LensRow.version, LensRow.rebuild_epoch).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
@@ -90,14 +97,9 @@ class Lenses(Repository):
         serial: str | None = None,
     ) -> list[LensRow]:
         """Return lenses, newest first, optionally of one model or serial, compared without case."""
-        query = owned(LensRow, owner).order_by(LensRow.public_id.desc()).limit(limit)
-        if before is not None:
-            query = query.where(LensRow.public_id < before)
-        if model is not None:
-            query = query.where(func.lower(LensRow.model) == model.lower())
-        if serial is not None:
-            query = query.where(func.lower(LensRow.serial) == serial.lower())
-        return list(session.scalars(query))
+        wanted = ((LensRow.model, model), (LensRow.serial, serial))
+        same = [func.lower(column) == value.lower() for column, value in wanted if value is not None]
+        return page_of(session, LensRow, owner, *same, before=before, limit=limit)
 
     @reads
     def with_photos_beyond(
@@ -168,19 +170,14 @@ class Lenses(Repository):
 
     # --- samples ----------------------------------------------------------------------------------
 
-    def state_of(self, lens_id: str) -> LensState | None:
-        """Return the version of a lens by one read through its key; None if there is no such lens."""
-        with self.database.reader.connect() as connection:
-            row = connection.execute(_STATE, {"lens": lens_id}).one_or_none()
-            return None if row is None else LensState(*row)
-
-    def known_of(self, lens_id: str, owner: str) -> LensState | None:
-        """Return `state_of` a lens of an owner by one read; None if the owner has no such lens."""
+    def state_of(self, lens_id: str, owner: Owner) -> LensState | None:
+        """Return the version of a lens by one read; None if the owner has no such lens."""
         # Without a session, which costs time: part of every request that a cached model answers
         if not is_id(lens_id):
             return None
+        which = {"lens": lens_id} if owner is ANY_OWNER else {"lens": lens_id, "owner": owner}
         with self.database.reader.connect() as connection:
-            row = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).one_or_none()
+            row = connection.execute(_STATE if owner is ANY_OWNER else _KNOWN, which).one_or_none()
             return None if row is None else LensState(*row)
 
     def samples_of(
@@ -249,7 +246,6 @@ class Lenses(Repository):
         for photo in photos:
             move_photo(session, photo, target)
         target.complete(lens.maker, lens.model)
-        session.flush()
         _forget(session, lens)
         return True
 
@@ -269,7 +265,6 @@ class Lenses(Repository):
             .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(CORRECTION_ACTIVE))
             .values(state="cancelled", finished_at=now())
         )
-        session.flush()
         _forget(session, lens)
         return True
 
@@ -288,21 +283,18 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
         return None
     name = LensName(photo.lens_maker, photo.lens_model, photo.lens_serial, photo.lens_serial_source or "none")
-    return _found(session, photo.owner_id, name, creates=photo.calibrate)
-
-
-def named(session: Session, owner_id: int, name: LensName) -> LensRow:
-    """Return the lens of a serial, creating it if need be; a label always creates a new lens."""
-    lens = _found(session, owner_id, name, creates=True)
-    assert lens is not None
-    return lens
+    if photo.calibrate:
+        return named(session, photo.owner_id, name)
+    key = identity_key(name.maker, name.model, name.serial)
+    return session.scalar(select(LensRow).where(*_same(photo.owner_id, key)).with_for_update())
 
 
 def _same(owner_id: int, key: str) -> tuple[Any, ...]:
     return LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
 
 
-def _found(session: Session, owner_id: int, name: LensName, *, creates: bool) -> LensRow | None:
+def named(session: Session, owner_id: int, name: LensName) -> LensRow:
+    """Return the lens of a serial, creating it if need be; a label always creates a new lens."""
     key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
     fresh = {
         "public_id": new_id(),
@@ -314,43 +306,57 @@ def _found(session: Session, owner_id: int, name: LensName, *, creates: bool) ->
         "serial_source": "user" if name.label else name.serial_source if name.serial else "none",
         "label": name.label,
         "created_at": now(),
-        **dict.fromkeys(("version", "rebuild_epoch", "photo_count", "sample_count"), 0),
     }
     # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
     query = select(LensRow).where(*_same(owner_id, key)).with_for_update()
-    return insert_or_find(session, LensRow, fresh, query, "lens")[0] if creates else session.scalar(query)
+    return insert_or_find(session, LensRow, fresh, query, "lens")[0]
 
 
 # --- samples and versions -------------------------------------------------------------------------
 
 
-def join(session: Session, photo: PhotoRow, kind: str) -> int:
-    """Let the samples of a counted photo join its lens; return the new version of the lens."""
-    assert photo.lens_id is not None
-    version = new_version(session, photo.lens_id, rebuild=kind != "photo_added")
-    added = _set_samples(session, photo, lens_id=photo.lens_id, version_added=version)
-    record_event(session, photo.lens_id, version, kind, photo, samples_added=added)
-    return version
+def note_change(session: Session, photo: PhotoRow, kind: str) -> int:
+    """Give the lens of a photo a new version, which `kind` explains; return it."""
+    # The lens's row is locked until the transaction ends. Its samples and photos are counted anew, never
+    # incremented.
+    query = select(LensRow).where(LensRow.id == photo.lens_id).with_for_update()
+    lens = session.scalars(query.execution_options(populate_existing=True)).one()
+    if lens.version:  # before the first there was nothing to report
+        discard(session, _reports_prefix(lens), after=STILL_WRITTEN)
+    lens.version += 1
+    # where samples went away or changed, models in memory are fitted anew instead of extended
+    lens.rebuild_epoch += kind != "photo_added"
+    change = 0
+    if kind in _JOINS:
+        belongs = (lens.id, lens.version) if _JOINS[kind] else (None, None)
+        samples = dict(zip(("lens_id", "version_added"), belongs, strict=True))
+        change = changed(session, update(SampleRow).where(SampleRow.photo_id == photo.id).values(samples))
+    lens.sample_count, lens.photo_count = session.execute(
+        select(func.count(), func.count(SampleRow.photo_id.distinct())).where(SampleRow.lens_id == lens.id)
+    ).one()
+    session.add(
+        EventRow(
+            lens_id=lens.id,
+            version=lens.version,
+            kind=kind,
+            photo_public_id=photo.public_id,
+            epoch=photo.epoch,
+            samples_added=change if _JOINS.get(kind) else -change,
+            samples=lens.sample_count,
+            photos=lens.photo_count,
+            created_at=now(),
+        )
+    )
+    return lens.version
 
 
-def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
-    """Take the samples of a photo out of its lens, which gets a new version that must be fitted anew."""
-    assert photo.lens_id is not None
-    version = new_version(session, photo.lens_id, rebuild=True)
-    dropped = _set_samples(session, photo, lens_id=None, version_added=None)
-    record_event(session, photo.lens_id, version, kind, photo, samples_added=-dropped)
-
-
-def switch(session: Session, photo: PhotoRow, after: Literal["counted", "excluded"]) -> bool:
-    """Exclude a counted photo from its lens's model, or include it again; False if it is in another state."""
-    if photo.state != ("counted" if after == "excluded" else "excluded"):
-        return False
+def switch(session: Session, photo: PhotoRow, *, excluded: bool) -> bool:
+    """Exclude a counted photo from its lens's model, or include it again; False if it is in neither state."""
+    after = "excluded" if excluded else "counted"
+    if photo.state not in {"counted", "excluded"} or photo.state == after:
+        return photo.state == after
     photo.state, photo.stage_at = after, now()
-    session.flush()
-    if after == "excluded":
-        give_back(session, photo, "photo_excluded")
-    else:
-        join(session, photo, "photo_included")
+    note_change(session, photo, "photo_excluded" if excluded else "photo_included")
     return True
 
 
@@ -359,77 +365,20 @@ def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
     if photo.lens_id == lens.id:
         return
     if photo.state == "counted":
-        give_back(session, photo, "photo_removed")
+        note_change(session, photo, "photo_removed")
     photo.lens_id = lens.id
     photo.given = {**photo.given, "lens_id": lens.public_id}
-    session.flush()
     if photo.state == "counted":
-        join(session, photo, "photo_included")
+        note_change(session, photo, "photo_included")
 
 
-def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
-    """Raise the version by one and return it."""
-    # The UPDATE locks the lens's row until the transaction ends. `rebuild` says that samples went away or
-    # changed: models in memory must be fitted anew instead of extended.
-    raised = 1 if rebuild else 0
-    version, epoch, public_id = session.execute(
-        update(LensRow)
-        .where(LensRow.id == lens_id)
-        .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + raised)
-        .returning(LensRow.version, LensRow.rebuild_epoch, LensRow.public_id)
-    ).one()
-    if version > 1:  # before the first there was nothing to report
-        discard(session, _reports_prefix(public_id, version - 1, epoch - raised), after=STILL_WRITTEN)
-    return int(version)
-
-
-def _reports_prefix(lens_id: str, version: int, epoch: int) -> str:
-    return f"models/{lens_id}/{version}-{epoch}/"
+def _reports_prefix(lens: LensRow) -> str:
+    return f"models/{lens.public_id}/{lens.version}-{lens.rebuild_epoch}/"
 
 
 def report_key(lens_id: str, version: int, epoch: int) -> str:
     """Return the key of the report that a worker makes of one version of a lens."""
-    return f"{_reports_prefix(lens_id, version, epoch)}report.json"
-
-
-def _set_samples(session: Session, photo: PhotoRow, **columns: int | None) -> int:
-    """Let the samples of a photo belong to its lens, or to none; return how many."""
-    assert photo.lens_id is not None
-    count = changed(session, update(SampleRow).where(SampleRow.photo_id == photo.id).values(**columns))
-    recount_samples(session, photo.lens_id)
-    return count
-
-
-def recount_samples(session: Session, lens_id: int) -> None:
-    """Count the samples and photos of a lens anew: recomputed, never incremented."""
-    samples, photos = session.execute(
-        select(func.count(), func.count(SampleRow.photo_id.distinct())).where(SampleRow.lens_id == lens_id)
-    ).one()
-    session.execute(
-        update(LensRow).where(LensRow.id == lens_id).values(sample_count=samples, photo_count=photos)
-    )
-
-
-def record_event(
-    session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow, *, samples_added: int
-) -> None:
-    """Write one line of the lens's history."""
-    samples, photos = session.execute(
-        select(LensRow.sample_count, LensRow.photo_count).where(LensRow.id == lens_id)
-    ).one()
-    session.add(
-        EventRow(
-            lens_id=lens_id,
-            version=version,
-            kind=kind,
-            photo_public_id=photo.public_id,
-            epoch=photo.epoch,
-            samples_added=samples_added,
-            samples=samples,
-            photos=photos,
-            created_at=now(),
-        )
-    )
+    return f"models/{lens_id}/{version}-{epoch}/report.json"
 
 
 # --- deletion -------------------------------------------------------------------------------------
@@ -438,23 +387,19 @@ def record_event(
 def forget_if_empty(session: Session, photo: PhotoRow) -> None:
     """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it."""
     # A lens that the owner named stays as long as there is any photo of it, even a failed one
-    if photo.lens_id is None:
-        return
     lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
-    session.flush()
+    if lens is None or lens.deleted_at is not None:
+        return
     others = select(PhotoRow.id).where(
-        PhotoRow.lens_id == photo.lens_id, PhotoRow.deleted_at.is_(None), PhotoRow.id != photo.id
+        PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None), PhotoRow.id != photo.id
     )
-    named_by_owner = lens is not None and (lens.label is not None or lens.serial_source == "user")
+    named_by_owner = lens.label is not None or lens.serial_source == "user"
     if not named_by_owner:
         others = others.where(PhotoRow.state.not_in(NO_RESULT))
     keeps = named_by_owner and photo.deleted_at is None
-    if lens is None or lens.deleted_at is not None or keeps or session.scalar(others.limit(1)) is not None:
-        return
-    session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
-    photo.lens_id = None
-    session.flush()
-    _forget(session, lens)
+    if not keeps and session.scalar(others.limit(1)) is None:
+        session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
+        _forget(session, lens)
 
 
 def _unlearn(session: Session, photo: PhotoRow) -> None:
@@ -463,7 +408,7 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     elif photo.state in {"counted", "excluded"}:
         photo.state, photo.calibrate = "stored", False
     photo.stage_at = now()
-    photo.lens_id, photo.counted_at = None, None
+    photo.lens_id = None
     photo.given = {name: value for name, value in photo.given.items() if name != "lens_id"}
     forget_patches(session, photo)
 

@@ -28,7 +28,7 @@ class AnyOwner(Enum):
 ANY_OWNER: Final = AnyOwner.ANY
 # Whose rows are asked for; there is no default, so that nobody asks for everybody's by leaving it out
 Owner: TypeAlias = str | AnyOwner
-Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
+Row = TypeVar("Row", PhotoRow, LensRow, CorrectionRow)
 
 # What is read with a row: what nearly all who ask for it need of it
 _WITH: Final[dict[type[Base], tuple[ORMOption, ...]]] = {
@@ -60,9 +60,9 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
     return key
 
 
-def owned(table: type[Owned], owner: Owner) -> Select[Owned]:
+def owned(table: type[Row], owner: Owner) -> Select[Row]:
     """Select the rows of one owner, or of `ANY_OWNER`, that are not deleted."""
-    query: Select[Owned] = select(table).options(*_WITH[table]).where(*present(table))
+    query: Select[Row] = select(table).options(*_WITH[table]).where(*present(table))
     if owner is not ANY_OWNER:
         query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
     return query
@@ -73,19 +73,34 @@ def present(table: type[PhotoRow | LensRow | CorrectionRow]) -> tuple[ColumnElem
     return () if issubclass(table, CorrectionRow) else (table.deleted_at.is_(None),)
 
 
-def find_owned(session: Session, table: type[Owned], public_id: str, owner: Owner) -> Owned | None:
+def page_of(
+    session: Session,
+    table: type[Row],
+    owner: Owner,
+    *conditions: ColumnElement[bool],
+    before: str | None,
+    limit: int,
+) -> list[Row]:
+    """Return rows, newest first, that came before the row `before`."""
+    query = owned(table, owner).where(*conditions).order_by(table.public_id.desc()).limit(limit)
+    return list(session.scalars(query if before is None else query.where(table.public_id < before)))
+
+
+def find_owned(
+    session: Session, table: type[Row], public_id: str, owner: Owner, *, to_change: bool = False
+) -> Row | None:
     """Return one row by its public id if it is this owner's."""
-    return None if not is_id(public_id) else session.scalar(_by_id(table, public_id, owner))
-
-
-def find_to_change(session: Session, table: type[Owned], public_id: str, owner: Owner) -> Owned | None:
-    """Return as `find_owned`, locked until the transaction ends: what is read still holds when it is changed.
-
-    SQLite has one writer at a time anyway.
-    """
+    # To be changed it is locked until the transaction ends: what is read still holds when it is changed.
+    # SQLite has one writer at a time anyway.
     if not is_id(public_id):
         return None
-    return session.scalar(_by_id(table, public_id, owner).with_for_update(of=table))
+    query = owned(table, owner).where(table.public_id == public_id)
+    return session.scalar(query.with_for_update(of=table) if to_change else query)
+
+
+def find_to_change(session: Session, table: type[Row], public_id: str, owner: Owner) -> Row | None:
+    """Return as `find_owned`, locked."""
+    return find_owned(session, table, public_id, owner, to_change=True)
 
 
 def discard(session: Session, *prefixes: str, after: timedelta = LATE) -> None:
@@ -97,7 +112,3 @@ def discard(session: Session, *prefixes: str, after: timedelta = LATE) -> None:
 def is_id(text: str) -> bool:
     """Say whether a text can be an id of ours; PostgreSQL refuses some others with an error."""
     return text.isascii() and text.isalnum()
-
-
-def _by_id(table: type[Owned], public_id: str, owner: Owner) -> Select[Owned]:
-    return owned(table, owner).where(table.public_id == public_id)

@@ -12,8 +12,8 @@ from typing import Any, Final
 from sqlalchemy import Select, func, select, update
 from sqlalchemy.orm import Session
 
-from app.store.database import Repository, insert_new, reads, writes
-from app.store.owners import now
+from app.store.database import Repository, reads, writes
+from app.store.owners import ANY_OWNER, find_to_change, now
 from app.store.samples import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.psf import PsfSample
@@ -21,6 +21,7 @@ from lensmodel.core.psf import PsfSample
 # Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
 # diagonal is 3,600 pixels
 DIGITS: Final = 4
+_PLANNED: Final = ("idx", "cell", "row", "col", "size", "r", "phi", "score")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +57,20 @@ class Patches(Repository):
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
-        of_plan = {"photo_id": photo.id, "epoch": epoch, "state": "pending"}
-        columns = ("idx", "cell", "row", "col", "size", "r", "phi", "score")
-        rows = [
-            {**of_plan, **{name: getattr(patch, name) for name in columns}}
-            for patch in patches
-            if patch.rejected is None
-        ]
-        insert_new(session, PatchRow, rows)
-        rejected = [patch for patch in patches if patch.rejected is not None]
         if photo.windows is None:
+            session.add_all(
+                PatchRow(
+                    photo_id=photo.id,
+                    epoch=epoch,
+                    state="pending",
+                    **{name: getattr(patch, name) for name in _PLANNED},
+                )
+                for patch in patches
+                if patch.rejected is None
+            )
+            rejected = [patch for patch in patches if patch.rejected is not None]
             photo.windows, photo.windows_rejected = _packed(rejected), len(rejected)
-        return recount_patches(session, photo)
+        return _recount(session, photo)
 
     @reads
     def patches(self, session: Session, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
@@ -104,23 +107,25 @@ class Patches(Repository):
     def add_samples(self, session: Session, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
         """Store the samples of some patches and mark these done; return how many samples were new."""
         # Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated call
-        # stores nothing twice: patch and channel are a unique key.
+        # stores nothing twice: what is done stays as it is.
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
-        of_numbers = select(PatchRow).where(
-            PatchRow.photo_id == photo.id,
-            PatchRow.epoch == epoch,
-            PatchRow.idx.in_({sample.idx for sample in samples}),
-        )
-        patches = {patch.idx: patch for patch in session.scalars(of_numbers)}
-        rows = [columns_of(new.sample, photo, patches[new.idx]) for new in samples if new.idx in patches]
-        stored = insert_new(session, SampleRow, rows)
+        of_patches = {(new.idx, new.sample.settings.channel): new for new in samples}
+        numbers = {new.idx for new in samples}
+        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers))
+        query = select(PatchRow).where(*mine, PatchRow.state != "done")
+        patches = {patch.idx: patch for patch in session.scalars(query)}
+        rows = [
+            SampleRow(**columns_of(new.sample, photo, patches[new.idx]))
+            for new in of_patches.values()
+            if new.idx in patches
+        ]
+        session.add_all(rows)
         for patch in patches.values():
-            patch.state, patch.finished_at = "done", patch.finished_at or now()
-        session.flush()
-        recount_patches(session, photo)
-        return stored
+            patch.state, patch.finished_at = "done", now()
+        _recount(session, photo)
+        return len(rows)
 
     @writes
     def fail_patches(
@@ -147,7 +152,7 @@ class Patches(Repository):
         session.execute(
             update(PatchRow).where(*which).values(state=state, reason=reason[:60], finished_at=now())
         )
-        recount_patches(session, photo)
+        _recount(session, photo)
 
 
 def _patches_of(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
@@ -160,19 +165,12 @@ def _patches_of(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
 
 def _selecting(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
     """Return a photo whose patches may change, locked: on PostgreSQL a cancel waits, and the other way."""
-    return session.scalar(
-        select(PhotoRow)
-        .where(
-            PhotoRow.public_id == photo_id,
-            PhotoRow.epoch == epoch,
-            PhotoRow.state.in_(("selecting", "estimating")),
-            PhotoRow.deleted_at.is_(None),
-        )
-        .with_for_update()
-    )
+    photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+    may = photo is not None and photo.epoch == epoch and photo.state in {"selecting", "estimating"}
+    return photo if may else None
 
 
-def recount_patches(session: Session, photo: PhotoRow) -> int:
+def _recount(session: Session, photo: PhotoRow) -> int:
     """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
     rows = session.execute(
         select(PatchRow.state, func.count())
@@ -203,18 +201,8 @@ def _packed(rejected: Sequence[NewPatch]) -> dict[str, Any]:
 
 def _unpacked(stored: dict[str, Any] | None) -> list[PatchRow]:
     """Return the windows of `_packed` as rows that belong to no table."""
-    if stored is None:
-        return []
+    known, names = stored or {"windows": []}, ("idx", "row", "col", "size", "r", "phi")
     return [
-        PatchRow(
-            idx=idx,
-            row=row,
-            col=col,
-            size=size,
-            r=r,
-            phi=phi,
-            state="rejected",
-            reason=stored["reasons"][reason],
-        )
-        for idx, row, col, size, r, phi, reason in stored["windows"]
+        PatchRow(**dict(zip(names, places, strict=True)), state="rejected", reason=known["reasons"][reason])
+        for *places, reason in known["windows"]
     ]

@@ -7,22 +7,21 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Final, Literal
+from typing import Any, Final
 
-from sqlalchemy import case, delete, select, update
+from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session, joinedload
 
 from app import distances
 from app.errors import BusyError, UnknownError
 from app.store import lenses
-from app.store.database import changed, insert_new, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.lenses import LensName, forget_if_empty, forget_patches, give_back, join
-from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, owned
+from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
+from app.store.lenses import LensName, forget_if_empty, forget_patches, note_change
+from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, page_of
 from app.store.patches import Patches
 from app.store.samples import PROFILE, columns_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
-    PHOTO_FINAL,
     PHOTO_UNFINISHED,
     PHOTO_WORKED_ON,
     PROFILE_FILE,
@@ -33,6 +32,7 @@ from app.store.tables import (
     PhotoRow,
     SampleRow,
 )
+from app.store.work import Works
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 
@@ -69,13 +69,10 @@ class Received:
     wants_file: bool = False  # whether the photo is known without its file, which has now come again
 
 
-class Photos(Patches):
-    """Photos of all owners, with their patches. `ANY_OWNER` asks as the service itself."""
+class Photos(Patches, Works[PhotoRow]):
+    """Photos of all owners, with their patches."""
 
-    @reads
-    def get(self, session: Session, photo_id: str, owner: Owner) -> PhotoRow | None:
-        """Return one photo with its lens, or None."""
-        return find_owned(session, PhotoRow, photo_id, owner)
+    table, active, unfinished = PhotoRow, PHOTO_WORKED_ON, PHOTO_UNFINISHED
 
     @reads
     def newest_file(self, session: Session) -> str | None:
@@ -94,14 +91,12 @@ class Photos(Patches):
         state: str | None = None,
     ) -> list[PhotoRow]:
         """Return photos with their lenses, newest first, that came before the photo `before`."""
-        query = owned(PhotoRow, owner).where(PhotoRow.kind != PROFILE_FILE)
-        if before is not None:
-            query = query.where(PhotoRow.public_id < before)
+        conditions = [PhotoRow.kind != PROFILE_FILE]
         if lens_id is not None:
-            query = query.where(PhotoRow.lens.has(LensRow.public_id == lens_id))
+            conditions.append(PhotoRow.lens.has(LensRow.public_id == lens_id))
         if state is not None:
-            query = query.where(PhotoRow.state == state)
-        return list(session.scalars(query.order_by(PhotoRow.public_id.desc()).limit(limit)))
+            conditions.append(PhotoRow.state == state)
+        return page_of(session, PhotoRow, owner, *conditions, before=before, limit=limit)
 
     @reads
     def unneeded(self, session: Session, limit: int = 100) -> list[str]:
@@ -134,13 +129,6 @@ class Photos(Patches):
         return list(session.scalars(query.where(PhotoRow.state.not_in(PHOTO_WORKED_ON)).limit(limit)))
 
     @reads
-    def is_live(self, session: Session, photo_id: str, epoch: int) -> bool:
-        """Say whether work for this epoch of the photo is still wanted: the cancel poll."""
-        of_epoch = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch)
-        wanted = (PhotoRow.state.not_in(PHOTO_FINAL), PhotoRow.deleted_at.is_(None))
-        return session.scalar(select(PhotoRow.id).where(*of_epoch, *wanted)) is not None
-
-    @reads
     def siblings(self, session: Session, photo: PhotoRow, limit: int) -> list[PhotoRow]:
         """Return the newest other RAW photos of the same owner and body whose file is kept."""
         if photo.body_key is None:
@@ -167,37 +155,28 @@ class Photos(Patches):
     def receive(
         self,
         session: Session,
+        /,
         owner: str,
         *,
-        public_id: str,
-        sha256: str,
-        filename: str,
-        kind: str,
-        byte_size: int,
-        blob_key: str,
-        calibrate: bool,
         given: Mapping[str, Any],
+        calibrate: bool,
         may_be_new: bool = True,
+        **file: str | int,
     ) -> Received:
         """Store an upload that was announced by `expect`, or find the photo with the same bytes."""
+        # `file`: public_id, sha256, filename, kind, byte_size and blob_key.
         # A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
         # calibrate its lens and was not before, or it waited for settings that are now given
         fresh = {
-            "public_id": public_id,
+            **file,
             "owner_id": ensure_owner(session, owner, may_be_new=may_be_new),
-            "sha256": sha256,
-            "filename": filename,
-            "kind": kind,
-            "byte_size": byte_size,
-            "blob_key": blob_key,
             "calibrate": calibrate,
             "given": _of_upload(given),
             "state": "received",
-            "received_at": now(),
-            "stage_at": now(),
+            **dict.fromkeys(("received_at", "stage_at"), now()),
             **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
         }
-        of_bytes = (PhotoRow.owner_id == fresh["owner_id"], PhotoRow.sha256 == sha256)
+        of_bytes = (PhotoRow.owner_id == fresh["owner_id"], PhotoRow.sha256 == file["sha256"])
         same = select(PhotoRow).where(*of_bytes, PhotoRow.deleted_at.is_(None))
         query = same.options(joinedload(PhotoRow.lens)).with_for_update(of=PhotoRow)
         known, created = insert_or_find(session, PhotoRow, fresh, query, "photo of the same bytes")
@@ -212,8 +191,7 @@ class Photos(Patches):
             or (known.kind == PROFILE_FILE and known.state == "stored")
         )
         if again:
-            known.calibrate = calibrate
-            known.given = merged
+            known.calibrate, known.given = calibrate, merged
             if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
                 restart(session, known)
         return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
@@ -256,23 +234,6 @@ class Photos(Patches):
             photo.state, photo.started_at, photo.stage_at = "inspecting", now(), now()
         photo.attempt += 1
         return photo
-
-    @writes
-    def set_state(
-        self,
-        session: Session,
-        /,
-        photo_id: str,
-        from_states: Sequence[str],
-        to: str,
-        *,
-        epoch: int | None = None,
-        **fields: object,
-    ) -> bool:
-        """Move a photo from one of `from_states` to `to`; False where it was in none of them."""
-        # With `epoch` only if the photo was not started anew since: a worker that lost its lease changes
-        # nothing
-        return change_state(session, photo_id, from_states, to, epoch=epoch, **fields)
 
     @writes
     def record_inspection(
@@ -336,26 +297,22 @@ class Photos(Patches):
         return lens
 
     @writes
-    def fail(self, session: Session, photo_id: str, epoch: int, code: str, detail: str) -> bool:
-        """End a photo that is being worked on with a reason; its samples never count."""
-        fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-        failed = change_state(session, photo_id, PHOTO_WORKED_ON, "failed", epoch=epoch, **fields)
-        if failed:
-            _let_go(session, photo_id)
-        return failed
-
-    @writes
     def finish(self, session: Session, photo_id: str, epoch: int) -> int | None:
         """Count a photo: its samples join the model and the lens's version grows by one."""
         # Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
         # transaction: it happens entirely and once, however often it is tried.
-        done = {"finished_at": now(), "counted_at": now()}
-        if not change_state(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
-            return None
-        photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
-        if photo.lens_id is None:
+        photo = self.move(
+            session, photo_id, ANY_OWNER, ("estimating",), "counted", {"finished_at": now()}, epoch=epoch
+        )
+        if photo is not None and photo.lens_id is None:
             raise ValueError(f"photo {photo_id} has no lens: assign one before it is counted")
-        return join(session, photo, "photo_added")
+        return None if photo is None else note_change(session, photo, "photo_added")
+
+    def _ended_badly(self, session: Session, photo: PhotoRow) -> None:
+        """Forget a lens that only this photo refers to, and with it its serial."""
+        if photo.state == "cancelled":
+            session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+        forget_if_empty(session, photo)
 
     # --- what owners change -----------------------------------------------------------------------
 
@@ -378,10 +335,8 @@ class Photos(Patches):
         photo = find_to_change(session, PhotoRow, photo_id, owner)
         if photo is None:
             return False
-        if excluded is not None:
-            wanted: Literal["excluded", "counted"] = "excluded" if excluded else "counted"
-            if photo.state != wanted and not lenses.switch(session, photo, wanted):
-                return False
+        if excluded is not None and not lenses.switch(session, photo, excluded=excluded):
+            return False
         chosen = _chosen(session, photo, lens, owner)
         begins = calibrate and not photo.calibrate
         if begins and photo.file_gone_at is not None:
@@ -424,19 +379,6 @@ class Photos(Patches):
         return True
 
     @writes
-    def cancel(self, session: Session, photo_id: str, owner: Owner) -> bool:
-        """Cancel an unfinished photo; False if it was finished already."""
-        # Work that still runs sees the state and changes nothing
-        photo = find_to_change(session, PhotoRow, photo_id, owner)
-        if photo is None or not change_state(
-            session, photo_id, PHOTO_UNFINISHED, "cancelled", finished_at=now()
-        ):
-            return False
-        session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-        _let_go(session, photo_id)
-        return True
-
-    @writes
     def delete(self, session: Session, photo_id: str, owner: Owner) -> str | None:
         """Forget a photo, its patches, samples and corrections; return the prefix of its blobs."""
         # The row stays, emptied, because the lens's history refers to it
@@ -444,7 +386,7 @@ class Photos(Patches):
         if photo is None:
             return None
         if photo.state == "counted":
-            give_back(session, photo, "photo_removed")
+            note_change(session, photo, "photo_removed")
         forget_patches(session, photo)
         corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
         discard(session, photo.folder, *(row.folder for row in corrections))
@@ -472,22 +414,20 @@ class Photos(Patches):
             groups[sample.photo, sample.settings.with_channel("g")].append(sample)
         lens = find_to_change(session, LensRow, file.given["lens_id"], ANY_OWNER)
         ended = {"finished_at": now(), "file_gone_at": now()}
-        if lens is None or not change_state(
-            session, file.public_id, ("inspecting",), "stored", epoch=file.epoch, **ended
+        if lens is None or not self.move(
+            session, file.public_id, ANY_OWNER, ("inspecting",), "stored", ended, epoch=file.epoch
         ):
             return None
         discard(session, file.blob_key)
-        here = (PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
-        own = set(session.scalars(select(PhotoRow.public_id).where(*here)))
+        present = (PhotoRow.owner_id == lens.owner_id, PhotoRow.deleted_at.is_(None))
+        own = set(session.scalars(select(PhotoRow.public_id).where(*present, PhotoRow.lens_id == lens.id)))
+        before = set(session.scalars(select(PhotoRow.sha256).where(*present, PhotoRow.kind == PROFILE)))
         imported = 0
         for (photo, settings), of_photo in groups.items():
-            if photo in own:
-                continue
-            name = names.get(photo, photo or PROFILE)
-            row = _imported(session, lens, photo, settings, of_photo[0], name)
-            if row is not None:
-                _estimated(session, row, of_photo)
-                join(session, row, "photo_added")
+            digest = hashlib.sha256(f"{PROFILE}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
+            if photo not in own and digest not in before:
+                name = names.get(photo, photo or PROFILE)[:200]
+                _import(session, lens, settings, of_photo, sha256=digest, filename=name)
                 imported += 1
         return imported
 
@@ -533,11 +473,8 @@ def _correct_settings(
     photo.given = {**photo.given, **given}
     for column, value in columns.items():
         setattr(photo, column, value)
-    session.flush()
     if photo.state == "counted":
-        assert photo.lens_id is not None
-        version = lenses.new_version(session, photo.lens_id, rebuild=True)
-        lenses.record_event(session, photo.lens_id, version, "photo_changed", photo, samples_added=0)
+        note_change(session, photo, "photo_changed")
 
 
 def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
@@ -566,91 +503,53 @@ def _setting(photo: PhotoRow, field: str, header: object) -> object:
     return next((value for value in ranked if value is not None), None)
 
 
-def _let_go(session: Session, photo_id: str) -> None:
-    """Forget a lens that only a photo without a result refers to, and with it its serial."""
-    photo = session.scalars(
-        select(PhotoRow).where(PhotoRow.public_id == photo_id).execution_options(populate_existing=True)
-    ).one()
-    forget_if_empty(session, photo)
-
-
 def restart(session: Session, photo: PhotoRow) -> None:
     """Begin a new epoch of a photo: its samples are deleted, work of the old one that still runs is void."""
     forget_patches(session, photo)
     photo.epoch += 1
     photo.attempt = 0
     photo.state, photo.stage_at = "received", now()
-    photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
+    photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = None
 
 
-def change_state(
-    session: Session,
-    photo_id: str,
-    from_states: Sequence[str],
-    to: str,
-    *,
-    epoch: int | None = None,
-    **fields: object,
-) -> bool:
-    """Move a photo from one of `from_states` to `to`; False where it was in none of them."""
-    conditions = [
-        PhotoRow.public_id == photo_id,
-        PhotoRow.state.in_(from_states),
-        PhotoRow.deleted_at.is_(None),
-    ]
-    if epoch is not None:
-        conditions.append(PhotoRow.epoch == epoch)
-    since = case((PhotoRow.state == to, PhotoRow.stage_at), else_=now())
-    statement = update(PhotoRow).where(*conditions).values(state=to, stage_at=since, **fields)
-    return changed(session, statement) == 1
-
-
-# --- profiles -------------------------------------------------------------------------------------
-
-
-def _imported(
-    session: Session, lens: LensRow, photo: str, settings: LensSettings, first: PsfSample, name: str
-) -> PhotoRow | None:
-    digest = hashlib.sha256(f"{PROFILE}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
-    public_id = new_id()
-    fresh: dict[str, Any] = {
-        "public_id": public_id,
-        "owner_id": lens.owner_id,
-        "lens_id": lens.id,
-        "sha256": digest,
-        "filename": name[:200],
-        "kind": PROFILE,
-        "byte_size": 0,
-        "blob_key": f"photos/{public_id}/original",
-        "calibrate": True,
-        "given": {"lens_id": lens.public_id},
-        "aperture": settings.aperture,
-        "focal_mm": settings.focal_mm,
-        "focus_m": distances.written(settings.focus_m),
-        "pixel_pitch_um": first.pixel_pitch_um,
-        "state": "counted",
-        **dict.fromkeys(("received_at", "stage_at", "started_at", "finished_at", "counted_at"), now()),
-        "file_gone_at": now(),
-    }
-    if insert_new(session, PhotoRow, [fresh]) != 1:
-        return None
-    return session.scalars(select(PhotoRow).where(PhotoRow.public_id == public_id)).one()
-
-
-def _estimated(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) -> None:
-    places: dict[tuple[float, float], int] = {}
-    for sample in samples:
-        places.setdefault(_place(sample), len(places))
-    done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done"}
-    done |= {"row": 0, "col": 0, "size": 0, "finished_at": now()}  # a profile does not say where in pixels
-    rows = [{**done, "idx": idx, "cell": idx, "r": r, "phi": phi} for (r, phi), idx in places.items()]
-    insert_new(session, PatchRow, rows)
-    patches = {row.idx: row for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
-    columns = [columns_of(sample, photo, patches[places[_place(sample)]]) for sample in samples]
-    insert_new(session, SampleRow, columns)
-    photo.patches_total = photo.patches_done = len(places)
+def _import(
+    session: Session, lens: LensRow, settings: LensSettings, samples: Sequence[PsfSample], **names: str
+) -> None:
+    """Add a counted photo without a file, whose patches and samples a profile tells."""
+    public_id, epoch = new_id(), 1
+    places = {(sample.position.r, sample.position.phi): sample.position for sample in samples}
+    photo = PhotoRow(
+        public_id=public_id,
+        owner_id=lens.owner_id,
+        lens_id=lens.id,
+        kind=PROFILE,
+        byte_size=0,
+        blob_key=f"photos/{public_id}/original",
+        calibrate=True,
+        given={"lens_id": lens.public_id},
+        aperture=settings.aperture,
+        focal_mm=settings.focal_mm,
+        focus_m=distances.written(settings.focus_m),
+        pixel_pitch_um=samples[0].pixel_pitch_um,
+        epoch=epoch,
+        state="counted",
+        patches_total=len(places),
+        patches_done=len(places),
+        **dict.fromkeys(("received_at", "stage_at", "started_at", "finished_at", "file_gone_at"), now()),
+        **names,
+    )
+    session.add(photo)
     session.flush()
-
-
-def _place(sample: PsfSample) -> tuple[float, float]:
-    return sample.position.r, sample.position.phi
+    done = {"photo_id": photo.id, "epoch": epoch, "state": "done", "finished_at": now()}
+    done |= dict.fromkeys(("row", "col", "size"), 0)  # a profile does not say where in pixels
+    patches = {
+        place: PatchRow(**done, idx=idx, cell=idx, r=place[0], phi=place[1])
+        for idx, place in enumerate(places)
+    }
+    session.add_all(patches.values())
+    session.flush()
+    own = {(place, s.settings.channel): s for s in samples for place in [(s.position.r, s.position.phi)]}
+    session.add_all(
+        SampleRow(**columns_of(sample, photo, patches[place])) for (place, _), sample in own.items()
+    )
+    note_change(session, photo, "photo_added")

@@ -8,7 +8,7 @@ updates give every effect exactly once, however often a step is repeated.
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any, ClassVar, Final, get_args
+from typing import Annotated, Any, ClassVar, Final, TypeAlias, get_args
 
 from sqlalchemy import (
     JSON,
@@ -19,13 +19,10 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
-    LargeBinary,
     MetaData,
-    String,
     Text,
     TypeDecorator,
     UniqueConstraint,
-    false,
     text,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
@@ -75,9 +72,6 @@ class UtcTime(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value is not None and value.tzinfo is None else value
 
 
-BigKey = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts rows only in INTEGER keys
-
-
 class Base(DeclarativeBase):
     """Base of all tables."""
 
@@ -93,21 +87,54 @@ class Base(DeclarativeBase):
     type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcTime(), dict[str, Any]: JSON(), str: Text()}
 
 
+Key: TypeAlias = Annotated[int, mapped_column(primary_key=True)]
+Name: TypeAlias = Annotated[str, mapped_column(unique=True)]
+OfOwner: TypeAlias = Annotated[int, mapped_column(ForeignKey("owner.id"))]
+OfLens: TypeAlias = Annotated[int, mapped_column(ForeignKey("lens.id"))]
+OfPhoto: TypeAlias = Annotated[int, mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))]
+Count: TypeAlias = Annotated[int, mapped_column(default=0)]
+Big: TypeAlias = Annotated[int, mapped_column(BigInteger)]
+BigKey: TypeAlias = Annotated[  # SQLite counts rows only in INTEGER keys
+    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True)
+]
+
+
 class OwnerRow(Base):
     """Whose photos and lenses these are."""
 
     __tablename__ = "owner"
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    name: Mapped[str] = mapped_column(String(200), unique=True)
+    id: Mapped[Key]
+    name: Mapped[Name]
     # Limit of the bytes of photos; None where the setting applies, as for `quota_photos`
-    quota_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    quota_bytes: Mapped[Big | None]
     quota_photos: Mapped[int | None]
     created_at: Mapped[datetime]
     erased_at: Mapped[datetime | None]  # when erasure of everything was requested; the row is deleted last
 
 
-class LensRow(Base):
+class Owned:
+    """What belongs to an owner, with its id for the outside."""
+
+    id: Mapped[Key]
+    public_id: Mapped[Name]
+    owner_id: Mapped[OfOwner]
+
+
+class Work(Owned):
+    """What workers do for an owner: how far it is, and why it ended."""
+
+    epoch: Mapped[int] = mapped_column(default=1)  # grows when it is started anew after its end
+    attempt: Mapped[Count]  # grows when a worker takes it up
+    state: Mapped[str]
+    stage_at: Mapped[datetime]  # when `state` last changed
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    error_code: Mapped[str | None]
+    error_detail: Mapped[str | None]
+
+
+class LensRow(Owned, Base):
     """One copy of a lens; `version` grows with every change of its samples."""
 
     __tablename__ = "lens"
@@ -117,19 +144,16 @@ class LensRow(Base):
         Index("ix_lens_page", "owner_id", "public_id"),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    public_id: Mapped[str] = mapped_column(String(40), unique=True)
-    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
     maker: Mapped[str | None]
     model: Mapped[str | None]
     serial: Mapped[str | None]
-    serial_source: Mapped[str] = mapped_column(String(20))
+    serial_source: Mapped[str]
     identity_key: Mapped[str]
     label: Mapped[str | None]
-    version: Mapped[int] = mapped_column(default=0)
-    rebuild_epoch: Mapped[int] = mapped_column(default=0)
-    photo_count: Mapped[int] = mapped_column(default=0)
-    sample_count: Mapped[int] = mapped_column(default=0)
+    version: Mapped[Count]
+    rebuild_epoch: Mapped[Count]
+    photo_count: Mapped[Count]
+    sample_count: Mapped[Count]
     created_at: Mapped[datetime]
     deleted_at: Mapped[datetime | None]
 
@@ -138,7 +162,7 @@ class LensRow(Base):
         self.maker, self.model = self.maker or maker, self.model or model
 
 
-class PhotoRow(Base):
+class PhotoRow(Work, Base):
     """One uploaded photo and how far its calibration is."""
 
     __tablename__ = "photo"
@@ -150,14 +174,11 @@ class PhotoRow(Base):
         Index("ix_photo_lens_id_state", "lens_id", "state"),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    public_id: Mapped[str] = mapped_column(String(40), unique=True)
-    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
-    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
-    sha256: Mapped[str] = mapped_column(String(64))
+    lens_id: Mapped[OfLens | None]
+    sha256: Mapped[str]
     filename: Mapped[str]
-    kind: Mapped[str] = mapped_column(String(20))
-    byte_size: Mapped[int] = mapped_column(BigInteger)
+    kind: Mapped[str]
+    byte_size: Mapped[Big]
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
     # What the owner said about the photo; goes before what the file says, except `photos.FALLBACKS`
@@ -168,41 +189,31 @@ class PhotoRow(Base):
     camera_maker: Mapped[str | None]
     camera_model: Mapped[str | None]
     # Digest of the camera and its serial: distinguishes bodies without identifying one
-    body_key: Mapped[str | None] = mapped_column(String(16))
+    body_key: Mapped[str | None]
     lens_maker: Mapped[str | None]
     lens_model: Mapped[str | None]
     lens_serial: Mapped[str | None]
-    lens_serial_source: Mapped[str | None] = mapped_column(String(20))
+    lens_serial_source: Mapped[str | None]
     aperture: Mapped[float | None]
     focal_mm: Mapped[float | None]
     focus_m: Mapped[float | None]  # as `app.distances` writes it
     pixel_pitch_um: Mapped[float | None]
     # Lateral colour that this photo shows: radial polynomials of red and blue
     lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
-    epoch: Mapped[int] = mapped_column(default=1)
-    attempt: Mapped[int] = mapped_column(default=0)
-    state: Mapped[str] = mapped_column(String(20))
-    error_code: Mapped[str | None] = mapped_column(String(40))
-    error_detail: Mapped[str | None]
-    patches_total: Mapped[int] = mapped_column(default=0)
-    patches_done: Mapped[int] = mapped_column(default=0)
-    patches_rejected: Mapped[int] = mapped_column(default=0)
+    patches_total: Mapped[Count]
+    patches_done: Mapped[Count]
+    patches_rejected: Mapped[Count]
     # How many windows were rejected before anything was estimated in them
-    windows_rejected: Mapped[int] = mapped_column(default=0)
+    windows_rejected: Mapped[Count]
     # Those windows, as `app.store.patches` writes them: thousands, never queried one by one
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
     received_at: Mapped[datetime]
-    started_at: Mapped[datetime | None]
-    stage_at: Mapped[datetime]  # when `state` last changed
-    finished_at: Mapped[datetime | None]
-    counted_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
     # Whether the file said where it was taken: none, removed, or unknown; None until it was searched
-    location: Mapped[str | None] = mapped_column(String(10))
+    location: Mapped[str | None]
     # Hash of the stored file where it differs from what was sent, whose hash is `sha256`
-    file_sha256: Mapped[str | None] = mapped_column(String(64))
+    file_sha256: Mapped[str | None]
     file_gone_at: Mapped[datetime | None]  # when the file was deleted, see the setting `keep_photos`
-    owner: Mapped[OwnerRow] = relationship()
     lens: Mapped[LensRow | None] = relationship()  # the lens that it was taken with, where that is known
 
     @property
@@ -220,8 +231,8 @@ class PatchRow(Base):
         UniqueConstraint("photo_id", "epoch", "idx"),
     )
 
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
+    id: Mapped[BigKey]
+    photo_id: Mapped[OfPhoto]
     epoch: Mapped[int]
     idx: Mapped[int]
     cell: Mapped[int | None]
@@ -231,11 +242,11 @@ class PatchRow(Base):
     r: Mapped[float]
     phi: Mapped[float]
     score: Mapped[float | None]
-    state: Mapped[str] = mapped_column(String(20))
-    reason: Mapped[str | None] = mapped_column(String(60))
+    state: Mapped[str]
+    reason: Mapped[str | None]
     finished_at: Mapped[datetime | None]
     # What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`
-    encoded: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
+    encoded: Mapped[bytes | None] = mapped_column(deferred=True)
 
 
 class SampleRow(Base):
@@ -252,20 +263,20 @@ class SampleRow(Base):
         {"sqlite_autoincrement": True},
     )
 
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
+    id: Mapped[BigKey]
+    photo_id: Mapped[OfPhoto]
     patch_id: Mapped[int] = mapped_column(ForeignKey("patch.id", ondelete="CASCADE"))
-    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
+    lens_id: Mapped[OfLens | None]
     version_added: Mapped[int | None]
-    channel: Mapped[str] = mapped_column(String(1))
+    channel: Mapped[str]
     r: Mapped[float]
     phi: Mapped[float]
     weight: Mapped[float]
     predicted_error: Mapped[float | None]
     size: Mapped[int]
     format_version: Mapped[int]
-    crc32: Mapped[int] = mapped_column(BigInteger)
-    psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+    crc32: Mapped[Big]
+    psf: Mapped[bytes] = mapped_column(deferred=True)
     estimator: Mapped[str]
     created_at: Mapped[datetime]
 
@@ -282,11 +293,11 @@ class EventRow(Base):
         ),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id"))
+    id: Mapped[Key]
+    lens_id: Mapped[OfLens]
     version: Mapped[int]
-    kind: Mapped[str] = mapped_column(String(20))
-    photo_public_id: Mapped[str] = mapped_column(String(40))
+    kind: Mapped[str]
+    photo_public_id: Mapped[str]
     epoch: Mapped[int]
     samples_added: Mapped[int]
     samples: Mapped[int]
@@ -295,7 +306,7 @@ class EventRow(Base):
     created_at: Mapped[datetime]
 
 
-class CorrectionRow(Base):
+class CorrectionRow(Work, Base):
     """One photo to be corrected with one version of a lens's model."""
 
     __tablename__ = "correction"
@@ -311,32 +322,21 @@ class CorrectionRow(Base):
         Index("ix_correction_lens_id", "lens_id"),
     )
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    public_id: Mapped[str] = mapped_column(String(40), unique=True)
-    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
-    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
-    lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id"))
+    photo_id: Mapped[OfPhoto]
+    lens_id: Mapped[OfLens]
     lens_version: Mapped[int]
     params: Mapped[dict[str, Any]]
-    params_hash: Mapped[str] = mapped_column(String(64))
-    epoch: Mapped[int] = mapped_column(default=1)  # grows when it is started anew after its end
-    attempt: Mapped[int] = mapped_column(default=0)
-    state: Mapped[str] = mapped_column(String(20))
-    stage: Mapped[str | None] = mapped_column(String(20))
-    progress_done: Mapped[int] = mapped_column(default=0)
-    progress_total: Mapped[int] = mapped_column(default=0)
-    error_code: Mapped[str | None] = mapped_column(String(40))
-    error_detail: Mapped[str | None]
+    params_hash: Mapped[str]
+    stage: Mapped[str | None]
+    progress_done: Mapped[Count]
+    progress_total: Mapped[Count]
     report: Mapped[dict[str, Any] | None]
     result_key: Mapped[str | None]
     result_etag: Mapped[str | None]
     result_media_type: Mapped[str | None]
-    result_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    result_bytes: Mapped[Big | None]
     result_name: Mapped[str | None]
     created_at: Mapped[datetime]
-    started_at: Mapped[datetime | None]
-    finished_at: Mapped[datetime | None]
-    owner: Mapped[OwnerRow] = relationship()
     photo: Mapped[PhotoRow] = relationship()
     lens: Mapped[LensRow] = relationship()
 
@@ -357,15 +357,15 @@ class WorkerRow(Base):
     __tablename__ = "worker"
     __table_args__ = (CheckConstraint(_one_of("state", ("live", "dead")), name="state"),)
 
-    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    id: Mapped[str] = mapped_column(primary_key=True)
     host: Mapped[str]
     pid: Mapped[int]
     pid_started: Mapped[float]  # when the process began: a pid alone may belong to another process by now
-    state: Mapped[str] = mapped_column(String(10))
+    state: Mapped[str] = mapped_column(default="live")
     started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
     # Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces
-    confined: Mapped[str] = mapped_column(String(200), server_default="")
+    confined: Mapped[str]
 
 
 class GarbageRow(Base):
@@ -376,7 +376,7 @@ class GarbageRow(Base):
     prefix: Mapped[str] = mapped_column(primary_key=True)
     not_before: Mapped[datetime]
     # Whether a worker has begun to delete them: from then on no upload may keep them
-    claimed: Mapped[bool] = mapped_column(default=False, server_default=false())
+    claimed: Mapped[bool] = mapped_column(default=False)
 
 
 class KeyRow(Base):
@@ -385,13 +385,13 @@ class KeyRow(Base):
     __tablename__ = "api_key"
     __table_args__ = (Index("ix_api_key_owner_id", "owner_id"),)
 
-    id: Mapped[int] = mapped_column(primary_key=True)
-    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
-    prefix: Mapped[str] = mapped_column(String(20), unique=True)
-    key_hash: Mapped[str] = mapped_column(String(200), unique=True)
+    id: Mapped[Key]
+    owner_id: Mapped[OfOwner]
+    prefix: Mapped[Name]
+    key_hash: Mapped[Name]
     label: Mapped[str | None]
     # Words of `app.store.accounts.SCOPES`, separated by spaces
-    scopes: Mapped[str] = mapped_column(String(60))
+    scopes: Mapped[str]
     created_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]
     expires_at: Mapped[datetime | None]
@@ -405,7 +405,7 @@ class SessionRow(Base):
     __tablename__ = "session"
     __table_args__ = (Index("ix_session_key_id", "key_id"),)
 
-    token_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    token_hash: Mapped[str] = mapped_column(primary_key=True)
     key_id: Mapped[int] = mapped_column(ForeignKey("api_key.id", ondelete="CASCADE"))
     created_at: Mapped[datetime]
     expires_at: Mapped[datetime]

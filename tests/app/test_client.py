@@ -152,7 +152,7 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
     assert not list(tmp_path.glob("*.p*"))
 
     Storage(settings.storage).put("corrections/x/result", b"the file")
-    run = store.jobs.start(correction.id)
+    run = store.jobs.start(correction.id, 1)
     assert run is not None
     store.jobs.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
 

@@ -54,7 +54,7 @@ def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str
     assert lens is not None
     params = {"method": "fast", "strength": 1.0, "output": {"format": "dng"}, "roi": None}
     row, _ = store.jobs.correct(photo, lens, 1, params)
-    run = store.jobs.start(row.public_id)
+    run = store.jobs.start(row.public_id, 1)
     assert run is not None
     key = f"corrections/{row.public_id}/result.dng"
     storage.put(key, b"result")

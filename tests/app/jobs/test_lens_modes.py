@@ -118,9 +118,9 @@ def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, taken: Cal
 def test_that_read_is_for_the_owner_alone(store: Store, taken: Callable[..., str]) -> None:
     lens = taken(6.0, (6000, 4000), 1.5)
 
-    assert store.lenses.known_of(lens, "local") == store.lenses.state_of(lens)
-    assert store.lenses.known_of(lens, "somebody else") is None
-    assert store.lenses.known_of("none", "local") is None
+    assert store.lenses.state_of(lens, "local") == store.lenses.state_of(lens, ANY_OWNER)
+    assert store.lenses.state_of(lens, "somebody else") is None
+    assert store.lenses.state_of("none", "local") is None
 
 
 def test_an_aperture_far_from_all_photos_is_said_to_be_beyond(

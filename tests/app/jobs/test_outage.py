@@ -193,8 +193,8 @@ def failed_correction(store: Store, steps: Any, strength: float = 1.0) -> str:
     photo = steps.counted()
     params = {"method": "fast", "strength": strength, "output": {"format": "png8"}, "roi": None}
     correction = steps.correct(photo, **params)
-    assert store.jobs.start(correction.public_id)
-    assert store.jobs.fail(correction.public_id, "outage", "for a test")
+    assert store.jobs.start(correction.public_id, 1)
+    assert store.jobs.fail(correction.public_id, 1, "outage", "for a test")
     return correction.public_id
 
 
@@ -218,13 +218,13 @@ def test_a_failed_correction_is_retried_as_another_job_of_the_engine(
 
     assert (answer.status_code, answer.json()["state"]) == (202, "queued")
     assert Job("correction", (correction, 2), "local") in store.jobs.to_do()
-    assert not store.jobs.fail(correction, "outage", "said late by the first try", epoch=1)
+    assert not store.jobs.fail(correction, 1, "outage", "said late by the first try")
     assert store.jobs.start(correction, epoch=2)
 
 
 def test_a_retry_gives_way_to_the_same_wish_made_again(client: TestClient, store: Store, steps: Any) -> None:
     correction = failed_correction(store, steps)
-    row = store.jobs.correction(correction, ANY_OWNER)
+    row = store.jobs.get(correction, ANY_OWNER)
     assert row is not None
     store.jobs.correct(row.photo, row.lens, row.lens_version, row.params)
 

@@ -663,7 +663,7 @@ def test_a_correction_ends_with_a_file(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
     assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
@@ -697,7 +697,7 @@ def test_a_correction_with_a_version_without_samples_fails(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "no_samples")
 
@@ -727,7 +727,7 @@ def test_a_child_cannot_hand_in_a_file_from_elsewhere(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "internal_error")
 
@@ -768,7 +768,7 @@ def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(
     sandbox.answers["correct"] = [paused, write_result]
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.attempt, row.report) == (
         "succeeded",
@@ -791,7 +791,7 @@ def test_a_run_of_before_a_retry_reports_nothing(
     sandbox.answers["correct"] = [retried]
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.epoch, row.result_key) == ("queued", 2, None)
 
@@ -898,7 +898,7 @@ def test_a_report_that_no_correction_makes_ends_it(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "internal_error")
 
@@ -925,6 +925,6 @@ def test_a_cancelled_correction_stays_cancelled(
     sandbox.answers["correct"] = [cancel]
     CorrectionWork(context).correction(key)
 
-    row = context.store.jobs.correction(key, ANY_OWNER)
+    row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.result_key) == ("cancelled", None)

@@ -88,7 +88,7 @@ def finished(
     for name in SIDES.values():
         write_tiles(settings.data_dir / name, a_picture())
         blobs.put(f"{folder}{name}", settings.data_dir / name)
-    run = store.jobs.start(made["id"])
+    run = store.jobs.start(made["id"], 1)
     assert run is not None
     audit = {
         "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"re-blur": 0.1}}},

@@ -30,7 +30,7 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
     key = f"corrections/{correction_id}/result"
     Storage(settings.storage).put(key, FILE)
     etag = hashlib.sha256(FILE).hexdigest()
-    run = store.jobs.start(correction_id)
+    run = store.jobs.start(correction_id, 1)
     assert run is not None
     result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
     report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
@@ -87,7 +87,7 @@ def test_bounds_make_another_correction(client: TestClient, steps: Steps, store:
     bound = post(client, photo_id=photo.public_id, halo=0.2, denoise=0.5).json()["id"]
 
     assert unbound == plain != bound
-    rows = [store.jobs.correction(key, ANY_OWNER) for key in (plain, bound)]
+    rows = [store.jobs.get(key, ANY_OWNER) for key in (plain, bound)]
     assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
         [None, 0.0],
         [0.2, 0.5],
@@ -139,7 +139,7 @@ def test_a_photo_with_other_settings_is_corrected_anew(
     again = post(client, photo_id=photo.public_id, lens_id=lens_id)
 
     assert (again.status_code, again.json()["id"] != first) == (202, True)
-    row = store.jobs.correction(again.json()["id"], ANY_OWNER)
+    row = store.jobs.get(again.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.params["settings"]["aperture"] == 8.0
 
@@ -226,7 +226,7 @@ def test_a_wish_that_cannot_be_is_refused(client: TestClient, steps: Steps) -> N
 
 def test_the_result_waits_for_the_work(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
-    run = store.jobs.start(made["id"])
+    run = store.jobs.start(made["id"], 1)
     assert run is not None
     store.jobs.progress(run, 3, 8)
 
@@ -244,7 +244,7 @@ def test_a_failed_correction_says_why_and_can_be_asked_for_again(
 ) -> None:
     photo = steps.counted()
     made = post(client, photo_id=photo.public_id).json()
-    store.jobs.fail(made["id"], "memory_limit", "needs 9 GiB, may have 4: correct a region")
+    store.jobs.fail(made["id"], 1, "memory_limit", "needs 9 GiB, may have 4: correct a region")
 
     shown = client.get(made["links"]["self"]).json()
 
@@ -334,7 +334,7 @@ def test_corrections_are_listed_by_photo_and_deleted_with_their_file(
 
 def test_a_running_correction_is_cancelled_once(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
-    store.jobs.start(made["id"])
+    store.jobs.start(made["id"], 1)
 
     assert client.post(f"/v1/jobs/{made['id']}/cancel").json()["state"] == "cancelled"
     assert client.post(f"/v1/jobs/{made['id']}/cancel").status_code == 409

@@ -27,7 +27,7 @@ BLOBS: Final = "blobs"
 TRIES: Final = 5
 # The blobs that cannot be made again: photos, and results of corrections
 _NAMED: Final = """
-    SELECT blob_key FROM photo WHERE deleted_at IS NULL AND file_gone_at IS NULL
+    SELECT blob_key FROM photo WHERE file_gone_at IS NULL
     UNION SELECT result_key FROM correction WHERE state = 'succeeded' AND result_key IS NOT NULL"""
 
 
@@ -89,5 +89,5 @@ def _rows(database: Path, part: Path) -> tuple[int, set[str]]:
     with closing(sqlite3.connect(part)) as copy, copy:
         copy.execute("DELETE FROM worker")  # none of them works on the copy
         named = {str(row[0]) for row in copy.execute(_NAMED)}
-        photos = copy.execute("SELECT count(*) FROM photo WHERE deleted_at IS NULL").fetchone()[0]
+        photos = copy.execute("SELECT count(*) FROM photo").fetchone()[0]
     return photos, named

@@ -21,7 +21,7 @@ from app.store import Store
 from app.store.invariants import INVARIANTS
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
 
-_WITH_FILE: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
+_WITH_FILE: Final = PhotoRow.file_gone_at.is_(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +81,12 @@ def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
         return
     sizes = dict(storage.listed())
     kept = {
-        "photos": select(PhotoRow.public_id).where(PhotoRow.deleted_at.is_(None)),
+        "photos": select(PhotoRow.public_id),
         "corrections": select(CorrectionRow.public_id),
         "models": select(LensRow.public_id).where(LensRow.deleted_at.is_(None)),
     }
     named = {
-        "photo": select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(*_WITH_FILE),
+        "photo": select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(_WITH_FILE),
         "correction": select(
             CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes
         ).where(CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)),
@@ -119,7 +119,7 @@ def _kernels(store: Store) -> Iterator[Violation]:
 
 def _photos(store: Store, storage: Storage) -> Iterator[Violation]:
     digest = func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256)
-    query = select(PhotoRow.public_id, PhotoRow.blob_key, digest, PhotoRow.byte_size).where(*_WITH_FILE)
+    query = select(PhotoRow.public_id, PhotoRow.blob_key, digest, PhotoRow.byte_size).where(_WITH_FILE)
     with store.database.reading() as session:
         rows = session.execute(query).all()
     for public_id, key, sha256, size in rows:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias, get_args
 
-from sqlalchemy import ColumnElement, Select, Table, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, Select, and_, delete, func, or_, select, true, update
 from sqlalchemy.orm import Session, joinedload
+from sqlalchemy.sql.base import ReadOnlyColumnCollection
+from sqlalchemy.sql.elements import KeyedColumnElement
 
 from app.store.database import Repository, new_id, reads, writes, writes_durably
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, now, owner_id
@@ -28,7 +30,6 @@ from app.store.tables import (
     KeyRow,
     LensRow,
     OwnerRow,
-    PatchRow,
     PhotoRow,
     SampleRow,
     SessionRow,
@@ -164,9 +165,7 @@ class Accounts(Repository):
             return Usage()
         kept = func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None))
         working = func.count().filter(PhotoRow.state.in_(PHOTO_WORKED_ON))
-        photos = select(func.count(), func.coalesce(kept, 0), working).where(
-            PhotoRow.owner_id == row.id, PhotoRow.deleted_at.is_(None)
-        )
+        photos = select(func.count(), func.coalesce(kept, 0), working).where(PhotoRow.owner_id == row.id)
         made = func.sum(CorrectionRow.result_bytes).filter(CorrectionRow.state == "succeeded")
         running = func.count().filter(CorrectionRow.state.in_(CORRECTION_ACTIVE))
         corrections = select(func.count(), func.coalesce(made, 0), running).where(
@@ -188,13 +187,12 @@ class Accounts(Repository):
 
     def rows(self, table: type[Base], owner: str, *, at_once: int = 200) -> Iterator[dict[str, Any]]:
         """Yield the rows of an owner, a few at a time: photos, lenses, and what belongs to them."""
-        cells: Table = table.__table__  # type: ignore[assignment]  # of a declared table it is one
-        last = 0
+        cells, last = table.__table__.c, 0
         while True:
             with self.database.reading() as session:
-                key = owner_id(session, owner)
-                query = select(cells).where(cells.c.id > last, _of_owner(table, key or 0))
-                page = session.execute(query.order_by(cells.c.id).limit(at_once)).mappings().all()
+                key = owner_id(session, owner) or 0
+                query = select(table.__table__).where(cells.id > last, _of_owner(cells, key))
+                page = session.execute(query.order_by(cells.id).limit(at_once)).mappings().all()
             if not page:
                 return
             last = page[-1]["id"]
@@ -240,30 +238,25 @@ class Accounts(Repository):
 
     @writes
     def purge(self, session: Session) -> None:
-        """Remove the emptied rows of what was deleted a day ago."""
-        old = now() - REMEMBERED
-        session.execute(delete(PhotoRow).where(PhotoRow.deleted_at < old))
+        """Remove the emptied rows of lenses that were deleted a day ago, and that nothing refers to."""
         named = select(CorrectionRow.lens_id).union(
             select(PhotoRow.lens_id).where(PhotoRow.lens_id.is_not(None)),
             select(SampleRow.lens_id).where(SampleRow.lens_id.is_not(None)),
             select(EventRow.lens_id),
         )
-        session.execute(delete(LensRow).where(LensRow.deleted_at < old, LensRow.id.not_in(named)))
+        old = LensRow.deleted_at < now() - REMEMBERED
+        session.execute(delete(LensRow).where(old, LensRow.id.not_in(named)))
 
 
-def _of_owner(table: type[Base], key: int) -> ColumnElement[bool]:
-    photos = select(PhotoRow.id).where(PhotoRow.owner_id == key, PhotoRow.deleted_at.is_(None))
+def _of_owner(cells: ReadOnlyColumnCollection[str, KeyedColumnElement[Any]], key: int) -> ColumnElement[bool]:
+    """Select rows by the owner that they name, or by their photo or lens."""
+    if "owner_id" in cells:
+        present = cells.deleted_at.is_(None) if "deleted_at" in cells else true()
+        return and_(cells.owner_id == key, present)
+    if "photo_id" in cells:
+        return cells.photo_id.in_(select(PhotoRow.id).where(PhotoRow.owner_id == key))
     lenses = select(LensRow.id).where(LensRow.owner_id == key, LensRow.deleted_at.is_(None))
-    conditions: dict[type[Base], ColumnElement[bool]] = {
-        PhotoRow: PhotoRow.id.in_(photos),
-        LensRow: LensRow.id.in_(lenses),
-        CorrectionRow: CorrectionRow.owner_id == key,
-        KeyRow: KeyRow.owner_id == key,
-        PatchRow: PatchRow.photo_id.in_(photos),
-        SampleRow: SampleRow.photo_id.in_(photos),
-        EventRow: EventRow.lens_id.in_(lenses),
-    }
-    return conditions[table]
+    return cells.lens_id.in_(lenses)
 
 
 def _valid() -> Select[KeyRow]:

@@ -52,7 +52,7 @@ INVARIANTS: Final = (
         "joined",
         "each counted photo joined its lens by an event",
         """
-        SELECT public_id FROM photo WHERE state = 'counted' AND deleted_at IS NULL AND NOT EXISTS (
+        SELECT public_id FROM photo WHERE state = 'counted' AND NOT EXISTS (
             SELECT 1 FROM calibration_event e WHERE e.lens_id = photo.lens_id
             AND e.photo_public_id = photo.public_id AND e.kind IN ('photo_added', 'photo_included')
         )""",
@@ -65,7 +65,7 @@ INVARIANTS: Final = (
         JOIN psf_sample ON psf_sample.photo_id = photo.id
         JOIN patch ON patch.id = psf_sample.patch_id
         LEFT JOIN lens ON lens.id = psf_sample.lens_id
-        WHERE CASE WHEN photo.state = 'counted' AND photo.deleted_at IS NULL AND patch.epoch = photo.epoch
+        WHERE CASE WHEN photo.state = 'counted' AND patch.epoch = photo.epoch
             THEN psf_sample.lens_id IS NULL OR psf_sample.lens_id <> photo.lens_id
                 OR psf_sample.version_added IS NULL OR psf_sample.version_added > lens.version
             ELSE psf_sample.lens_id IS NOT NULL END""",
@@ -75,7 +75,7 @@ INVARIANTS: Final = (
         "patches are done exactly if they have samples",
         """
         SELECT DISTINCT photo.public_id FROM photo JOIN patch ON patch.photo_id = photo.id
-        WHERE deleted_at IS NULL AND (patch.state = 'done') <> EXISTS (
+        WHERE (patch.state = 'done') <> EXISTS (
             SELECT 1 FROM psf_sample WHERE psf_sample.patch_id = patch.id
         )""",
     ),
@@ -90,7 +90,7 @@ INVARIANTS: Final = (
                 sum(CASE WHEN state <> 'rejected' THEN 1 ELSE 0 END) AS used
             FROM patch GROUP BY photo_id, epoch
         ) AS counted ON counted.photo_id = photo.id AND counted.epoch = photo.epoch
-        WHERE deleted_at IS NULL AND state IN ('estimating', 'counted', 'excluded') AND (
+        WHERE state IN ('estimating', 'counted', 'excluded') AND (
             patches_done <> coalesce(done, 0) OR patches_total <> coalesce(used, 0)
             OR patches_rejected <> coalesce(rejected, 0) + windows_rejected
         )""",
@@ -100,18 +100,8 @@ INVARIANTS: Final = (
         "counted photos have a lens, failed ones a reason",
         """
         SELECT photo.public_id FROM photo LEFT JOIN lens ON lens.id = photo.lens_id
-        WHERE photo.deleted_at IS NULL AND (
-            (state = 'counted' AND (lens.id IS NULL OR finished_at IS NULL OR lens.deleted_at IS NOT NULL))
-            OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))
-        )""",
-    ),
-    Invariant(
-        "forgotten photos",
-        "nothing is kept of deleted photos",
-        """
-        SELECT public_id FROM photo WHERE deleted_at IS NOT NULL AND (
-            sha256 <> '' OR filename <> '' OR EXISTS (SELECT 1 FROM patch WHERE patch.photo_id = photo.id)
-        )""",
+        WHERE (state = 'counted' AND (lens.id IS NULL OR finished_at IS NULL OR lens.deleted_at IS NOT NULL))
+            OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))""",
     ),
     Invariant(
         "forgotten lenses",

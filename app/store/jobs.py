@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.errors import ConflictError, UnknownError
 from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of, present
+from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
     PHOTO_WORKED_ON,
@@ -103,8 +103,7 @@ class Jobs(Works[CorrectionRow]):
             **dict.fromkeys(("created_at", "stage_at"), now()),
         }
         current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
-        # by its public id: SQLite may have given the key of a deleted photo to another one
-        if current is None or (current.id, current.owner_id) != (photo.id, photo.owner_id):
+        if current is None:
             raise UnknownError("photo", photo.public_id)
         if current.file_gone_at is not None:
             raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
@@ -200,7 +199,7 @@ class Jobs(Works[CorrectionRow]):
             rows = session.execute(
                 select(table.public_id, table.epoch, OwnerRow.name)
                 .join(OwnerRow, OwnerRow.id == table.owner_id)
-                .where(table.state.in_(states if begun else states[:1]), *present(table))
+                .where(table.state.in_(states if begun else states[:1]))
                 .order_by(table.id)
                 .limit(10 * limit if begun else limit)
             )
@@ -213,8 +212,7 @@ class Jobs(Works[CorrectionRow]):
         jobs: dict[tuple[str, str], int] = {}
         oldest: dict[str, float] = {}
         for kind, (table, states) in _TABLES.items():
-            unfinished = (table.state.in_(states), *present(table))
-            query = select(table.state, func.count(), func.min(table.stage_at)).where(*unfinished)
+            query = select(table.state, func.count(), func.min(table.stage_at)).where(table.state.in_(states))
             found = {row[0]: row for row in session.execute(query.group_by(table.state))}
             jobs |= {(kind, state): found[state][1] if state in found else 0 for state in states}
             waits = now() - found[states[0]][2] if states[0] in found else timedelta(0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final
 
-from sqlalchemy import and_, bindparam, delete, func, select, update
+from sqlalchemy import bindparam, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes
@@ -41,7 +41,7 @@ from app.store.tables import (
 from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import PsfSample
 
-TEACHES: Final = and_(PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
+TEACHES: Final = PhotoRow.state == "counted"
 NO_RESULT: Final = ("failed", "cancelled")
 
 # How long the previous version is kept (chosen): a worker may still be reporting of it
@@ -109,7 +109,7 @@ class Lenses(Repository):
         query = (
             select(LensRow.public_id)
             .join(PhotoRow, PhotoRow.lens_id == LensRow.id)
-            .where(LensRow.public_id.in_(lens_ids), PhotoRow.deleted_at.is_(None))
+            .where(LensRow.public_id.in_(lens_ids))
             .where(PhotoRow.state.not_in(states))
         )
         return set(session.scalars(query.distinct()))
@@ -239,7 +239,7 @@ class Lenses(Repository):
         lens, target = rows[lens_id], rows[into]
         if lens is None or target is None or lens.id == target.id:
             return False
-        query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+        query = select(PhotoRow).where(PhotoRow.lens_id == lens.id)
         photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
         if any(photo.state in PHOTO_WORKED_ON for photo in photos):
             return False
@@ -384,20 +384,17 @@ def report_key(lens_id: str, version: int, epoch: int) -> str:
 # --- deletion -------------------------------------------------------------------------------------
 
 
-def forget_if_empty(session: Session, photo: PhotoRow) -> None:
+def forget_if_empty(session: Session, photo: PhotoRow, *, gone: bool = False) -> None:
     """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it."""
     # A lens that the owner named stays as long as there is any photo of it, even a failed one
     lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
     if lens is None or lens.deleted_at is not None:
         return
-    others = select(PhotoRow.id).where(
-        PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None), PhotoRow.id != photo.id
-    )
+    others = select(PhotoRow.id).where(PhotoRow.lens_id == lens.id, PhotoRow.id != photo.id)
     named_by_owner = lens.label is not None or lens.serial_source == "user"
     if not named_by_owner:
         others = others.where(PhotoRow.state.not_in(NO_RESULT))
-    keeps = named_by_owner and photo.deleted_at is None
-    if not keeps and session.scalar(others.limit(1)) is None:
+    if (gone or not named_by_owner) and session.scalar(others.limit(1)) is None:
         session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
         _forget(session, lens)
 

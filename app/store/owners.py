@@ -62,15 +62,12 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
 
 def owned(table: type[Row], owner: Owner) -> Select[Row]:
     """Select the rows of one owner, or of `ANY_OWNER`, that are not deleted."""
-    query: Select[Row] = select(table).options(*_WITH[table]).where(*present(table))
+    query: Select[Row] = select(table).options(*_WITH[table])
+    if table is LensRow:  # photos and corrections are deleted outright
+        query = query.where(LensRow.deleted_at.is_(None))
     if owner is not ANY_OWNER:
         query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
     return query
-
-
-def present(table: type[PhotoRow | LensRow | CorrectionRow]) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions of rows that are not deleted; corrections are removed outright."""
-    return () if issubclass(table, CorrectionRow) else (table.deleted_at.is_(None),)
 
 
 def page_of(

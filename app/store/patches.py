@@ -13,7 +13,7 @@ from sqlalchemy import Select, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store.database import Repository, reads, writes
-from app.store.owners import ANY_OWNER, find_to_change, now
+from app.store.owners import ANY_OWNER, find_to_change
 from app.store.samples import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.psf import PsfSample
@@ -21,7 +21,8 @@ from lensmodel.core.psf import PsfSample
 # Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
 # diagonal is 3,600 pixels
 DIGITS: Final = 4
-_PLANNED: Final = ("idx", "cell", "row", "col", "size", "r", "phi", "score")
+_WINDOW: Final = ("idx", "row", "col", "size", "r", "phi")
+_PLANNED: Final = (*_WINDOW, "cell", "score")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +82,8 @@ class Patches(Repository):
     def windows(self, session: Session, photo_id: str) -> list[PatchRow]:
         """Return the patches of a photo, followed by the windows that were rejected before estimation."""
         rows = list(session.scalars(_patches_of(photo_id).order_by(PatchRow.idx)))
-        return rows + _unpacked(
-            session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id))
-        )
+        query = select(PhotoRow.windows).where(PhotoRow.public_id == photo_id)
+        return rows + _unpacked(session.scalar(query))
 
     @reads
     def cells(self, session: Session, photo_id: str, epoch: int) -> list[int]:
@@ -123,7 +123,7 @@ class Patches(Repository):
         ]
         session.add_all(rows)
         for patch in patches.values():
-            patch.state, patch.finished_at = "done", now()
+            patch.state = "done"
         _recount(session, photo)
         return len(rows)
 
@@ -149,9 +149,7 @@ class Patches(Repository):
         if cell is not None:
             which += [PatchRow.cell == cell, PatchRow.state == "pending"]
         state = "rejected" if rejected else "failed"
-        session.execute(
-            update(PatchRow).where(*which).values(state=state, reason=reason[:60], finished_at=now())
-        )
+        session.execute(update(PatchRow).where(*which).values(state=state, reason=reason[:60]))
         _recount(session, photo)
 
 
@@ -185,24 +183,15 @@ def _recount(session: Session, photo: PhotoRow) -> int:
     return photo.patches_total
 
 
-def _packed(rejected: Sequence[NewPatch]) -> dict[str, Any]:
-    """Return windows as one value that JSON can hold; each reason is stored once."""
-    reasons = sorted({patch.rejected or "" for patch in rejected})
-    numbers = {reason: number for number, reason in enumerate(reasons)}
-    listed = [
-        [
-            *(patch.idx, patch.row, patch.col, patch.size),
-            *(round(patch.r, DIGITS), round(patch.phi, DIGITS), numbers[patch.rejected or ""]),
-        ]
-        for patch in rejected
-    ]
-    return {"reasons": reasons, "windows": listed}
+def _packed(rejected: Sequence[NewPatch]) -> dict[str, list[Any]]:
+    """Return windows as one value that JSON can hold: a list for each column."""
+    columns = {name: [getattr(patch, name) for patch in rejected] for name in _WINDOW}
+    rounded = {name: [round(value, DIGITS) for value in columns[name]] for name in ("r", "phi")}
+    return {**columns, **rounded, "reason": [patch.rejected for patch in rejected]}
 
 
-def _unpacked(stored: dict[str, Any] | None) -> list[PatchRow]:
+def _unpacked(stored: dict[str, list[Any]] | None) -> list[PatchRow]:
     """Return the windows of `_packed` as rows that belong to no table."""
-    known, names = stored or {"windows": []}, ("idx", "row", "col", "size", "r", "phi")
-    return [
-        PatchRow(**dict(zip(names, places, strict=True)), state="rejected", reason=known["reasons"][reason])
-        for *places, reason in known["windows"]
-    ]
+    names, columns = (stored or {}).keys(), (stored or {}).values()
+    windows = zip(*columns, strict=True)
+    return [PatchRow(state="rejected", **dict(zip(names, window, strict=True))) for window in windows]

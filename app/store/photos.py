@@ -46,12 +46,6 @@ GIVEN_SETTINGS: Final = {
 # Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
 # under their own names are corrections made since and go before the header.
 FALLBACKS: Final = "fallbacks"
-# Columns that describe a photo; all are emptied when it is deleted
-DESCRIPTION: Final = (
-    *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),
-    *("aperture", "focal_mm", "focus_m", "pixel_pitch_um", "lateral"),
-    *("width", "height", "orientation", "location", "error_detail", "body_key"),
-)
 # Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
 # several machines differ by less
 SPARE: Final = timedelta(hours=1)
@@ -77,7 +71,7 @@ class Photos(Patches, Works[PhotoRow]):
     @reads
     def newest_file(self, session: Session) -> str | None:
         """Return the key of the file of the newest photo, or None where there is no file."""
-        return session.scalar(select(PhotoRow.blob_key).where(*_FILED).order_by(PhotoRow.id.desc()).limit(1))
+        return session.scalar(select(PhotoRow.blob_key).where(_FILED).order_by(PhotoRow.id.desc()).limit(1))
 
     @reads
     def page(
@@ -109,23 +103,21 @@ class Photos(Patches, Works[PhotoRow]):
             (PhotoRow.state == "failed") & ((PhotoRow.error_code != "outage") | (ended < day))
         )
         disposable = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
-        query = select(PhotoRow.public_id).where(*_FILED, disposable, ~busy)
+        query = select(PhotoRow.public_id).where(_FILED, disposable, ~busy)
         return list(session.scalars(query.limit(limit)))
 
     @reads
     def read_profiles(self, session: Session, limit: int = 100) -> list[str]:
         """Return the files of samples that were read, or refused, a day ago."""
         ended = PhotoRow.finished_at < now() - FILE_KEPT
-        query = select(PhotoRow.public_id).where(
-            PhotoRow.kind == PROFILE_FILE, PhotoRow.deleted_at.is_(None), ended
-        )
+        query = select(PhotoRow.public_id).where(PhotoRow.kind == PROFILE_FILE, ended)
         return list(session.scalars(query.limit(limit)))
 
     @reads
     def unsearched(self, session: Session, limit: int = 100) -> list[PhotoRow]:
         """Return photos nobody works on whose file may still say where they were taken."""
         # Such are those that failed before they were searched, and files that came again
-        query = select(PhotoRow).where(*_FILED, PhotoRow.location.is_(None), PhotoRow.kind != PROFILE_FILE)
+        query = select(PhotoRow).where(_FILED, PhotoRow.location.is_(None), PhotoRow.kind != PROFILE_FILE)
         return list(session.scalars(query.where(PhotoRow.state.not_in(PHOTO_WORKED_ON)).limit(limit)))
 
     @reads
@@ -135,13 +127,13 @@ class Photos(Patches, Works[PhotoRow]):
             return []
         same = (PhotoRow.owner_id == photo.owner_id, PhotoRow.body_key == photo.body_key)
         raw = (PhotoRow.id != photo.id, PhotoRow.kind.in_(("raw", "dng")))
-        query = select(PhotoRow).where(*same, *raw, *_FILED).order_by(PhotoRow.id.desc())
+        query = select(PhotoRow).where(*same, *raw, _FILED).order_by(PhotoRow.id.desc())
         return list(session.scalars(query.limit(limit)))
 
     @reads
     def existing(self, session: Session, photo_ids: Iterable[str]) -> set[str]:
         """Return which of these photos are not deleted and still have their file."""
-        query = select(PhotoRow.public_id).where(PhotoRow.public_id.in_(list(photo_ids)), *_FILED)
+        query = select(PhotoRow.public_id).where(PhotoRow.public_id.in_(list(photo_ids)), _FILED)
         return set(session.scalars(query))
 
     # --- receiving --------------------------------------------------------------------------------
@@ -177,7 +169,7 @@ class Photos(Patches, Works[PhotoRow]):
             **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
         }
         of_bytes = (PhotoRow.owner_id == fresh["owner_id"], PhotoRow.sha256 == file["sha256"])
-        same = select(PhotoRow).where(*of_bytes, PhotoRow.deleted_at.is_(None))
+        same = select(PhotoRow).where(*of_bytes)
         query = same.options(joinedload(PhotoRow.lens)).with_for_update(of=PhotoRow)
         known, created = insert_or_find(session, PhotoRow, fresh, query, "photo of the same bytes")
         if created:
@@ -256,7 +248,7 @@ class Photos(Patches, Works[PhotoRow]):
     @writes
     def record_lateral(self, session: Session, photo_id: str, epoch: int, lateral: dict[str, Any]) -> None:
         """Store the lateral colour that a photo shows, unless it was deleted or started anew meanwhile."""
-        current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch, PhotoRow.deleted_at.is_(None))
+        current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch)
         session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
 
     @writes_durably
@@ -274,7 +266,7 @@ class Photos(Patches, Works[PhotoRow]):
         # file of the photo, and the one before garbage once nobody reads it any more
         current = (PhotoRow.public_id == photo.public_id, PhotoRow.blob_key == photo.blob_key)
         values = {"location": location, **({} if key is None else {"blob_key": key, "file_sha256": digest})}
-        statement = update(PhotoRow).where(*current, PhotoRow.deleted_at.is_(None)).values(**values)
+        statement = update(PhotoRow).where(*current).values(**values)
         if changed(session, statement) != 1:
             return False
         if key is not None:
@@ -380,23 +372,16 @@ class Photos(Patches, Works[PhotoRow]):
 
     @writes
     def delete(self, session: Session, photo_id: str, owner: Owner) -> str | None:
-        """Forget a photo, its patches, samples and corrections; return the prefix of its blobs."""
-        # The row stays, emptied, because the lens's history refers to it
+        """Delete a photo, its patches, samples and corrections; return the prefix of its blobs."""
         photo = find_to_change(session, PhotoRow, photo_id, owner)
         if photo is None:
             return None
         if photo.state == "counted":
             note_change(session, photo, "photo_removed")
-        forget_patches(session, photo)
         corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
         discard(session, photo.folder, *(row.folder for row in corrections))
-        session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
-        photo.deleted_at = now()
-        photo.state = "cancelled" if photo.state in PHOTO_UNFINISHED else photo.state
-        photo.given, photo.filename, photo.sha256 = {}, "", ""
-        for column in DESCRIPTION:
-            setattr(photo, column, None)
-        forget_if_empty(session, photo)
+        forget_if_empty(session, photo, gone=True)
+        session.execute(delete(PhotoRow).where(PhotoRow.id == photo.id))  # and by its key all of them
         return photo.folder
 
     # --- profiles ---------------------------------------------------------------------------------
@@ -419,9 +404,9 @@ class Photos(Patches, Works[PhotoRow]):
         ):
             return None
         discard(session, file.blob_key)
-        present = (PhotoRow.owner_id == lens.owner_id, PhotoRow.deleted_at.is_(None))
-        own = set(session.scalars(select(PhotoRow.public_id).where(*present, PhotoRow.lens_id == lens.id)))
-        before = set(session.scalars(select(PhotoRow.sha256).where(*present, PhotoRow.kind == PROFILE)))
+        own = set(session.scalars(select(PhotoRow.public_id).where(PhotoRow.lens_id == lens.id)))
+        of_profiles = (PhotoRow.owner_id == lens.owner_id, PhotoRow.kind == PROFILE)
+        before = set(session.scalars(select(PhotoRow.sha256).where(*of_profiles)))
         imported = 0
         for (photo, settings), of_photo in groups.items():
             digest = hashlib.sha256(f"{PROFILE}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
@@ -432,8 +417,7 @@ class Photos(Patches, Works[PhotoRow]):
         return imported
 
 
-# Conditions of photos whose file is kept
-_FILED: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
+_FILED: Final = PhotoRow.file_gone_at.is_(None)  # of photos whose file is kept
 
 
 def _keep_announced(session: Session, prefix: str) -> None:
@@ -540,7 +524,7 @@ def _import(
     )
     session.add(photo)
     session.flush()
-    done = {"photo_id": photo.id, "epoch": epoch, "state": "done", "finished_at": now()}
+    done = {"photo_id": photo.id, "epoch": epoch, "state": "done"}
     done |= dict.fromkeys(("row", "col", "size"), 0)  # a profile does not say where in pixels
     patches = {
         place: PatchRow(**done, idx=idx, cell=idx, r=place[0], phi=place[1])

@@ -17,7 +17,6 @@ from sqlalchemy import Row
 from sqlalchemy.orm import InstrumentedAttribute
 
 from app import distances
-from app.store.owners import now
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import EncodedPatch, PsfSample
@@ -90,7 +89,6 @@ def columns_of(sample: PsfSample, photo: PhotoRow, patch: PatchRow) -> dict[str,
         "format_version": FORMAT_VERSION,
         "crc32": zlib.crc32(blob),
         "psf": blob,
-        "created_at": now(),
     }
 
 

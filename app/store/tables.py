@@ -84,7 +84,12 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
-    type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcTime(), dict[str, Any]: JSON(), str: Text()}
+    type_annotation_map: ClassVar[dict[Any, Any]] = {
+        datetime: UtcTime(),
+        dict[str, Any]: JSON(),
+        list[Any]: JSON(),
+        str: Text(),
+    }
 
 
 Key: TypeAlias = Annotated[int, mapped_column(primary_key=True)]
@@ -168,10 +173,11 @@ class PhotoRow(Work, Base):
     __tablename__ = "photo"
     __table_args__ = (
         CheckConstraint(_one_of("state", PHOTO_STATES), name="state"),
-        _unique("uq_photo_bytes", "owner_id", "sha256", where="deleted_at IS NULL"),
+        UniqueConstraint("owner_id", "sha256"),
         Index("ix_photo_state", "state"),
         Index("ix_photo_page", "owner_id", "public_id"),
         Index("ix_photo_lens_id_state", "lens_id", "state"),
+        {"sqlite_autoincrement": True},  # the key of a deleted photo is given to no other
     )
 
     lens_id: Mapped[OfLens | None]
@@ -208,7 +214,6 @@ class PhotoRow(Work, Base):
     # Those windows, as `app.store.patches` writes them: thousands, never queried one by one
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
     received_at: Mapped[datetime]
-    deleted_at: Mapped[datetime | None]
     # Whether the file said where it was taken: none, removed, or unknown; None until it was searched
     location: Mapped[str | None]
     # Hash of the stored file where it differs from what was sent, whose hash is `sha256`
@@ -244,7 +249,6 @@ class PatchRow(Base):
     score: Mapped[float | None]
     state: Mapped[str]
     reason: Mapped[str | None]
-    finished_at: Mapped[datetime | None]
     # What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`
     encoded: Mapped[bytes | None] = mapped_column(deferred=True)
 
@@ -278,7 +282,6 @@ class SampleRow(Base):
     crc32: Mapped[Big]
     psf: Mapped[bytes] = mapped_column(deferred=True)
     estimator: Mapped[str]
-    created_at: Mapped[datetime]
 
 
 class EventRow(Base):

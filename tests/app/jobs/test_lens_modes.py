@@ -12,6 +12,7 @@ from sqlalchemy import event, update
 from starlette.testclient import TestClient
 
 from app.store import LensName, NewPatch, NewSample, Store
+from app.store.owners import ANY_OWNER
 from app.store.tables import SampleRow
 from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition

@@ -288,14 +288,14 @@ def _first(refused: Callable[[str], bool], *candidates: str | None) -> str | Non
 # --- as EXIF tags of a written file -------------------------------------------------------------
 
 
-def main_tags(metadata: PhotoMetadata, orientation: int, description: str = "") -> dict[int, Value | None]:
+def main_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | None]:
     """Tags of the main directory; names of people are UTF-8, as most programs read them."""
     stars = metadata.rating
     return {
         0x010E: text(description),
         0x010F: text(metadata.camera_maker),
         0x0110: text(metadata.camera_model),
-        0x0112: shorts(orientation),
+        0x0112: shorts(metadata.orientation),
         0x0131: text(SOFTWARE),
         0x0132: _date(metadata.taken_at),
         0x013B: text(metadata.artist, "utf-8"),

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
 import imagecodecs
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError
@@ -28,14 +28,13 @@ from lensmodel.photo.colour import (
     icc_space,
     inverse,
     linear_profile,
-    matrix3,
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.dng import NONE, write_linear_dng
+from lensmodel.photo.dng import dng_tags
 from lensmodel.photo.metadata import exif_tags, main_tags
 from lensmodel.photo.tiff import BYTE, EXIF, GPS, UNDEFINED, Written, laid_out, shorts, write_strip
-from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, PhotoMetadata, remarks_log
+from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
 from lensmodel.photo.xmp import xmp_packet
 
 _ROWS: Final = 256
@@ -44,21 +43,13 @@ _ROWS: Final = 256
 _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""
 
-XMP_TAG: Final = 700  # XMP specification, part 3
-ICC_TAG: Final = 34675  # ICC.1:2022, annex B.4
+# XMP specification, part 3; ICC.1:2022, annex B.4; DNG 1.6, chapter 6.
+_XMP_TAG, _ICC_TAG, _OPCODES_2, _OPCODES_3 = 700, 34675, 51009, 51022
+
+_NOWHERE: Final[Written] = MappingProxyType({})
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col, channel)`, uint8 or uint16."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """How linear planes become the numbers of the file: gain, matrix, curve, and the profile that says so."""
-
-    gain: tuple[float, float, float]
-    matrix: Matrix | None
-    curves: tuple[Curve, Curve, Curve]
-    icc: bytes
 
 
 def write_image(
@@ -71,7 +62,7 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
-    gps: Written = NONE,
+    gps: Written = _NOWHERE,
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
@@ -94,58 +85,83 @@ def write_image(
         )
     if not 1 <= quality <= 100:
         raise InvalidInputError(f"JPEG quality must lie in 1..100, got {quality}")
-    path = Path(path)
-    carried = _Carried(encoding.metadata.without_serials(), description, lens, gps)
-    if format == "dng":
-        _write_dng(path, planes, encoding, carried)
-        return
+    path, metadata = Path(path), encoding.metadata.without_serials()
+    if format.startswith("png"):
+        metadata = replace(metadata, orientation=1)
+    main, below = main_tags(metadata, description), {EXIF: exif_tags(metadata), GPS: gps}
+    xmp = xmp_packet(metadata, description, lens)
+    _tell_losses(path.name, planes, encoding, format)
+    with atomic(path) as file:
+        if format == "dng":
+            tags = {**main, **_linear_dng_tags(encoding), _XMP_TAG: (BYTE, xmp)}
+            write_strip(file, tags, below, _sixteen_bits(planes))
+            return
+        if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
+            color_space = "camera-linear"
+        target = _target(encoding, color_space)
+        pixels = _encoded(planes, target, {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535))
+        if format == "jpeg":
+            exif = b"Exif\0\0" + laid_out(main, below)
+            options: dict[str, Any] = {"quality": quality, "subsampling": 0, "optimize": True}
+            Image.fromarray(pixels).save(file, "JPEG", icc_profile=target.icc, exif=exif, xmp=xmp, **options)
+        elif format.startswith("png"):
+            chunks = {
+                b"iCCP": b"ICC\0\0" + zlib.compress(target.icc),
+                b"eXIf": laid_out(main, below),
+                b"iTXt": b"XML:com.adobe.xmp\0\0\0\0\0" + xmp,
+            }
+            if description:
+                chunks[b"tEXt"] = b"Description\0" + description.encode("latin-1", "replace")
+            _write_png(file, upright(pixels, encoding.orientation), chunks)
+        else:
+            sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point
+            tags = {262: shorts(2), 339: shorts(*(sample_format,) * 3)}  # RGB
+            blocks = {_XMP_TAG: (BYTE, xmp), _ICC_TAG: (UNDEFINED, target.icc)}
+            write_strip(file, {**main, **tags, **blocks}, below, pixels)
+
+
+def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
+    """Tell what of the photo a file of this format does not hold."""
     steps = [step.name for block in (encoding.opcodes_2, encoding.opcodes_3) for step in opcodes.read(block)]
-    if steps:
+    if steps and output != "dng":
         remarks_log.warning(
             "%s: the corrections that the DNG leaves to raw converters (%s) are not in it; only DNG output "
             "keeps them",
-            path.name,
+            name,
             ", ".join(steps),
         )
-    if encoding.bit_depth == 32 and format != "tiff32" and (beyond := float((planes > 1.0).mean())) > 0.0:
+    if (
+        encoding.bit_depth == 32
+        and output not in {"tiff32", "dng"}
+        and (beyond := float((planes > 1.0).mean()))
+    ):
         remarks_log.warning(
             "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
-            path.name,
+            name,
             100.0 * beyond,
         )
-    if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
-        color_space = "camera-linear"
-    target = _target(encoding, color_space)
-    top = {"tiff32": None, "jpeg": 255, "png8": 255}.get(format, 65535)
-    with atomic(path) as file:
-        pixels = _encoded(planes, target, top)
-        if format == "jpeg":
-            Image.fromarray(pixels).save(
-                file,
-                "JPEG",
-                quality=quality,
-                subsampling=0,
-                optimize=True,
-                icc_profile=target.icc,
-                exif=b"Exif\0\0" + carried.exif(encoding.orientation),
-                xmp=carried.xmp,
-            )
-        elif format.startswith("tiff"):
-            _write_tiff(file, pixels, carried, target.icc)
-        else:
-            _write_png(file, np.ascontiguousarray(upright(pixels, encoding.orientation)), carried, target.icc)
 
 
 # --- colour ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """How linear planes become the numbers of the file: gain, matrix, curve, and the profile that says so."""
+
+    gain: tuple[float, float, float]
+    matrix: Matrix | None
+    curves: tuple[Curve, Curve, Curve]
+    icc: bytes
+
+
 def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
-    rgb_icc = _rgb_profile(encoding)
     if color_space == "camera-linear":
         profile = linear_profile(_to_xyz_d50(encoding), "lensmodel linear")
         return _Target((1.0, 1.0, 1.0), None, curves_of("linear"), profile)
-    if encoding.to_srgb is None and rgb_icc is not None and color_space == "same":
-        return _Target((1.0, 1.0, 1.0), None, curves_of(encoding.transfer, rgb_icc), rgb_icc)
+    icc = _rgb_profile(encoding)
+    if encoding.to_srgb is None and icc is not None and color_space == "same":
+        return _Target((1.0, 1.0, 1.0), None, curves_of(encoding.transfer, icc), icc)
     # White must stay white: where all channels clip, no multiplier may be below 1.
     r, g, b = (float(w) / min(encoding.white_balance) for w in encoding.white_balance)
     return _Target((r, g, b), _to_srgb(encoding), curves_of("srgb"), named_profile("srgb"))
@@ -158,8 +174,8 @@ def _rgb_profile(encoding: Encoding) -> bytes | None:
 def _to_srgb(encoding: Encoding) -> Matrix | None:
     if encoding.to_srgb is not None:
         return np.asarray(encoding.to_srgb)
-    rgb_icc = _rgb_profile(encoding)
-    profile = None if rgb_icc is None else matrix_profile(rgb_icc)
+    icc = _rgb_profile(encoding)
+    profile = None if icc is None else matrix_profile(icc)
     return None if profile is None else np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ profile.to_xyz
 
 
@@ -197,96 +213,49 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 # --- files -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Carried:
-    """What a file carries beside its pixels."""
-
-    metadata: PhotoMetadata
-    description: str
-    lens: str
-    gps: Written
-
-    @property
-    def xmp(self) -> bytes:
-        return xmp_packet(self.metadata, self.description, self.lens)
-
-    def exif(self, orientation: int) -> bytes:
-        below = {EXIF: exif_tags(self.metadata), GPS: self.gps}
-        return laid_out(main_tags(self.metadata, orientation, self.description), below)
+def _sixteen_bits(planes: Planes) -> Pixels:
+    """Linear numbers `(row, col, channel)` of 16 bits."""
+    out = np.empty((*planes.shape[1:], 3), dtype=np.uint16)
+    for row in range(0, len(out), _ROWS):
+        part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
+        out[row : row + _ROWS] = np.rint(part * np.float32(65535)).transpose(1, 2, 0)
+    return out
 
 
-def _write_tiff(file: BinaryIO, pixels: Pixels, carried: _Carried, icc: bytes) -> None:
-    metadata = carried.metadata
-    tags = {
-        **main_tags(metadata, metadata.orientation, carried.description),
-        262: shorts(2),  # RGB
-        339: shorts(*(3 if pixels.dtype.kind == "f" else 1,) * 3),  # SampleFormat
-        XMP_TAG: (BYTE, carried.xmp),
-        ICC_TAG: (UNDEFINED, icc),
+def _linear_dng_tags(encoding: Encoding) -> Written:
+    to_camera: ArrayLike | None = encoding.xyz_to_camera
+    if to_camera is None:
+        # To XYZ under D50, and back from D65, which is what the DNG tag means.
+        to_camera = np.linalg.inv(np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding))
+    neutral = tuple(1.0 / balance for balance in encoding.white_balance)
+    lists = {_OPCODES_2: encoding.opcodes_2, _OPCODES_3: encoding.opcodes_3}
+    return {
+        **dng_tags(encoding.metadata.without_serials(), to_camera, neutral, encoding.baseline_exposure),
+        262: shorts(34892),  # PhotometricInterpretation: linear RAW
+        # LibRaw 0.22 takes a black level of linear images off the values but not off the white level
+        50714: shorts(0, 0, 0),
+        50717: shorts(65535, 65535, 65535),
+        **{tag: (UNDEFINED, block) if block else None for tag, block in lists.items()},
     }
-    write_strip(file, tags, {EXIF: exif_tags(metadata), GPS: carried.gps}, pixels)
 
 
-def _write_png(file: BinaryIO, pixels: Pixels, carried: _Carried, icc: bytes) -> None:
-    data = imagecodecs.png_encode(pixels, **_PNG_OPTIONS)
+def _write_png(file: BinaryIO, pixels: Pixels, chunks: dict[bytes, bytes]) -> None:
+    data = imagecodecs.png_encode(np.ascontiguousarray(pixels), **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
-    file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
-    file.write(_chunk(b"eXIf", carried.exif(1)))
-    file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + carried.xmp))
-    if carried.description:
-        file.write(_chunk(b"tEXt", b"Description\0" + carried.description.encode("latin-1", "replace")))
+    for name, body in chunks.items():
+        check = struct.pack(">I", zlib.crc32(name + body))
+        file.write(struct.pack(">I", len(body)) + name + body + check)
     file.write(data[header_end:])
 
 
-def _write_dng(path: Path, planes: Planes, encoding: Encoding, carried: _Carried) -> None:
-    to_camera = encoding.xyz_to_camera
-    if to_camera is None:
-        # To XYZ under D50, and back from D65, which is what the DNG tag means.
-        to_xyz = np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding)
-        to_camera = matrix3(np.linalg.inv(to_xyz).astype(np.float64))
-    r, g, b = encoding.white_balance
-    numbers = np.empty(planes.shape, dtype=np.uint16)
-    for row in range(0, planes.shape[1], _ROWS):
-        part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
-        numbers[:, row : row + _ROWS] = np.rint(part * np.float32(65535))
-    write_linear_dng(
-        path,
-        numbers,
-        color_matrix=to_camera,
-        as_shot_neutral=(1 / r, 1 / g, 1 / b),
-        metadata=carried.metadata,
-        description=carried.description,
-        baseline_exposure=encoding.baseline_exposure,
-        more={
-            XMP_TAG: (BYTE, carried.xmp),
-            51009: (UNDEFINED, encoding.opcodes_2) if encoding.opcodes_2 else None,  # OpcodeList2
-            51022: (UNDEFINED, encoding.opcodes_3) if encoding.opcodes_3 else None,
-        },
-        gps=carried.gps,
-    )
-
-
-def _chunk(name: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-
-
-_UPRIGHT: Final[Mapping[int, Callable[[Pixels], Pixels]]] = {
-    1: lambda a: a,
-    2: lambda a: a[:, ::-1],
-    3: lambda a: a[::-1, ::-1],
-    4: lambda a: a[::-1],
-    5: lambda a: a.swapaxes(0, 1),
-    6: lambda a: np.rot90(a, -1),
-    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
-    8: np.rot90,
-}
-"""EXIF orientation -> how to turn the stored pixels upright (EXIF 2.3, tag Orientation)."""
+_TURNS: Final = {3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}
+"""EXIF orientation -> quarter turns, counter-clockwise, after 2, 4, 5 and 7 are mirrored (EXIF 2.3)."""
 
 
 def upright(pixels: Pixels, orientation: int) -> Pixels:
     """Turn an array `(row, col, ...)` from sensor orientation to upright, by its EXIF orientation."""
-    return _UPRIGHT.get(orientation, _UPRIGHT[1])(pixels)
+    return np.rot90(pixels[:, ::-1] if orientation in {2, 4, 5, 7} else pixels, _TURNS.get(orientation, 0))
 
 
 def shown(planes: Planes, encoding: Encoding) -> NDArray[np.uint8]:

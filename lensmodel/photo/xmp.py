@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 from xml.etree import ElementTree as ET
 
@@ -75,19 +76,20 @@ _PACKET: Final = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n{}\n
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
 """What XML has no way to write; cameras put it into names."""
 
+_NONE: Final[Mapping[str, str | None]] = MappingProxyType({})
+
 
 def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> bytes:
     """Return a packet, UTF-8; serial numbers, places (GPS) and maker notes stay out."""
+    named, taken, rating = lens or metadata.lens.model, metadata.taken_at, metadata.rating
     root = ET.Element(_name("x:xmpmeta"), {_name("x:xmptk"): SOFTWARE})
-    about = {_name("rdf:about"): ""}
-    whole = ET.SubElement(ET.SubElement(root, _name("rdf:RDF")), _name("rdf:Description"), about)
-    named = lens or metadata.lens.model
-    taken = metadata.taken_at
-    _attributes(
-        whole,
+    whole = _below(
+        _below(root, "rdf:RDF"),
+        "rdf:Description",
         {
+            "rdf:about": "",
             "xmp:CreatorTool": SOFTWARE,
-            "xmp:Rating": None if metadata.rating is None else str(metadata.rating),
+            "xmp:Rating": None if rating is None else str(rating),
             "tiff:Make": metadata.camera_maker,
             "tiff:Model": metadata.camera_model,
             "exifEX:LensMake": metadata.lens.maker,
@@ -98,35 +100,27 @@ def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> byt
             "exif:DateTimeOriginal": None if taken is None else taken.isoformat(),
         },
     )
-    _list(whole, "dc:rights", "rdf:Alt", [metadata.copyright])
-    _list(whole, "dc:creator", "rdf:Seq", [metadata.artist])
-    _list(whole, "dc:subject", "rdf:Bag", metadata.keywords)
-    _list(whole, "dc:description", "rdf:Alt", [description])
-    if description:
-        steps = ET.SubElement(ET.SubElement(whole, _name("xmpMM:History")), _name("rdf:Seq"))
-        step = {"action": "filtered", "softwareAgent": SOFTWARE, "parameters": description}
-        _attributes(
-            ET.SubElement(steps, _name("rdf:li")), {f"stEvt:{key}": value for key, value in step.items()}
-        )
+    done = {"stEvt:action": "filtered", "stEvt:softwareAgent": SOFTWARE, "stEvt:parameters": description}
+    default = {"xml:lang": "x-default"}
+    for name, kind, items, attributes in (
+        ("dc:rights", "rdf:Alt", [metadata.copyright], default),
+        ("dc:creator", "rdf:Seq", [metadata.artist], {}),
+        ("dc:subject", "rdf:Bag", metadata.keywords, {}),
+        ("dc:description", "rdf:Alt", [description], default),
+        ("xmpMM:History", "rdf:Seq", [description], done),
+    ):
+        if any(items):
+            container = _below(_below(whole, name), kind)
+            for item in items:
+                entry = _below(container, "rdf:li", attributes)
+                entry.text = None if attributes is done else _plain(item or "")
     ET.indent(root, " ")
     return _PACKET.format(ET.tostring(root, encoding="unicode")).encode()
 
 
-def _attributes(element: ET.Element, values: Mapping[str, str | None]) -> None:
-    for key, value in values.items():
-        if value:
-            element.set(_name(key), _plain(value))
-
-
-def _list(whole: ET.Element, name: str, kind: str, items: Sequence[str | None]) -> None:
-    if not any(items):
-        return
-    container = ET.SubElement(ET.SubElement(whole, _name(name)), _name(kind))
-    for item in items:
-        entry = ET.SubElement(container, _name("rdf:li"))
-        if kind == "rdf:Alt":
-            entry.set(_name("xml:lang"), "x-default")
-        entry.text = _plain(item or "")
+def _below(parent: ET.Element, name: str, attributes: Mapping[str, str | None] = _NONE) -> ET.Element:
+    known = {_name(key): _plain(value) for key, value in attributes.items() if value is not None}
+    return ET.SubElement(parent, _name(name), known)
 
 
 def _rational(value: float | None) -> str | None:

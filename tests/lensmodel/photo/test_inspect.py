@@ -26,7 +26,7 @@ from lensmodel.core.errors import (
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
+from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.tiff import Tag, Tags
 
 
@@ -99,7 +99,7 @@ def test_inspect_tells_kind_and_size(tmp_path: Path, kind: str) -> None:
 def test_inspect_tells_dng_from_tiff_and_its_size(tmp_path: Path) -> None:
     mosaic = np.random.default_rng(0).integers(600, 9000, (48, 64), dtype=np.uint16)
     write_bayer_dng(tmp_path / "bayer", mosaic, black=512, white=15000)
-    write_linear_dng(tmp_path / "linear", np.repeat(mosaic[None], 3, axis=0))
+    photo.write_image(tmp_path / "linear", np.full((3, 48, 64), 0.5), photo.Encoding(), format="dng")
 
     for name in ("bayer", "linear"):
         info = photo.inspect(tmp_path / name)

@@ -4,14 +4,17 @@ CRW files, which are older than all three, name their camera here; LibRaw tells 
 
 The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
 one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
+Maker notes are read only for what EXIF leaves out; one that does not look as expected gives nothing.
 
-Source: CIPA DC-008-2023 (Exif 3.0), section 4.6.
+Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; for maker notes, which no maker documents, ExifTool's tag
+tables (P. Harvey), checked against files of these cameras.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,8 +23,7 @@ from typing import Final
 
 from lensmodel.photo.colour import profile_by_tags
 from lensmodel.photo.containers import Header, opened_header
-from lensmodel.photo.makernote import MakerNote, read_maker_note
-from lensmodel.photo.tiff import EXIF, UNDEFINED, Tags, Value, rationals, shorts, text
+from lensmodel.photo.tiff import EXIF, UNDEFINED, Tag, Tags, TiffReader, Value, rationals, shorts, text
 from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
 from lensmodel.photo.xmp import read_xmp
 
@@ -49,11 +51,13 @@ _SENSOR_WIDTHS_MM: Final = (
 _LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
 _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm
 _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
-_PITCHES_UM: Final = (0.3, 60.0)  # micrometres: what sensors have, with room on either side
-_APERTURES: Final = (0.5, 128.0)  # what lenses have, with room on either side
-_FOCALS_MM: Final = (0.1, 20000.0)  # the same
-_SPEEDS: Final = (1.0, 1e7)  # the same
-_EXPOSURES_S: Final = (1e-7, 1e6)  # the same, seconds
+
+# What lenses and sensors have, with room on either side.
+_PITCHES_UM: Final = (0.3, 60.0)
+_APERTURES: Final = (0.5, 128.0)
+_FOCALS_MM: Final = (0.1, 20000.0)
+_SPEEDS: Final = (1.0, 1e7)
+_EXPOSURES_S: Final = (1e-7, 1e6)
 
 
 def read_metadata(path: Path | str) -> PhotoMetadata:
@@ -82,7 +86,7 @@ class Said:
     header: Header
     tags: Tags  # of IFD0 and the EXIF directory together; the latter win
     xmp: Mapping[str, str]
-    note: MakerNote
+    note: _MakerNote
 
     @classmethod
     def of(cls, header: Header) -> Said:
@@ -96,11 +100,7 @@ class Said:
             if 0x927C in main:
                 note_in = reader
             tags = Tags({**main, **tags})
-        note = (
-            MakerNote()
-            if note_in is None
-            else read_maker_note(tags.text(0x010F) or "", tags[0x927C], note_in)
-        )
+        note = _maker_note(tags.text(0x010F) or "", tags[0x927C], note_in) if note_in else _MakerNote()
         return cls(header, tags, read_xmp(header.xmp), note)
 
     def metadata(self) -> PhotoMetadata:
@@ -152,7 +152,7 @@ class Said:
         pitch, width, height = metadata.pixel_pitch_um, self.header.width, self.header.height
         if self.header.kind in {"raw", "dng"} or pitch is None:
             return True
-        if self._is_cut:
+        if self.xmp.get("crs:HasCrop") == "True":
             return False
         width_mm = max(width, height) * pitch / 1000.0
         film = self._film_pitch_um()
@@ -176,10 +176,6 @@ class Said:
             tags.numbers(319),
             tags.number(0xA500),
         )
-
-    @property
-    def _is_cut(self) -> bool:
-        return self.xmp.get("crs:HasCrop") == "True"
 
     @property
     def _zoom(self) -> float:
@@ -244,7 +240,7 @@ class Said:
             mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
             # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
             whole = any(abs(longer / max(shorter, 1) / shape - 1.0) < 0.01 for shape in (1.5, 4.0 / 3.0))
-            unscaled = mosaic or self._is_cut or not whole
+            unscaled = mosaic or self.xmp.get("crs:HasCrop") == "True" or not whole
             if _is_width_of_sensor(width_mm) or (width_mm <= _LARGEST_SENSOR_MM and unscaled):
                 return pitch
         film = self._film_pitch_um()
@@ -283,6 +279,82 @@ def _first_within(low: float, high: float, *candidates: float | None) -> float |
 
 def _first(refused: Callable[[str], bool], *candidates: str | None) -> str | None:
     return next((c for c in candidates if c and not refused(c)), None)
+
+
+# --- maker notes --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _MakerNote:
+    """What a maker note adds to EXIF; `None` is unknown."""
+
+    lens_model: str | None = None
+    lens_serial: str | None = None
+    body_serial: str | None = None
+    focus_m: float | None = None
+    iso: float | None = None
+
+
+def _maker_note(maker: str, note: Tag, reader: TiffReader) -> _MakerNote:
+    """Read the maker note of EXIF tag 0x927C by its first bytes, or the maker's name."""
+    buffer, start = reader.buffer, note.offset
+    head, at = bytes(buffer[start : start + 16]), start - reader.base
+    if head.startswith(b"OLYMP\0"):  # its offsets count from the file's TIFF header
+        return _olympus(reader, at + 8)
+    if head.startswith((b"OLYMPUS\0", b"OM SYSTEM\0\0\0")):
+        first = 12 if head[:8] == b"OLYMPUS\0" else 16
+        order = {b"II": "<", b"MM": ">"}.get(head[first - 4 : first - 2])
+        return _olympus(TiffReader(buffer, start, order, first), first) if order else _MakerNote()
+    if head.startswith(b"Panasonic\0\0\0"):
+        tags = reader.directory(at + 12)[0]
+        return _MakerNote(lens_model=tags.text(0x0051), lens_serial=tags.text(0x0052))
+    if maker.lower().startswith("canon"):
+        return _canon(note, reader)
+    inner = TiffReader.open(buffer, start + 10) if head.startswith(b"Nikon\0\x02") else None
+    if inner or (maker.lower().startswith("nikon") and not head.startswith(b"Nikon\0")):
+        tags = (inner.directory(inner.first) if inner else reader.directory(at))[0]
+        speed = [*tags.numbers(0x0002, 2), 0.0, 0.0][1]
+        return _MakerNote(body_serial=tags.text(0x001D), iso=speed or None)
+    return _MakerNote()
+
+
+def _canon(note: Tag, reader: TiffReader) -> _MakerNote:
+    # Canon ends its notes with a TIFF header of its own byte order whose offset is the note's original place:
+    # a program may have moved the note without rewriting its offsets.
+    if footer := TiffReader.open(reader.buffer, note.offset + note.size - 8):
+        reader = TiffReader(reader.buffer, note.offset - footer.first, footer.order, footer.first)
+    tags, _ = reader.directory(note.offset - reader.base)
+    # Five bytes, of which exiftool prints ten hexadecimal digits; the number is in the last
+    # four, and all zero (as "1c00000000") where the lens has none.
+    serial, focus_m = tags.raw(0x4019)[:5], None
+    for tag, index in ((0x0093, 20), (0x0004, 19)):
+        # The far and near bounds of focus in centimetres, of which the geometric mean is taken.
+        raw = tags.raw(tag)[2 * index : 2 * index + 4]
+        far, near = struct.unpack(tags[tag].order + "HH", raw) if len(raw) == 4 else (0, 0)
+        if focus_m is None and far >= near > 0:
+            focus_m = math.inf if far == 65535 else math.sqrt(far * near) / 100.0
+    return _MakerNote(
+        lens_model=tags.text(0x0095),
+        lens_serial=serial.hex() if len(serial) == 5 and any(serial[1:]) else None,
+        focus_m=focus_m,
+    )
+
+
+def _olympus(reader: TiffReader, first: int) -> _MakerNote:
+    tags, parts = reader.directory(first)[0], list[Tags]()
+    for pointer in (0x2010, 0x2050):  # equipment and focus, given by a pointer or, in older notes, in place
+        in_place = pointer in tags and tags[pointer].count != 1
+        place = tags[pointer].offset - reader.base if in_place else tags.integer(pointer)
+        parts.append(reader.directory(place)[0])
+    equipment, focus = parts
+    # Millimetres over 1 in some models, centimetres over 10 in others: the numerator is in mm.
+    millimetres = int.from_bytes(focus.raw(0x0305)[:4], "little" if reader.order == "<" else "big")
+    return _MakerNote(
+        lens_model=equipment.text(0x0203),
+        lens_serial=equipment.text(0x0202),
+        body_serial=equipment.text(0x0101),
+        focus_m=(math.inf if millimetres == 0xFFFFFFFF else millimetres / 1000.0) or None,
+    )
 
 
 # --- as EXIF tags of a written file -------------------------------------------------------------

@@ -465,11 +465,8 @@ def _check_colours(tags: Tags) -> None:
         raise UnsupportedFormatError(f"a picture of {samples} channels is no photo; give RGB")
     if tags.integer(339, 1) not in {1, 3, 4}:
         raise UnsupportedFormatError("the TIFF's numbers are signed or complex; save it with 8 or 16 bits")
-    steps = tags.integers(530, 2) if 530 in tags else (2, 2)
-    if kind == 6 and tags.integer(259, 1) not in _JPEG and steps != (1, 1):
-        raise UnsupportedFormatError(
-            f"the TIFF stores one colour (YCbCr) for {' x '.join(map(str, steps))} pixels; convert it to RGB"
-        )
+    if kind == 6 and tags.integer(259, 1) not in _JPEG:
+        raise UnsupportedFormatError("the TIFF's colours are YCbCr that is no JPEG; convert it to RGB")
 
 
 # --- RAW files that are not plain TIFF ---------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -38,9 +38,6 @@ Pixels: TypeAlias = NDArray[Any]
 
 UNDECODABLE: Final = (Image.DecompressionBombError, OSError, SyntaxError, ValueError)
 """What Pillow raises at pictures that are damaged or hostile."""
-
-_PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
-
 
 _TURNED: Final = (
     "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
@@ -104,14 +101,30 @@ def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None]:
 
 def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
     """Decode to numbers `(row, col, 3)`, and say whether alpha was dropped that was not opaque."""
-    if header.kind == "tiff":
-        pixels = _read_tiff(path, header.directory)
-    elif header.kind == "png" and header.bits == 16:
-        pixels = _guarded(lambda: imagecodecs.png_decode(path.read_bytes()), "PNG")
-    else:
-        pixels = _read_with_pillow(path, header)
-    alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
-    return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
+    name = header.kind.upper()
+    try:
+        if header.kind == "tiff":
+            with tifffile.TiffFile(path) as file:
+                file.filehandle.seek(header.directory)
+                pixels = _tiff_page(tifffile.TiffPage(file, 0))
+        elif header.kind == "png" and header.bits == 16:
+            pixels = imagecodecs.png_decode(path.read_bytes())
+        else:
+            with unwarned(), Image.open(path, formats=(name,)) as image:
+                opaque = "transparency" not in image.info and not image.mode.endswith("A")
+                pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
+        alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
+        return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
+    except (MemoryError, LensModelError):
+        raise
+    except Image.DecompressionBombError as error:
+        raise ImageTooLargeError(
+            f"{header.width} x {header.height} pixels are more than the decoder takes"
+        ) from error
+    except Exception as error:  # decoders meet hostile files with exceptions of any kind
+        if "truncated" in str(error):
+            raise TruncatedImageError(f"the {name} ends before its picture does ({error})") from error
+        raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
 
 
 @contextmanager
@@ -120,46 +133,6 @@ def unwarned() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         yield
-
-
-def _read_with_pillow(path: Path, header: Header) -> Pixels:
-    if header.channels == 4 and header.kind == "jpeg":
-        raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
-    try:
-        with unwarned(), Image.open(path, formats=("JPEG", "PNG")) as image:
-            if image.mode not in _PLAIN_MODES:
-                raise UnsupportedFormatError(f"pictures of kind {image.mode} are not read; convert it to RGB")
-            opaque = "transparency" not in image.info and not image.mode.endswith("A")
-            return np.asarray(image.convert("RGB" if opaque else "RGBA"))
-    except Image.DecompressionBombError as error:
-        raise ImageTooLargeError(
-            f"{header.width} x {header.height} pixels are more than the decoder takes"
-        ) from error
-    except (OSError, SyntaxError, ValueError) as error:
-        if "truncated" in str(error):
-            raise TruncatedImageError(
-                f"the {header.kind.upper()} ends before its picture does ({error})"
-            ) from error
-        raise NotAnImageError(f"the {header.kind.upper()}'s pixel data are damaged ({error})") from error
-
-
-def _guarded(decoder: Callable[[], Pixels], name: str) -> Pixels:
-    """Decoders meet hostile files with exceptions of any kind: all mean the same."""
-    try:
-        return np.asarray(decoder())
-    except (MemoryError, LensModelError):
-        raise
-    except Exception as error:
-        raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
-
-
-def _read_tiff(path: Path, directory: int) -> Pixels:
-    def decoded() -> Pixels:
-        with tifffile.TiffFile(path) as file:
-            file.filehandle.seek(directory)
-            return _tiff_page(tifffile.TiffPage(file, 0))
-
-    return _guarded(decoded, "TIFF")
 
 
 def _tiff_page(page: tifffile.TiffPage) -> Pixels:
@@ -175,29 +148,7 @@ def _tiff_page(page: tifffile.TiffPage) -> Pixels:
     if kind == 3 and page.colormap is not None:
         indices = pixels if pixels.ndim == 2 else pixels[:, :, 0]  # what follows them is alpha
         pixels = _colours_of(page.colormap)[indices]
-    if kind == 6 and page.compression not in {6, 7}:  # JPEG's own decoder has converted them
-        pixels = _from_ycbcr(pixels, page)
     return pixels
-
-
-def _from_ycbcr(pixels: Pixels, page: tifffile.TiffPage) -> Pixels:
-    """Convert Y, Cb, Cr to R, G, B by the file's luma weights and ranges: TIFF 6.0, section 21."""
-
-    def numbers(tag: int, default: tuple[float, ...]) -> NDArray[np.float64]:
-        entry = page.tags.get(tag)
-        if entry is None:
-            return np.array(default)
-        pairs = np.asarray(entry.value, dtype=np.float64)  # rationals, or plain numbers
-        return pairs[::2] / pairs[1::2] if len(pairs) == 2 * len(default) else pairs
-
-    top = float(np.iinfo(pixels.dtype).max)
-    red, green, blue = numbers(529, (0.299, 0.587, 0.114))
-    low, high = numbers(532, (0, top, (top + 1) / 2, top, (top + 1) / 2, top)).reshape(3, 2).T
-    full = np.array([1.0, 0.5 - 0.5 / top, 0.5 - 0.5 / top])  # "CodingRange": 255, 127, 127 of 8 bits
-    y, cb, cr = np.moveaxis((pixels[:, :, :3] - low) / (high - low) * full, -1, 0)
-    r, b = y + cr * (2.0 - 2.0 * red), y + cb * (2.0 - 2.0 * blue)
-    rgb = np.stack([r, (y - red * r - blue * b) / green, b], axis=-1)
-    return np.rint(np.clip(rgb, 0.0, 1.0) * top).astype(pixels.dtype)
 
 
 def _colours_of(table: NDArray[np.uint16]) -> Pixels:
@@ -225,14 +176,10 @@ def _three_channels(pixels: Pixels) -> Pixels:
             f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
         )
     if pixels.ndim == 2:
-        return np.repeat(pixels[:, :, None], 3, axis=2)
-    if pixels.ndim != 3:
-        raise UnsupportedFormatError(f"a picture of {pixels.ndim} dimensions is no photo; give one page")
-    if pixels.shape[2] in {1, 2}:
-        return np.repeat(pixels[:, :, :1], 3, axis=2)
-    if pixels.shape[2] > 4:
-        raise UnsupportedFormatError(f"a picture of {pixels.shape[2]} channels is no photo; give RGB")
-    return pixels[:, :, :3]
+        pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or pixels.shape[2] > 4:
+        raise UnsupportedFormatError(f"a picture of shape {pixels.shape} is no photo; give RGB on one page")
+    return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]
 
 
 # --- pixels that a program has turned upright ---------------------------------------------------

@@ -1,18 +1,21 @@
 #!/bin/sh
-# Builds the wheel and installs it in two clean environments. Without any extra: the command's help, and the
-# five lines of docs/library.md on simulated photos. With extras: a lens report, and what the commands that are
-# no part of the wheel say. Nothing of the source tree is on the path; of its files, the page and photographs are read.
+# Builds the wheel and installs it in a clean environment. Without any extra: the command's help, and the five
+# lines of docs/library.md on simulated photos. With extras: a lens report, and what the commands that are no part
+# of the wheel say. Nothing of the source tree is on the path; of its files, the page and photographs are read.
 #
 #     tools/wheel_check.sh [PYTHON]
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT INT TERM
-python=${1:-python3}
+trap 'rm -rf "$work"' EXIT
+trap 'exit 1' HUP INT TERM
+# One environment, nothing kept besides it: packages of this size fill the disk of a small machine
+export TMPDIR="$work" PIP_NO_CACHE_DIR=1
+install() { pip install --quiet --no-compile "$@"; }
 
-"$python" -m venv "$work/build"
-"$work/build/bin/pip" install --quiet hatchling
-(cd "$here" && "$work/build/bin/python" -m hatchling build --target wheel --directory "$work" >/dev/null)
+"${1:-python3}" -m venv "$work/venv"
+export PATH="$work/venv/bin:$PATH"
+pip wheel --quiet --no-deps --wheel-dir "$work" "$here" # in an environment that pip makes and removes
 wheel=$(ls "$work"/lensmodel-*.whl)
 size=$(stat -c %s "$wheel")
 echo "wheel: $(basename "$wheel"), $size bytes"
@@ -20,12 +23,11 @@ test "$size" -lt 12000000 || { echo "the wheel is larger than 12 MB, most of it 
 
 cd "$work"
 unset PYTHONPATH
-"$python" -m venv "$work/bare"
-"$work/bare/bin/pip" install --quiet "$wheel"
-"$work/bare/bin/python" -m lensmodel --help >/dev/null
-"$work/bare/bin/lensmodel" calibrate --help >/dev/null
+install "$wheel"
+python -m lensmodel --help >/dev/null
+lensmodel calibrate --help >/dev/null
 mkdir five-lines
-(cd five-lines && "$work/bare/bin/python" - "$here" <<'PYTHON'
+(cd five-lines && python - "$here" <<'PYTHON'
 import re
 import sys
 from importlib.util import find_spec
@@ -62,9 +64,7 @@ PYTHON
 )
 echo "without extras: the help, and the five lines of the library"
 
-"$python" -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet "$wheel[report,fits]"
-export PATH="$work/venv/bin:$PATH"
+install "$wheel[report,fits]"
 lensmodel --version
 python - <<'PYTHON'
 from importlib.metadata import files

@@ -9,6 +9,7 @@ from functools import cache
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
+from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 
 from app import pages
@@ -18,7 +19,7 @@ from app.http import errors
 from app.http.dependencies import Fresh, Services, call_of
 from app.http.middleware import Guard, RequestLog
 from app.http.model_cache import ModelCache
-from app.routes import account, corrections, health, jobs, lens_profiles, lens_reports, lenses, photos, psf
+from app.routes import account, corrections, health, jobs, lenses, photos, psf
 from app.routes.common import problems
 from app.runtime.outage import missable
 from app.runtime.settings import Settings
@@ -66,12 +67,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
+def _operation(route: APIRoute) -> str:
+    """Name an operation by its function: `getPhoto` for `get_photo`."""
+    first, *more = route.name.split("_")
+    return first + "".join(map(str.capitalize, more))
+
+
 @cache
 def _routes() -> tuple[BaseRoute, ...]:
     """All routes, the same for each application of a process."""
     # What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
     # most requests, and need not be done again for an application with other settings
-    router = APIRouter()
+    router = APIRouter(generate_unique_id_function=_operation)
     router.include_router(health.probes)
     router.include_router(account.sign_ins, prefix="/v1")
     resources = (
@@ -79,8 +86,6 @@ def _routes() -> tuple[BaseRoute, ...]:
         photos,
         jobs,
         lenses,
-        lens_profiles,
-        lens_reports,
         corrections,
         account,
         health,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Final, Generic, Literal, TypeVar, get_args
+from typing import Annotated, Any, Final, Generic, Literal, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
+    AliasPath,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -16,6 +17,7 @@ from pydantic import (
     field_validator,
 )
 
+from app.distances import INFINITY
 from lensmodel.core.types import Channel
 
 V1: Final = "/v1"
@@ -46,7 +48,6 @@ def _odd(value: int) -> int:
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
 OptionalName = Annotated[Name | None, BeforeValidator(blank_is_none)]
 Id = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")]
-OptionalId = Annotated[Id | None, BeforeValidator(blank_is_none)]
 Aperture = Annotated[float, Field(ge=0.5, le=128, description="f-number")]
 FocalLength = Annotated[float, Field(ge=0.1, le=20000, description="mm")]
 FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, description="m")]
@@ -56,10 +57,28 @@ KernelSize = Annotated[
 ]
 
 
-class Model(BaseModel):
-    """Common to what we send."""
+# Where the row of a table has what we send: under its own name unless an alias says otherwise
+PublicId = Annotated[str, Field(validation_alias="public_id")]
+FocusM = Annotated[float | None, BeforeValidator(lambda stored: None if stored == INFINITY else stored)]
 
-    model_config = ConfigDict(frozen=True, ser_json_inf_nan="null", protected_namespaces=())
+
+class Model(BaseModel):
+    """Common to what we send: made of a row of a table, by the service, or of JSON, by its client."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        from_attributes=True,
+        validate_by_alias=True,
+        validate_by_name=True,
+        json_schema_serialization_defaults_required=True,
+        ser_json_inf_nan="null",
+        protected_namespaces=(),
+    )
+
+    @classmethod
+    def of(cls, row: object, **more: object) -> Self:
+        """Describe a row; `more` is what no column says."""
+        return cls.model_validate(row, by_name=False).model_copy(update=more)
 
 
 class Page(Model, Generic[T]):
@@ -178,35 +197,32 @@ class PhotosChange(Question):
 class PatchCounts(Model):
     """How far the patches of a photo are."""
 
-    total: int
-    done: int
-    rejected: int
+    total: int = 0
+    done: int = 0
+    rejected: int = 0
 
 
 class PhotoOut(Model):
     """A photo."""
 
-    id: str
+    id: PublicId
     filename: str
     sha256: str
     state: PhotoState
     calibrate: bool
-    lens_id: str | None
+    lens_id: str | None = Field(None, validation_alias=AliasPath("lens", "public_id"))
     aperture: float | None
-    focal_length_mm: float | None
-    focus_distance_m: float | None
+    focal_length_mm: float | None = Field(validation_alias="focal_mm")
+    focus_distance_m: FocusM = Field(validation_alias="focus_m")
     pixel_pitch_um: float | None
-    camera: str | None
     lens_model: str | None
     width: int | None
     height: int | None
-    kind: MeasurementKind | None = Field(
-        default=None, description="what a photo made to measure the lens shows"
-    )
-    reference_id: str | None = Field(default=None, description="of a pair: the photo closed to about f/8")
-    patches: PatchCounts
-    error: Problem | None
-    created_at: datetime
+    kind: MeasurementKind | None = Field(None, validation_alias=AliasPath("given", "kind"))
+    reference_id: str | None = Field(None, validation_alias=AliasPath("given", "reference_id"))
+    patches: PatchCounts = PatchCounts()
+    error: Problem | None = None
+    created_at: datetime = Field(validation_alias="received_at")
 
     @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
     @property
@@ -219,7 +235,7 @@ class PhotoOut(Model):
 class PatchOut(Model):
     """One window of a photo, used or rejected."""
 
-    index: int
+    index: int = Field(validation_alias="idx")
     row: int
     col: int
     size: int
@@ -231,9 +247,7 @@ class PatchOut(Model):
 
 
 CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
-
 OutputFormat = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
-
 ColorSpace = Literal["same", "srgb", "camera-linear"]
 
 
@@ -281,17 +295,17 @@ class CorrectionIn(Question):
 class CorrectionOut(Model):
     """A correction."""
 
-    id: str
-    photo_id: str
-    lens_id: str
+    id: PublicId
+    photo_id: str = Field(validation_alias=AliasPath("photo", "public_id"))
+    lens_id: str = Field(validation_alias=AliasPath("lens", "public_id"))
     lens_version: int
     state: CorrectionState
-    method: str
-    strength: float
-    output: dict[str, Any]
-    roi: dict[str, Any] | None
+    method: str = Field(validation_alias=AliasPath("params", "method"))
+    strength: float = Field(validation_alias=AliasPath("params", "strength"))
+    output: dict[str, Any] = Field(validation_alias=AliasPath("params", "output"))
+    roi: dict[str, Any] | None = Field(validation_alias=AliasPath("params", "roi"))
     report: dict[str, Any] | None
-    error: Problem | None
+    error: Problem | None = None
     created_at: datetime
     finished_at: datetime | None
 
@@ -338,17 +352,17 @@ SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
 class LensOut(Model):
     """One copy of a lens and what is known of it."""
 
-    id: str
+    id: PublicId
     maker: str | None
     model: str | None
     serial: str | None
     serial_source: SerialSource
     label: str | None
     version: int
-    photos: int
-    samples: int
-    apertures: list[float]
-    focal_lengths_mm: list[float]
+    photos: int = Field(validation_alias="photo_count")
+    samples: int = Field(validation_alias="sample_count")
+    apertures: list[float] = []
+    focal_lengths_mm: list[float] = []
     created_at: datetime
 
     @computed_field  # type: ignore[prop-decorator]  # as pydantic documents it
@@ -361,17 +375,35 @@ class LensOut(Model):
         return {"self": own, **{name: f"{own}/{part}" for name, part in parts.items()}, "photos": photos}
 
 
+class LensChange(Question):
+    """What to change about a lens: one of these."""
+
+    label: Name | None = Field(None, description="what its owner calls it; null takes the name away")
+    merge_into: Id | None = Field(None, description="the lens that this one is a part of")
+    any_lens: bool = Field(default=False, description="merge lenses too that seem to be two")
+
+
+class LensIn(Question):
+    """A lens of which nothing is known yet but its name."""
+
+    label: Name = Field(description="what its owner calls it")
+
+
 class CalibrationOut(Model):
     """One version of a lens: what changed, and how good the model was then."""
 
     version: int
     kind: str
-    photo_id: str | None
+    photo_id: str | None = Field(validation_alias="photo_public_id")
     samples_added: int
     samples: int
     photos: int
-    error: dict[str, Any] | float | None = Field(description="held-out error; null until it is measured")
-    coverage: dict[str, Any] | None
+    error: dict[str, Any] | float | None = Field(
+        None,
+        validation_alias=AliasPath("metrics", "error"),
+        description="held-out error, once it is measured",
+    )
+    coverage: dict[str, Any] | None = Field(None, validation_alias=AliasPath("metrics", "coverage"))
     created_at: datetime
 
 
@@ -419,18 +451,6 @@ class KernelOut(Model):
     data: list[list[float]]
 
 
-class QueryOut(Model):
-    """The question as it was understood."""
-
-    r: float
-    phi: float
-    aperture: float | None
-    channel: Channel
-    size: int
-    focal_length_mm: float | None
-    focus_distance_m: float | None
-
-
 class Support(Model):
     """What an answer rests on."""
 
@@ -466,7 +486,7 @@ class PsfOut(Model):
 
     lens_id: str
     version: int
-    query: QueryOut
+    query: PsfQuery = Field(description="the question as it was understood")
     psf: KernelOut
     support: Support
     bandwidth: dict[str, float]

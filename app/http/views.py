@@ -1,19 +1,17 @@
-"""Rows as the schemas of responses: columns of the same name are taken over, the others said here."""
+"""Rows as answers where one column alone does not say it: what went wrong, and how far the work is."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Final, TypeVar, get_args
+from typing import Final, TypeAlias, get_args
 
-from app import distances
 from app import schemas as s
 from app.http.errors import problem_of
 from app.schemas import V1
 from app.store.owners import now
-from app.store.tables import Base, CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow
+from app.store.tables import CorrectionRow, PhotoRow
 
-M = TypeVar("M", bound=s.Model)
-
+Worked: TypeAlias = PhotoRow | CorrectionRow
 # State of the job, by the state of the photo
 JOB_STATES: Final[dict[str, s.JobState]] = {
     **dict.fromkeys(get_args(s.Working), "running"),
@@ -25,32 +23,18 @@ JOB_STATES: Final[dict[str, s.JobState]] = {
 }
 
 
-def _of(model: type[M], row: Base, **more: object) -> M:
-    """Return a row as a model: its columns, and `more` in place of some of them."""
-    shared = {name: getattr(row, name) for name in model.model_fields if hasattr(row, name)}
-    return model.model_validate({**shared, **more})
-
-
 def photo_out(row: PhotoRow) -> s.PhotoOut:
     """Describe a photo."""
-    camera = " ".join(part for part in (row.camera_maker, row.camera_model) if part)
-    return _of(
-        s.PhotoOut,
-        row,
-        id=row.public_id,
-        lens_id=None if row.lens is None else row.lens.public_id,
-        focal_length_mm=row.focal_mm,
-        focus_distance_m=None if row.focus_m == distances.INFINITY else row.focus_m,
-        camera=camera or None,
-        kind=row.given.get("kind"),
-        reference_id=row.given.get("reference_id"),
-        patches={"total": row.patches_total, "done": row.patches_done, "rejected": row.patches_rejected},
-        error=_problem(row),
-        created_at=row.received_at,
-    )
+    patches = s.PatchCounts(total=row.patches_total, done=row.patches_done, rejected=row.patches_rejected)
+    return s.PhotoOut.of(row, patches=patches, error=_problem(row))
 
 
-def _problem(row: PhotoRow | CorrectionRow) -> s.Problem | None:
+def correction_out(row: CorrectionRow) -> s.CorrectionOut:
+    """Describe a correction."""
+    return s.CorrectionOut.of(row, error=_problem(row))
+
+
+def _problem(row: Worked) -> s.Problem | None:
     if isinstance(row, PhotoRow) and row.state == "needs_lens":
         return problem_of(
             "metadata_missing",
@@ -64,94 +48,42 @@ def _problem(row: PhotoRow | CorrectionRow) -> s.Problem | None:
     return None if row.error_code is None else problem_of(row.error_code, row.error_detail)
 
 
-def patch_out(row: PatchRow) -> s.PatchOut:
-    """Describe one window of a photo."""
-    return _of(s.PatchOut, row, index=row.idx)
-
-
-def photo_job(row: PhotoRow) -> s.JobOut:
-    """Describe the work on a photo."""
-    since = row.stage_at if row.state == "estimating" else None
-    how_far = (row.patches_done, row.patches_total, "patches")
-    return _job(row, "photo", JOB_STATES[row.state], row.state, since, how_far, row, {}, row.received_at)
-
-
-def correction_job(row: CorrectionRow) -> s.JobOut:
-    """Describe the work on a correction."""
-    own = f"{V1}/corrections/{row.public_id}"
-    links = {"correction": own, "result": f"{own}/result" if row.state == "succeeded" else None}
-    since = row.started_at if row.state == "running" else None
-    how_far = (row.progress_done, row.progress_total, "tiles")
-    return _job(row, "correction", row.state, row.stage, since, how_far, row.photo, links, row.created_at)
-
-
-def _job(
-    row: PhotoRow | CorrectionRow,
-    kind: str,
-    state: str,
-    stage: str | None,
-    since: datetime | None,
-    how_far: tuple[int, int, str],
-    photo: PhotoRow,
-    links: dict[str, str | None],
-    created_at: datetime,
-) -> s.JobOut:
-    done, total, unit = how_far
-    return _of(
-        s.JobOut,
-        row,
-        id=row.public_id,
-        kind=kind,
-        state=state,
-        stage=stage if state == "running" else None,
-        progress={"done": done, "total": total, "unit": unit},
-        eta_seconds=None if since is None else _eta(since, done, total),
-        attempt=max(row.attempt, 1),
-        error=_problem(row),
-        created_at=created_at,
-        links={
-            "self": f"{V1}/jobs/{row.public_id}",
-            "photo": f"{V1}/photos/{photo.public_id}",
-            "lens": None if row.lens is None else f"{V1}/lenses/{row.lens.public_id}",
-            "correction": None,
-            "result": None,
-            **links,
-        },
+def job_out(row: Worked) -> s.JobOut:
+    """Describe the work on a photo or on a correction."""
+    links = dict.fromkeys(("correction", "result"))
+    state: str = row.state
+    stage: str | None
+    if isinstance(row, PhotoRow):
+        photo, state, stage, created_at = row, JOB_STATES[row.state], row.state, row.received_at
+        done, total, unit = row.patches_done, row.patches_total, "patches"
+        since = row.stage_at if row.state == "estimating" else None
+    else:
+        photo, stage, created_at = row.photo, row.stage, row.created_at
+        done, total, unit = row.progress_done, row.progress_total, "tiles"
+        since = row.started_at if row.state == "running" else None
+        own = f"{V1}/corrections/{row.public_id}"
+        links = {"correction": own, "result": f"{own}/result" if row.state == "succeeded" else None}
+    return s.JobOut.model_validate(
+        {
+            "id": row.public_id,
+            "kind": "photo" if photo is row else "correction",
+            "state": state,
+            "stage": stage if state == "running" else None,
+            "progress": {"done": done, "total": total, "unit": unit},
+            "eta_seconds": None if since is None else _eta(since, done, total),
+            "attempt": max(row.attempt, 1),
+            "error": _problem(row),
+            "created_at": created_at,
+            "started_at": row.started_at,
+            "finished_at": row.finished_at,
+            "links": {
+                "self": f"{V1}/jobs/{row.public_id}",
+                "photo": f"{V1}/photos/{photo.public_id}",
+                "lens": None if row.lens is None else f"{V1}/lenses/{row.lens.public_id}",
+                **links,
+            },
+        }
     )
-
-
-def correction_out(row: CorrectionRow) -> s.CorrectionOut:
-    """Describe a correction."""
-    asked = {name: row.params[name] for name in ("method", "strength", "output", "roi")}
-    return _of(
-        s.CorrectionOut,
-        row,
-        id=row.public_id,
-        photo_id=row.photo.public_id,
-        lens_id=row.lens.public_id,
-        error=_problem(row),
-        **asked,
-    )
-
-
-def lens_out(row: LensRow, apertures: list[float], focals: list[float]) -> s.LensOut:
-    """Describe a lens."""
-    return _of(
-        s.LensOut,
-        row,
-        id=row.public_id,
-        photos=row.photo_count,
-        samples=row.sample_count,
-        apertures=apertures,
-        focal_lengths_mm=focals,
-    )
-
-
-def calibration_out(row: EventRow) -> s.CalibrationOut:
-    """Describe one version of a lens."""
-    metrics = row.metrics or {}
-    measured = {name: metrics.get(name) for name in ("error", "coverage")}
-    return _of(s.CalibrationOut, row, photo_id=row.photo_public_id, **measured)
 
 
 def _eta(since: datetime, done: int, total: int) -> float | None:

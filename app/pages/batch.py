@@ -27,7 +27,7 @@ router = APIRouter(include_in_schema=False, route_class=OneSession)
 def state(call: Call, ids: str) -> dict[str, Any]:
     """Return what the page shows of corrections whose ids have commas between them."""
     plans = _plans(call, ids)
-    jobs = [views.correction_job(plan) for plan in plans]
+    jobs = [views.job_out(plan) for plan in plans]
     return {
         "rows": list(zip(plans, map(views.correction_out, plans), jobs, strict=True)),
         "left": sum(job.state in {"queued", "running"} for job in jobs),

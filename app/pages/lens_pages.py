@@ -17,7 +17,7 @@ from app.pages import shown, words
 from app.pages.rendering import page
 from app.routes import lenses as lens_routes
 from app.routes.common import find_lens
-from app.routes.lens_reports import stored_report
+from app.routes.lenses import stored_report
 from app.schemas import Aperture, CalibrationOut, blank_is_none
 from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
@@ -39,7 +39,7 @@ router = APIRouter(include_in_schema=False, route_class=OneSession)
 @router.get("/lenses/{lens_id}")
 def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> HTMLResponse:
     """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
-    lens, row = lens_routes.read_lens(lens_id, call), find_lens(call, lens_id)
+    lens, row = lens_routes.get_lens(lens_id, call), find_lens(call, lens_id)
     photos, more = shown.photos(call, lens_id)
     aspect, test = _aspect(call, row), _test(call, row)
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
@@ -70,7 +70,7 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
 @router.get("/lenses/{lens_id}/tests")
 def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     """Show what testers and researchers ask of a lens: charts, its blur at any point, its versions."""
-    lens, row = lens_routes.read_lens(lens_id, call), find_lens(call, lens_id)
+    lens, row = lens_routes.get_lens(lens_id, call), find_lens(call, lens_id)
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, _ = shown.photos(call, lens_id)

@@ -58,13 +58,13 @@ def home(call: Call, _: str = "") -> Part:
 
 
 def _photo(call: Call, photo_id: str) -> Part:
-    photo = photo_routes.read_photo(photo_id, call)
+    photo = photo_routes.get_photo(photo_id, call)
     return "_photo_state.html", {"photo": photo}, not words.active(photo)
 
 
 def _correction(call: Call, correction_id: str) -> Part:
     plan = correction_routes.find_correction(call, correction_id)
-    correction, job = views.correction_out(plan), views.correction_job(plan)
+    correction, job = views.correction_out(plan), views.job_out(plan)
     values = {"correction": correction, "job": job}
     return "_correction_state.html", values, job.state not in {"queued", "running"}
 
@@ -75,7 +75,7 @@ def _batch(call: Call, ids: str) -> Part:
 
 def _lens(call: Call, lens_id: str) -> Part:
     counting = shown.counting(call, lens_id)
-    values = {"lens": lens_routes.read_lens(lens_id, call), "counting": counting}
+    values = {"lens": lens_routes.get_lens(lens_id, call), "counting": counting}
     return "_lens_state.html", values, not counting
 
 

@@ -58,7 +58,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     corrections = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
     corrections = [correction for correction in corrections if correction.roi is None]
     done = next((correction for correction in corrections if correction.state == "succeeded"), None)
-    lens = None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call)
+    lens = None if photo.lens_id is None else lens_routes.get_lens(photo.lens_id, call)
     shown_by = "" if done is None else f"/ui/corrections/{done.id}/tiles"
     better = done is not None and not (done.report or {}).get("nothing_to_correct")
     return page(
@@ -132,7 +132,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     return page(
         "correction.html",
         correction=correction,
-        job=views.correction_job(plan),
+        job=views.job_out(plan),
         photo=_upright(photo, row),
         can_look=can_look,
         zones=zones if changed else [],

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Final
 from urllib.parse import urlsplit
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import StreamingResponse
@@ -24,25 +25,18 @@ sign_ins = APIRouter(tags=["account"], route_class=OneSession)
 HTTPS: Final = "https"
 
 
-@router.get("/account", operation_id="getAccount")
-def read_account(call: CallDep) -> AccountOut:
+@router.get("/account")
+def get_account(call: CallDep) -> AccountOut:
     """Return what the owner has, and may have."""
     usage = call.store.accounts.usage(call.owner)
     max_bytes, max_photos = most(call.settings, usage)
-    return AccountOut.model_validate(
-        {
-            "owner": call.owner,
-            "scopes": call.who.scopes,
-            "max_photos": max_photos,
-            "max_stored_bytes": max_bytes,
-            **{name: getattr(usage, name) for name in AccountOut.model_fields if hasattr(usage, name)},
-        }
-    )
+    most_of_it = {"max_photos": max_photos, "max_stored_bytes": max_bytes}
+    owner = {"owner": call.owner, "scopes": call.who.scopes}
+    return AccountOut.model_validate({**asdict(usage), **most_of_it, **owner})
 
 
 @router.get(
     "/account/export",
-    operation_id="exportAccount",
     response_class=Response,
     responses=file_answer("application/zip", "Rows as JSON lines, originals, results"),
 )
@@ -53,7 +47,7 @@ def export_account(call: CallDep) -> Response:
     return StreamingResponse(body, headers=headers, media_type="application/zip")
 
 
-@router.delete("/account", operation_id="eraseAccount", status_code=status.HTTP_204_NO_CONTENT)
+@router.delete("/account", status_code=204)
 def erase_account(call: CallDep) -> None:
     """Erase the owner: photos, lenses, samples, corrections, keys and sign-ins. There is no way back.
 
@@ -67,9 +61,7 @@ def erase_account(call: CallDep) -> None:
     call.response.delete_cookie(COOKIE)
 
 
-@sign_ins.post(
-    "/session", operation_id="signIn", status_code=status.HTTP_201_CREATED, responses=problems(401, 422, 429)
-)
+@sign_ins.post("/session", status_code=201, responses=problems(401, 422, 429))
 async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
     gate = call.gate
@@ -85,16 +77,14 @@ async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     return SessionOut.model_validate({"owner": who.owner, "scopes": who.scopes, "needed": True})
 
 
-@sign_ins.get("/session", operation_id="getSession", responses=problems(401))
-async def read_session(call: CallDep) -> SessionOut:
+@sign_ins.get("/session", responses=problems(401))
+async def get_session(call: CallDep) -> SessionOut:
     """Return who is signed in."""
     needed = call.who.key_id is not None
     return SessionOut.model_validate({"owner": call.owner, "scopes": call.who.scopes, "needed": needed})
 
 
-@sign_ins.delete(
-    "/session", operation_id="signOut", status_code=status.HTTP_204_NO_CONTENT, responses=problems(422)
-)
+@sign_ins.delete("/session", status_code=204, responses=problems(422))
 async def sign_out(call: ProbeDep) -> None:
     """Sign the browser out."""
     await run_in_threadpool(call.gate.sign_out, call.request)

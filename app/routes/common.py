@@ -1,10 +1,11 @@
-"""What several routes share: pages, and which problems an endpoint may answer with."""
+"""What several routes share: look-ups, pages, files, and which problems an endpoint may answer with."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Final, Protocol, TypeAlias, TypeVar
+from operator import attrgetter
+from typing import Annotated, Any, Final, TypeAlias, TypeVar
 from urllib.parse import quote, urlencode
 
 from fastapi import Query
@@ -14,28 +15,17 @@ from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
 from app.other_lens import Described
 from app.schemas import Model, OptionalName, Page, Problem
-from app.store.tables import LensRow
+from app.store.tables import LensRow, PhotoRow
 from lensmodel.core.names import camera_name
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
-Cursor = Annotated[
-    str | None, Query(pattern="^[A-Za-z0-9]{1,40}$", description="from `next` of the page before")
-]
-OnlyId = Annotated[str | None, Query(pattern="^[A-Za-z0-9]{1,40}$")]
+_ID: Final = "^[A-Za-z0-9]{1,40}$"
+Cursor = Annotated[str | None, Query(pattern=_ID, description="from `next` of the page before")]
+OnlyId = Annotated[str | None, Query(pattern=_ID)]
 OnlyName = Annotated[OptionalName, Query()]
 
-
-class HasPublicId(Protocol):
-    """A row with a public id."""
-
-    public_id: str
-
-
-Row = TypeVar("Row", bound=HasPublicId)
 M = TypeVar("M", bound=Model)
 T = TypeVar("T")
-
-
 Answers: TypeAlias = dict[int | str, dict[str, Any]]
 
 
@@ -65,7 +55,6 @@ def file_headers(name: str, *, inline: bool = False, cache: str = "private, no-c
     return {
         "Content-Disposition": f"{how}; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}",
         "Cache-Control": cache,
-        "X-Content-Type-Options": "nosniff",
     }
 
 
@@ -90,26 +79,32 @@ def find_lens(call: Call, lens_id: str) -> LensRow:
 def described_lens(call: Call, lens: LensRow) -> Described:
     """Return what is known of a lens by itself and by its newest photos."""
     own = call.store.photos.page(call.owner, before=None, limit=200, lens_id=lens.public_id)
-    return Described(
-        lens.maker,
-        lens.model,
-        lens.serial,
-        {camera_name(row.camera_maker, row.camera_model) for row in own if row.camera_model},
-        [row.focal_mm for row in own if row.focal_mm],
-    )
+    return _described(lens.maker, lens.model, lens.serial, own)
 
 
-def paged(call: Call, rows: Sequence[Row], limit: int, make: Callable[[Row], M]) -> Page[M]:
-    """Return a page of what one row more was read of, with the address of the next one."""
-    following = rows[limit - 1].public_id if len(rows) > limit else None
-    return Page(items=[make(row) for row in rows[:limit]], next=next_link(call, following))
+def described_photo(photo: PhotoRow) -> Described:
+    """Return what a photo says of its lens."""
+    return _described(photo.lens_maker, photo.lens_model, photo.lens_serial, [photo])
 
 
-def next_link(call: Call, cursor: str | None) -> str | None:
-    """Return the address of the next page, and set the Link header."""
-    if cursor is None:
-        return None
-    query = {**call.request.query_params, "cursor": cursor}
-    link = f"{call.request.url.path}?{urlencode(query)}"
-    call.response.headers["Link"] = f'<{link}>; rel="next"'
-    return link
+def _described(
+    maker: str | None, model: str | None, serial: str | None, photos: Sequence[PhotoRow]
+) -> Described:
+    cameras = {camera_name(row.camera_maker, row.camera_model) for row in photos if row.camera_model}
+    return Described(maker, model, serial, cameras, [row.focal_mm for row in photos if row.focal_mm])
+
+
+def paged(
+    call: Call,
+    rows: Sequence[T],
+    limit: int,
+    make: Callable[[T], M],
+    cursor: Callable[[T], str] = attrgetter("public_id"),
+) -> Page[M]:
+    """Return a page of what one row more was read of, with the address of the next one, also in `Link`."""
+    items, following = [make(row) for row in rows[:limit]], None
+    if len(rows) > limit:
+        query = {**call.request.query_params, "cursor": cursor(rows[limit - 1])}
+        following = f"{call.request.url.path}?{urlencode(query)}"
+        call.response.headers["Link"] = f'<{following}>; rel="next"'
+    return Page(items=items, next=following)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, Response
 from starlette.responses import StreamingResponse
 
 from app.errors import ConflictError, InvalidParameterError, NotReadyError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import check_version
-from app.other_lens import REMEDY, Described, difference
+from app.other_lens import REMEDY, difference
 from app.routes.common import (
     NOT_CHANGED,
     Cursor,
     Limit,
     OnlyId,
     described_lens,
+    described_photo,
     file_answer,
     file_headers,
     find_lens,
@@ -33,7 +34,6 @@ from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
-from lensmodel.core.names import camera_name
 from lensmodel.correction import deconvolvers
 
 router = APIRouter(tags=["corrections"], route_class=OneSession)
@@ -42,9 +42,7 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 
 @router.post(
     "/corrections",
-    operation_id="createCorrection",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=CorrectionOut,
+    status_code=202,
     responses={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
 )
 def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
@@ -70,7 +68,7 @@ def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
     params = asked | own | {"settings": stored_settings(photo)}
     row, created = call.store.jobs.correct(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
-    call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
+    call.response.status_code = 200 if finished else 202
     call.response.headers["Location"] = f"{V1}/corrections/{row.public_id}"
     return views.correction_out(row)
 
@@ -115,15 +113,7 @@ def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
 
 def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
     """Refuse a photo that seems to be of another lens, as the command line does."""
-    camera = camera_name(photo.camera_maker, photo.camera_model)
-    own_lens = Described(
-        photo.lens_maker,
-        photo.lens_model,
-        photo.lens_serial,
-        [camera] if photo.camera_model else [],
-        [photo.focal_mm] if photo.focal_mm else [],
-    )
-    why = difference(described_lens(call, lens), own_lens)
+    why = difference(described_lens(call, lens), described_photo(photo))
     if why is not None:
         raise ConflictError(
             f"{photo.filename} seems to be of another lens: {why}; {REMEDY}", code="other_lens"
@@ -148,7 +138,7 @@ def find_correction(call: Call, correction_id: str) -> CorrectionRow:
     return found("correction", correction_id, call.store.jobs.get(correction_id, call.owner))
 
 
-@router.get("/corrections", operation_id="listCorrections")
+@router.get("/corrections")
 def list_corrections(
     call: CallDep, limit: Limit = 50, cursor: Cursor = None, photo_id: OnlyId = None
 ) -> Page[CorrectionOut]:
@@ -158,15 +148,13 @@ def list_corrections(
     return paged(call, rows, limit, views.correction_out)
 
 
-@router.get("/corrections/{correction_id}", operation_id="getCorrection")
-def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
+@router.get("/corrections/{correction_id}")
+def get_correction(correction_id: str, call: CallDep) -> CorrectionOut:
     """Return one correction."""
     return views.correction_out(find_correction(call, correction_id))
 
 
-@router.delete(
-    "/corrections/{correction_id}", operation_id="deleteCorrection", status_code=status.HTTP_204_NO_CONTENT
-)
+@router.delete("/corrections/{correction_id}", status_code=204)
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
     prefix = call.store.jobs.delete(correction_id, call.owner)
@@ -175,13 +163,12 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
 
 @router.get(
     "/corrections/{correction_id}/result",
-    operation_id="getCorrectionResult",
     response_class=Response,
     responses=problems(
         416, also=file_answer("image/*", "The file") | file_answer("image/*", "A part", 206) | NOT_CHANGED
     ),
 )
-def read_result(correction_id: str, call: CallDep) -> Response:
+def get_correction_result(correction_id: str, call: CallDep) -> Response:
     """Return the corrected photo, whole or in part."""
     row = find_correction(call, correction_id)
     if row.state != "succeeded":
@@ -195,15 +182,15 @@ def read_result(correction_id: str, call: CallDep) -> Response:
     tag = f'"{row.result_etag}"'
     headers = {"ETag": tag, "Accept-Ranges": "bytes", **file_headers(row.result_name or "corrected")}
     if matches_tag(call, tag):
-        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+        return Response(status_code=304, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:
         part = None  # the file has changed since the first part: send all of it
     start, end = byte_range(part, row.result_bytes)
     headers["Content-Length"] = str(end - start)
-    code = status.HTTP_200_OK
+    code = 200
     if (start, end) != (0, row.result_bytes):
-        code = status.HTTP_206_PARTIAL_CONTENT
+        code = 206
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{row.result_bytes}"
     body = call.storage.stream(row.result_key, start, end)
     return StreamingResponse(body, code, headers, row.result_media_type)

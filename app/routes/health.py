@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import Final, get_args
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, Response
 
 from app.http.dependencies import Call, CallDep, OneSession, ProbeDep
 from app.routes.jobs import LONG_POLL_S
@@ -37,22 +37,18 @@ probes = APIRouter(tags=["service"], route_class=OneSession)
 router = APIRouter(tags=["service"], route_class=OneSession)
 
 
-@probes.get("/healthz", operation_id="getHealth")
-def healthz() -> dict[str, str]:
+@probes.get("/healthz")
+def get_health() -> dict[str, str]:
     """Say that the process lives."""
     return {"status": "ok"}
 
 
-@probes.get(
-    "/readyz",
-    operation_id="getReadiness",
-    responses={503: {"model": Readiness, "description": "Something is missing"}},
-)
-def readyz(call: ProbeDep) -> Readiness:
+@probes.get("/readyz", responses={503: {"model": Readiness, "description": "Something is missing"}})
+def get_readiness(call: ProbeDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
     readiness = call.readiness.get(lambda: _readiness(call))
     if readiness.status != "ready":
-        call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
+        call.response.status_code = 503
     return readiness
 
 
@@ -110,21 +106,21 @@ def _worker(call: Call) -> dict[str, bool]:
 
 
 @probes.get("/metrics", include_in_schema=False)
-def read_metrics(call: CallDep) -> Response:
+def get_metrics(call: CallDep) -> Response:
     """Return the numbers of this service for Prometheus."""
     text = metrics.of_service(call.store, call.settings.lease_seconds)
     return Response(text, media_type=metrics.CONTENT_TYPE)
 
 
-@router.get("/version", operation_id="getVersion")
-def read_version(call: CallDep) -> VersionOut:
+@router.get("/version")
+def get_version(call: CallDep) -> VersionOut:
     """Return what runs here."""
     revision = migrate.current(call.store.database)
     return VersionOut(name="lensmodel", version=version("lensmodel"), api="v1", schema_revision=revision)
 
 
-@router.get("/formats", operation_id="getFormats")
-def read_formats() -> FormatsOut:
+@router.get("/formats")
+def get_formats() -> FormatsOut:
     """Return what can be read and written, and the methods by name."""
     return FormatsOut(
         read=["raw", "dng", "tiff", "png", "jpeg"],
@@ -137,8 +133,8 @@ def read_formats() -> FormatsOut:
     )
 
 
-@router.get("/limits", operation_id="getLimits")
-def read_limits(call: CallDep) -> LimitsOut:
+@router.get("/limits")
+def get_limits(call: CallDep) -> LimitsOut:
     """Return how much of everything."""
     settings = call.settings
     return LimitsOut(

@@ -6,16 +6,17 @@ import asyncio
 import hashlib
 import time
 from collections.abc import AsyncIterator
+from operator import attrgetter
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Query, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
 from app.errors import ConflictError, UnknownError
 from app.http import views
 from app.http.dependencies import Call, CallDep, OneSession
-from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, found, next_link
+from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, found, paged
 from app.routes.photos import SEND_AGAIN
 from app.schemas import JobOut, Page
 
@@ -31,9 +32,8 @@ FINAL = {"succeeded", "failed", "cancelled"}
 def find_job(call: Call, job_id: str) -> JobOut:
     """Return the job of a photo or of a correction."""
     photo = call.store.photos.get(job_id, call.owner)
-    if photo is not None:
-        return views.photo_job(photo)
-    return views.correction_job(found("job", job_id, call.store.jobs.get(job_id, call.owner)))
+    correction = call.store.jobs.get(job_id, call.owner) if photo is None else None
+    return views.job_out(photo or found("job", job_id, correction))
 
 
 def fingerprint(job: JobOut) -> str:
@@ -41,19 +41,17 @@ def fingerprint(job: JobOut) -> str:
     return hashlib.sha256(job.model_dump_json(exclude={"eta_seconds"}).encode()).hexdigest()[:16]
 
 
-@router.get("/jobs", operation_id="listJobs")
+@router.get("/jobs")
 def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> Page[JobOut]:
     """List jobs of photos and corrections, newest first."""
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
     corrections = call.store.jobs.page(call.owner, before=cursor, limit=limit + 1)
-    jobs = [*map(views.photo_job, photos), *map(views.correction_job, corrections)]
-    newest = sorted(jobs, key=lambda job: job.id, reverse=True)
-    following = newest[limit - 1].id if len(newest) > limit else None
-    return Page[JobOut](items=newest[:limit], next=next_link(call, following))
+    newest: list[views.Worked] = sorted([*photos, *corrections], key=attrgetter("public_id"), reverse=True)
+    return paged(call, newest, limit, views.job_out)
 
 
-@router.get("/jobs/{job_id}", operation_id="getJob", response_model=JobOut, responses=NOT_CHANGED)
-async def read_job(
+@router.get("/jobs/{job_id}", response_model=JobOut, responses=NOT_CHANGED)
+async def get_job(
     job_id: str,
     call: CallDep,
     wait: Annotated[float, Query(ge=0, le=20, allow_inf_nan=False, description="seconds")] = 0.0,
@@ -75,17 +73,12 @@ async def read_job(
     if job.state not in FINAL:
         headers["Retry-After"] = "1"
     if known_tag == tag:
-        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+        return Response(status_code=304, headers=headers)
     call.response.headers.update(headers)
     return job
 
 
-@router.post(
-    "/jobs/{job_id}/cancel",
-    operation_id="cancelJob",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=JobOut,
-)
+@router.post("/jobs/{job_id}/cancel", status_code=202)
 def cancel_job(job_id: str, call: CallDep) -> JobOut:
     """Cancel a job: running parts of it stop within a second, nothing of it counts."""
     done = call.store.photos.cancel(job_id, call.owner) or call.store.jobs.cancel(job_id, call.owner)
@@ -95,12 +88,7 @@ def cancel_job(job_id: str, call: CallDep) -> JobOut:
     return job
 
 
-@router.post(
-    "/jobs/{job_id}/retry",
-    operation_id="retryJob",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=JobOut,
-)
+@router.post("/jobs/{job_id}/retry", status_code=202)
 def retry_job(job_id: str, call: CallDep) -> JobOut:
     """Start a failed or cancelled job anew."""
     photo = call.store.photos.get(job_id, call.owner)
@@ -118,7 +106,6 @@ def retry_job(job_id: str, call: CallDep) -> JobOut:
 
 @router.get(
     "/jobs/{job_id}/events",
-    operation_id="watchJob",
     response_class=EventSourceResponse,
     responses=file_answer("text/event-stream", "Events"),
 )

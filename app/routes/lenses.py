@@ -1,62 +1,97 @@
-"""Lenses: what is known of each copy, its history, and what its owner does with it as a whole."""
+"""Lenses: what is known of each copy, what its owner does with it, its profile and its report as files."""
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
+import io
+import json
+import time
+from dataclasses import replace
 from statistics import median
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Query, status
-from pydantic import Field
+from fastapi import APIRouter, Query, Response
+from starlette.concurrency import run_in_threadpool
 
-from app.errors import ConflictError, InvalidParameterError, UnknownError
-from app.http import views
-from app.http.dependencies import CallDep, OneSession
+from app.errors import ConflictError, InvalidParameterError, NotReadyError, ServiceError, UnknownError
+from app.http import upload
+from app.http.dependencies import Call, CallDep, OneSession
 from app.other_lens import REMEDY, difference
-from app.routes.common import Cursor, Limit, OnlyName, described_lens, find_lens, next_link, paged
-from app.schemas import MAX_VERSION, CalibrationOut, Id, LateralOut, LensOut, Name, Page, Question
+from app.routes import jobs
+from app.routes.common import (
+    NOT_CHANGED,
+    Answers,
+    Cursor,
+    Limit,
+    OnlyName,
+    described_lens,
+    file_answer,
+    file_headers,
+    find_lens,
+    matches_tag,
+    paged,
+    problems,
+)
+from app.routes.photos import delete_photo, receiving, recorded
+from app.schemas import MAX_VERSION, V1, CalibrationOut, LateralOut, LensChange, LensIn, LensOut, Page
+from app.store.lenses import report_key
+from app.store.tables import PHOTO_FINAL, PROFILE_FILE, LensRow, PhotoRow
+from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.names import camera_name, full_name
+from lensmodel.model.profile import LensProfile, write_profile
+from lensmodel.report import LensReport, provenance
+from lensmodel.report.tables import to_csv
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 
+_PAGE: Final = 200  # photos that are read at once (chosen): bounds the memory that a large lens takes
+_PROFILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
+_READING: Final[Answers] = {202: {"model": LensOut, "description": "Still being read: `Location` is its job"}}
+# Codes with which the reading of a profile is refused as such; all others are conflicts
+_REFUSALS: Final = frozenset({"malformed_upload", "image_too_large", "unknown_lens", "other_lens"})
+# Photos whose names a report looks at, at most (chosen): it lists some, and says how many more there are
+_NAMED: Final = 1000
+Form = Literal["json", "csv", "pdf"]
+FORMS: Final[dict[Form, str]] = {
+    "json": "application/json",
+    "csv": "text/csv; charset=utf-8",
+    "pdf": "application/pdf",
+}
+_REPORT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for kind in FORMS.values()}
 
-@router.get("/lenses", operation_id="listLenses")
+
+@router.get("/lenses")
 def list_lenses(
     call: CallDep, limit: Limit = 50, cursor: Cursor = None, model: OnlyName = None, serial: OnlyName = None
 ) -> Page[LensOut]:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
+    described = dict(zip([row.id for row in rows], _described(call, rows), strict=True))
+    return paged(call, rows, limit, lambda row: described[row.id])
+
+
+def _described(call: Call, rows: list[LensRow]) -> list[LensOut]:
     coverage = call.store.lenses.coverage_of(rows)
-    return paged(call, rows, limit, lambda row: views.lens_out(row, *coverage[row.id]))
+    return [
+        LensOut.of(row, apertures=coverage[row.id][0], focal_lengths_mm=coverage[row.id][1]) for row in rows
+    ]
 
 
-@router.get("/lenses/{lens_id}", operation_id="getLens")
-def read_lens(lens_id: str, call: CallDep) -> LensOut:
+@router.get("/lenses/{lens_id}")
+def get_lens(lens_id: str, call: CallDep) -> LensOut:
     """Return one lens."""
-    lens = find_lens(call, lens_id)
-    return views.lens_out(lens, *call.store.lenses.coverage_of([lens])[lens.id])
+    return _described(call, [find_lens(call, lens_id)])[0]
 
 
-class LensChange(Question):
-    """What to change about a lens: one of these."""
-
-    label: Name | None = Field(None, description="what its owner calls it; null takes the name away")
-    merge_into: Id | None = Field(None, description="the lens that this one is a part of")
-    any_lens: bool = Field(default=False, description="merge lenses too that seem to be two")
-
-
-class LensIn(Question):
-    """A lens of which nothing is known yet but its name."""
-
-    label: Name = Field(description="what its owner calls it")
-
-
-@router.post("/lenses", operation_id="createLens", status_code=status.HTTP_201_CREATED)
+@router.post("/lenses", status_code=201)
 def create_lens(new: LensIn, call: CallDep) -> LensOut:
     """Create a lens, to add a profile to; photos create theirs by themselves."""
-    return read_lens(call.store.lenses.create(call.owner, new.label), call)
+    return get_lens(call.store.lenses.create(call.owner, new.label), call)
 
 
-@router.patch("/lenses/{lens_id}", operation_id="changeLens")
+@router.patch("/lenses/{lens_id}")
 def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     """Rename a lens, or merge it into another.
 
@@ -66,31 +101,28 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     lens = find_lens(call, lens_id)
     if len(change.model_fields_set - {"any_lens"}) != 1:
         raise InvalidParameterError("send label or merge_into")
-    lenses = call.store.lenses
-    if change.merge_into is not None:
-        target = find_lens(call, change.merge_into)
-        if target.id == lens.id:
-            raise InvalidParameterError("merge_into names the lens itself: name the other one")
-        why = (
-            None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
-        )
-        if why is not None:
-            raise ConflictError(f"the two seem to be different lenses: {why}; {REMEDY}", code="other_lens")
-        if not lenses.merge(lens_id, change.merge_into, call.owner):
-            raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
-        return read_lens(change.merge_into, call)
-    lenses.rename(lens_id, call.owner, change.label)
-    return read_lens(lens_id, call)
+    if change.merge_into is None:
+        call.store.lenses.rename(lens_id, call.owner, change.label)
+        return get_lens(lens_id, call)
+    target = find_lens(call, change.merge_into)
+    if target.id == lens.id:
+        raise InvalidParameterError("merge_into names the lens itself: name the other one")
+    why = None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
+    if why is not None:
+        raise ConflictError(f"the two seem to be different lenses: {why}; {REMEDY}", code="other_lens")
+    if not call.store.lenses.merge(lens_id, change.merge_into, call.owner):
+        raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
+    return get_lens(change.merge_into, call)
 
 
-@router.delete("/lenses/{lens_id}", operation_id="deleteLens", status_code=status.HTTP_204_NO_CONTENT)
+@router.delete("/lenses/{lens_id}", status_code=204)
 def delete_lens(lens_id: str, call: CallDep) -> None:
     """Delete a lens with its serial and all that was learned of it; its photos stay and can be corrected."""
     if not call.store.lenses.delete(lens_id, call.owner):
         raise UnknownError("lens", lens_id)
 
 
-@router.get("/lenses/{lens_id}/calibrations", operation_id="listCalibrations")
+@router.get("/lenses/{lens_id}/calibrations")
 def list_calibrations(
     lens_id: str,
     call: CallDep,
@@ -98,15 +130,12 @@ def list_calibrations(
     cursor: Annotated[int, Query(ge=0, le=MAX_VERSION, description="from `next` of the page before")] = 0,
 ) -> Page[CalibrationOut]:
     """Return the history of a lens, oldest first: one item for each version."""
-    lens = find_lens(call, lens_id)
-    rows = call.store.lenses.history(lens, after=cursor, limit=limit + 1)
-    following = str(rows[limit - 1].version) if len(rows) > limit else None
-    items = [views.calibration_out(row) for row in rows[:limit]]
-    return Page[CalibrationOut](items=items, next=next_link(call, following))
+    rows = call.store.lenses.history(find_lens(call, lens_id), after=cursor, limit=limit + 1)
+    return paged(call, rows, limit, CalibrationOut.of, lambda row: str(row.version))
 
 
-@router.get("/lenses/{lens_id}/lateral-colour", operation_id="getLateralColour")
-def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
+@router.get("/lenses/{lens_id}/lateral-colour")
+def get_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     """Return the lateral colour shift, which the kernels do not contain.
 
     The median over the counted photos, coefficient by coefficient: one photo without edges near
@@ -137,3 +166,136 @@ def _measured(entries: list[dict[str, Any]], colour: str) -> list[list[float]]:
 def _middle(polynomials: list[list[float]]) -> tuple[float, float, float, float]:
     a, b, c, v = (median(terms) for terms in zip(*polynomials, strict=True))
     return a, b, c, v
+
+
+# --- profiles -----------------------------------------------------------------------------------------
+
+
+@router.get(
+    "/lenses/{lens_id}/profile",
+    response_class=Response,
+    responses=file_answer("application/zip", "A .lensprofile"),
+)
+def get_lens_profile(lens_id: str, call: CallDep) -> Response:
+    """Return all that was learned of a lens as one file, which the command line reads too."""
+    lens = find_lens(call, lens_id)
+    model = call.models.get(lens_id).model
+    named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
+    identity = {name: value for name, value in named.items() if value}
+    photos = _filenames(call, lens_id, {sample.photo for sample in model.samples})
+    out = io.BytesIO()
+    write_profile(out, LensProfile(model, identity, photos))
+    name = lens.label or full_name(lens.maker, lens.model) or "lens"
+    headers = file_headers(f"{name}.lensprofile")
+    return Response(out.getvalue(), media_type="application/zip", headers=headers)
+
+
+def _filenames(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
+    """Return the file names of the photos that a lens learned from, by id."""
+    filenames: dict[str, str] = {}
+    before = None
+    while True:
+        rows = call.store.photos.page(call.owner, before=before, limit=_PAGE, lens_id=lens_id)
+        filenames |= {row.public_id: row.filename for row in rows if row.public_id in wanted}
+        if len(rows) < _PAGE:
+            return filenames
+        before = rows[-1].public_id
+
+
+@router.put(
+    "/lenses/{lens_id}/profile",
+    responses=problems(400, 408, 413, 507, also=_READING),
+    openapi_extra={"requestBody": {"required": True, "content": _PROFILE}},
+)
+async def add_lens_profile(
+    lens_id: str,
+    call: CallDep,
+    any_lens: Annotated[bool, Query(description="also where it seems to be of another lens")] = False,
+) -> LensOut:
+    """Let what a profile knows join a lens; each of its photos counts as one, without its file.
+
+    A worker reads it: the answer is the lens with it, or 202 where that takes longer than a long poll.
+    The same profile a second time changes nothing. It must have been learned with the model of the lens.
+    """
+    await run_in_threadpool(find_lens, call, lens_id)
+    async with receiving(call) as (public_id, key):
+        digest, size = await upload.receive_profile(call.request, call.storage, key)
+    file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
+    end = time.monotonic() + jobs.LONG_POLL_S
+    while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
+        await asyncio.sleep(jobs.LOOK_S)
+        file = await run_in_threadpool(call.store.photos.get, file.public_id, call.owner)
+    if file is not None and file.state in {"failed", "cancelled"}:
+        await run_in_threadpool(delete_photo, file.public_id, call)
+        code = "image_too_large" if file.error_code == "memory_limit" else file.error_code
+        detail = file.error_detail or "the reading of the profile was cancelled: send it again"
+        raise ServiceError(detail, code=code if code in _REFUSALS else "conflict")
+    if file is not None and file.state not in PHOTO_FINAL:
+        call.response.status_code = 202
+        call.response.headers["Location"] = f"{V1}/jobs/{file.public_id}"
+    return await run_in_threadpool(get_lens, lens_id, call)
+
+
+def _record(
+    call: Call, lens_id: str, any_lens: bool, public_id: str, key: str, digest: str, size: int
+) -> PhotoRow | None:
+    """Store the file of a profile like that of a photo; another lens may be sent the same."""
+    name = f"{lens_id}.lensprofile"
+    return recorded(
+        call,
+        public_id,
+        key,
+        sha256=hashlib.sha256(f"{name}|{digest}".encode()).hexdigest(),
+        filename=name,
+        kind=PROFILE_FILE,
+        byte_size=size,
+        calibrate=True,
+        given={"lens_id": lens_id} | ({"any_lens": True} if any_lens else {}),
+    ).photo
+
+
+# --- reports ------------------------------------------------------------------------------------------
+
+
+def stored_report(call: Call, lens: LensRow) -> LensReport:
+    """Return the report of the newest version of a lens, which a worker has made."""
+    if lens.sample_count == 0:
+        raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
+    try:
+        stored = call.storage.get(report_key(lens.public_id, lens.version, lens.rebuild_epoch))
+    except FileNotFoundError as error:
+        raise NotReadyError(
+            f"the report of version {lens.version} is not made yet: it comes when that version is measured",
+            headers={"Retry-After": "2"},
+        ) from error
+    return from_json(LensReport, json.loads(stored))
+
+
+@router.get(
+    "/lenses/{lens_id}/report.{form}",
+    response_class=Response,
+    responses={200: {"content": _REPORT, "description": "Report"}, **NOT_CHANGED},
+)
+def get_lens_report(lens_id: str, form: Form, call: CallDep) -> Response:
+    """Return the test of a lens: its first sentence is for photographers, the rest what testers expect."""
+    lens = find_lens(call, lens_id)
+    test = stored_report(call, lens)
+    tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{form}"'
+    headers = {"ETag": tag, **file_headers(f"{test.name}-report.{form}", inline=form == "pdf")}
+    if matches_tag(call, tag):
+        return Response(status_code=304, headers=headers)
+    photos = call.store.photos.page(call.owner, before=None, limit=_NAMED, lens_id=lens_id, state="counted")
+    cameras = [camera_name(photo.camera_maker, photo.camera_model) for photo in photos]
+    details = provenance(lens.serial, cameras, [photo.filename for photo in photos])
+    body = _written(replace(test, details=details), form)
+    return Response(body, media_type=FORMS[form], headers=headers)
+
+
+def _written(test: LensReport, form: Form) -> bytes:
+    if form == "json":
+        return json.dumps(to_json(test)).encode()
+    if form == "csv":
+        return to_csv(test).encode()
+    from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
+
+    return to_pdf(pages(test))

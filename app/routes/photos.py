@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import timedelta
 from typing import Any, Final
 
-from fastapi import APIRouter, status
+from fastapi import APIRouter
 from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
@@ -53,13 +53,11 @@ _FIELDS: Final = {
 }
 _FILE: Final = {"type": "string", "contentMediaType": "application/octet-stream"}
 _FORM: Final = {"type": "object", "required": ["file"], "properties": {"file": _FILE, **_FIELDS}}
-_UPLOAD_BODY: Final = {
-    "required": True,
-    "content": {
-        "multipart/form-data": {"schema": _FORM},
-        "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-    },
+_BODY: Final = {
+    "multipart/form-data": {"schema": _FORM},
+    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
 }
+_UPLOAD: Final = {"requestBody": {"required": True, "content": _BODY}}
 
 # Of uploads and the checks before them
 _RECEIVED: Final = problems(
@@ -67,14 +65,7 @@ _RECEIVED: Final = problems(
 )
 
 
-@router.post(
-    "/photos",
-    operation_id="createPhoto",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=PhotoOut,
-    responses=_RECEIVED,
-    openapi_extra={"requestBody": _UPLOAD_BODY},
-)
+@router.post("/photos", status_code=202, responses=_RECEIVED, openapi_extra=_UPLOAD)
 async def create_photo(call: CallDep) -> PhotoOut:
     """Store a photo, and calibrate its lens with it unless `calibrate=false`.
 
@@ -90,14 +81,7 @@ async def create_photo(call: CallDep) -> PhotoOut:
     return await _received(call)
 
 
-@router.post(
-    "/lenses/{lens_id}/measurements",
-    operation_id="createMeasurement",
-    status_code=status.HTTP_202_ACCEPTED,
-    response_model=PhotoOut,
-    responses=_RECEIVED,
-    openapi_extra={"requestBody": _UPLOAD_BODY},
-)
+@router.post("/lenses/{lens_id}/measurements", status_code=202, responses=_RECEIVED, openapi_extra=_UPLOAD)
 async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
     """Store a photo made to measure a lens that is known, and measure it; `kind` says what it shows."""
     await run_in_threadpool(find_lens, call, lens_id)
@@ -151,7 +135,7 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
     except ServiceError:
         call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
         raise
-    call.response.status_code = status.HTTP_202_ACCEPTED if received.fresh else status.HTTP_200_OK
+    call.response.status_code = 202 if received.fresh else 200
     call.response.headers["Location"] = f"{V1}/photos/{received.photo.public_id}"
     return views.photo_out(received.photo)
 
@@ -240,7 +224,7 @@ def find_photo(call: Call, photo_id: str) -> PhotoRow:
     return found("photo", photo_id, call.store.photos.get(photo_id, call.owner))
 
 
-@router.get("/photos", operation_id="listPhotos")
+@router.get("/photos")
 def list_photos(
     call: CallDep,
     limit: Limit = 50,
@@ -253,26 +237,26 @@ def list_photos(
     return paged(call, rows, limit, views.photo_out)
 
 
-@router.get("/photos/{photo_id}", operation_id="getPhoto")
-def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
+@router.get("/photos/{photo_id}")
+def get_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
     return views.photo_out(find_photo(call, photo_id))
 
 
-@router.get("/photos/{photo_id}/patches", operation_id="listPatches")
+@router.get("/photos/{photo_id}/patches")
 def list_patches(photo_id: str, call: CallDep) -> Page[PatchOut]:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
     photo = find_photo(call, photo_id)
-    return Page[PatchOut](items=[views.patch_out(row) for row in call.store.photos.windows(photo.public_id)])
+    return Page[PatchOut](items=[PatchOut.of(row) for row in call.store.photos.windows(photo.public_id)])
 
 
-@router.delete("/photos/{photo_id}", operation_id="deletePhoto", status_code=status.HTTP_204_NO_CONTENT)
+@router.delete("/photos/{photo_id}", status_code=204)
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
     call.storage.delete(found("photo", photo_id, call.store.photos.delete(photo_id, call.owner)))
 
 
-@router.patch("/photos/{photo_id}", operation_id="changePhoto")
+@router.patch("/photos/{photo_id}")
 def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     """Name the lens, correct the settings, take the photo out of its lens's model, or let it teach that.
 
@@ -318,7 +302,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     return None
 
 
-@router.patch("/photos", operation_id="changePhotos")
+@router.patch("/photos")
 def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 

@@ -1,20 +1,27 @@
-"""The PSF of a lens at a place of the field, and maps of the whole field."""
+"""The PSF of a lens at a place of the field, in four formats, and pictures of the whole field."""
 
 from __future__ import annotations
 
 import hashlib
+import io
+import math
+from collections import Counter
 from typing import Annotated, Final, Literal
 
-from fastapi import APIRouter, Query, Response, status
+import numpy as np
+import tifffile
+from fastapi import APIRouter, Query, Response
+from PIL import Image
 
 from app.errors import InvalidParameterError, ServiceError
-from app.http import psf_formats
 from app.http.dependencies import Call, CallDep, OneSession
 from app.http.model_cache import Fitted
 from app.routes.common import NOT_CHANGED, Answers, file_answer, found, matches_tag, problems
-from app.schemas import FieldQuery, PsfOut, PsfQuery
+from app.schemas import FieldQuery, KernelOut, PsfOut, PsfQuery, Setting, Support, Units
 from lensmodel.core.errors import OutsideSupportError
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import FieldPosition, Kernel, LensSettings
+from lensmodel.report.lens_report import UNKNOWN
 
 router = APIRouter(tags=["psf"], route_class=OneSession)
 
@@ -29,20 +36,35 @@ MAX_GRID: Final = 25  # columns and rows of a map at most (chosen): more kernels
 # Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s
 # (measured once, no command repeats it)
 MAX_FIELD_PIXELS: Final = 2_000_000
-_CONTENT = {
-    name: {"schema": {"type": "string", "format": "binary"}}
-    for name in MEDIA_TYPES.values()
-    if "json" not in name
+SIDE: Final = 1000  # height of the frame of a map in pixels (chosen): only its aspect ratio matters
+DIGITS: Final = 10  # decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001
+GAP_PX: Final = 2  # pixels between the kernels of a map (chosen for looks)
+HATCH_PX: Final = 7  # pixels between the strokes over a cell that is not known (chosen for looks)
+SCALE: Final = "X-PSF-Scale"
+ANSWERED_BY: Final = "X-PSF-Answered-By"
+# What headers say of pictures and arrays, which have no other room for it
+_HEADERS: Final = {
+    SCALE: {
+        "description": "of one PSF as PNG: the value of white, and the gamma",
+        "schema": {"type": "string"},
+    },
+    ANSWERED_BY: {
+        "description": "what made the answer, as `support.answered_by` of the JSON; of a map all that took "
+        "part, those of most places first, with semicolons between",
+        "schema": {"type": "string"},
+    },
 }
-_HEADERS = {
-    name: {"description": text, "schema": {"type": "string"}} for name, text in psf_formats.HEADERS.items()
-}
+_FILES: Final = {name: {"schema": {"type": "string", "format": "binary"}} for name in MEDIA_TYPES.values()}
 _ANSWERS: Final[Answers] = {
-    200: {"model": PsfOut, "content": _CONTENT, "description": "The PSF", "headers": _HEADERS},
+    200: {
+        "model": PsfOut,
+        "content": {name: file for name, file in _FILES.items() if "json" not in name},
+        "description": "The PSF",
+        "headers": _HEADERS,
+    },
     **NOT_CHANGED,
 }
-
-
+_MAP: Final = {200: file_answer("image/png", "Map")[200] | {"headers": _HEADERS}, **NOT_CHANGED}
 _PROPERTIES: Final = PsfQuery.model_json_schema()["properties"]
 # Read by the route itself: for so many parameters FastAPI takes a third of the time of a request
 _QUERY: Final = {
@@ -55,41 +77,42 @@ _QUERY: Final = {
 
 @router.get(
     "/lenses/{lens_id}/psf",
-    operation_id="getPsf",
     response_class=Response,
     responses=problems(406, also=_ANSWERS),
     openapi_extra=_QUERY,
 )
-def read_psf(lens_id: str, call: CallDep) -> Response:
+def get_psf(lens_id: str, call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
-    return read_psf_as(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
+    return get_psf_as(lens_id, accepted(call.request.headers.get("accept", "*/*")), call)
 
 
 @router.get(
-    "/lenses/{lens_id}/psf.{suffix}",
-    operation_id="getPsfAs",
-    response_class=Response,
-    responses=_ANSWERS,
-    openapi_extra=_QUERY,
+    "/lenses/{lens_id}/psf.{suffix}", response_class=Response, responses=_ANSWERS, openapi_extra=_QUERY
 )
-def read_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
+def get_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
     """Return the PSF in the format of the suffix."""
     at = PsfQuery.model_validate(dict(call.request.query_params))
     fitted, headers = _fitted(lens_id, at, call, suffix)
     if fitted is None:
-        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    answer = fitted.model.query(
-        FieldPosition(at.r, at.phi), _setting(at), at.size, pitch_um=at.pixel_pitch_um
-    )
+        return Response(status_code=304, headers=headers)
+    place = FieldPosition(at.r, at.phi)
+    answer = fitted.model.query(place, _setting(at), at.size, pitch_um=at.pixel_pitch_um)
     if at.strict and answer.extrapolated:
         raise OutsideSupportError(
             f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
             "cover: upload photos that do, or ask without strict"
         )
-    pitch = at.pixel_pitch_um or fitted.model.pitch_um
-    body, more = psf_formats.psf(
-        suffix, answer.kernel, psf_formats.describe(lens_id, fitted, at, answer, pitch)
+    once_round = at.phi if -math.pi < at.phi <= math.pi else place.phi
+    told = PsfOut(
+        lens_id=lens_id,
+        version=fitted.state.version,
+        query=at.model_copy(update={"phi": once_round}),
+        psf=KernelOut(shape=(at.size, at.size), dtype="float32", data=[]),
+        support=Support.of(answer),
+        bandwidth=fitted.model.bandwidth,
+        units=Units(pixel_pitch_um=at.pixel_pitch_um or fitted.model.pitch_um),
     )
+    body, more = encoded(suffix, answer.kernel, told)
     return Response(body, media_type=MEDIA_TYPES[suffix], headers={**headers, **more})
 
 
@@ -109,35 +132,48 @@ def accepted(header: str) -> Format:
     )
 
 
-def _fitted(
-    lens_id: str, at: PsfQuery | FieldQuery, call: Call, form: str = ""
-) -> tuple[Fitted | None, dict[str, str]]:
+def encoded(form: Format, kernel: Kernel, told: PsfOut) -> tuple[bytes, dict[str, str]]:
+    """Encode a kernel and what is told of it; return the bytes and the headers that describe them."""
+    if form == "json":
+        values = np.round(kernel, DIGITS).tolist()
+        full = told.model_copy(update={"psf": told.psf.model_copy(update={"data": values})})
+        return full.model_dump_json().encode(), {}
+    at, headers, buffer = told.query, {ANSWERED_BY: told.support.answered_by}, io.BytesIO()
+    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
+    name = f"psf-v{told.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{form}"
+    headers["Content-Disposition"] = f'inline; filename="{name}"'
+    if form == "npy":
+        np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
+    elif form == "tiff":
+        text = told.model_dump_json(exclude={"psf"})  # tifffile would interpret a "shape" in it
+        pixels = kernel.astype(np.float32)
+        tifffile.imwrite(buffer, pixels, photometric="minisblack", description=text, metadata=None)
+    else:
+        peak = float(kernel.max())
+        headers[SCALE] = f"max={peak:.9g}; gamma=1"
+        Image.fromarray(np.round(kernel / peak * 65535).astype(np.uint16)).save(buffer, "PNG")
+    return buffer.getvalue(), headers
+
+
+def _fitted(lens_id: str, at: Setting, call: Call, form: str = "") -> tuple[Fitted | None, dict[str, str]]:
     """Return the model that answers, None where the browser has its answer already; and the headers."""
     state = found("lens", lens_id, call.store.lenses.state_of(lens_id, call.owner))
     fitted = call.models.get(lens_id, at.version, state=state)
-    tag = etag(fitted, f"{at.model_dump_json()}{form}")
+    # a strong tag: the same query to the same samples and weights has the same answer
+    question = f"{at.model_dump_json()}{form}{fitted.model.weights}"
+    digest = hashlib.sha256(question.encode()).hexdigest()[:12]
+    tag = f'"{fitted.lens_id}-v{fitted.state.version}-e{fitted.state.rebuild_epoch}-{digest}"'
     fresh = "no-cache" if at.version is None else "max-age=3600"
     headers = {"ETag": tag, "Cache-Control": f"private, {fresh}", "Vary": "Accept"}
     return (None if matches_tag(call, tag) else fitted), headers
 
 
-def _setting(at: PsfQuery | FieldQuery) -> LensSettings:
+def _setting(at: Setting) -> LensSettings:
     return LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 
 
-def etag(fitted: Fitted, question: str) -> str:
-    """Return a strong tag: the same query to the same samples and weights has the same answer."""
-    digest = hashlib.sha256(f"{question}{fitted.model.weights}".encode()).hexdigest()[:12]
-    return f'"{fitted.lens_id}-v{fitted.state.version}-e{fitted.state.rebuild_epoch}-{digest}"'
-
-
-@router.get(
-    "/lenses/{lens_id}/field.png",
-    operation_id="getFieldMap",
-    response_class=Response,
-    responses={200: file_answer("image/png", "Map")[200] | {"headers": _HEADERS}, **NOT_CHANGED},
-)
-def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
+@router.get("/lenses/{lens_id}/field.png", response_class=Response, responses=_MAP)
+def get_field_map(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
     """Return a picture of the kernels all over the field, each scaled to its own peak."""
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
@@ -150,13 +186,22 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
         )
     fitted, headers = _fitted(lens_id, at, call)
     if fitted is None:
-        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    setting, query = _setting(at), fitted.model.query
-    picture, more = psf_formats.field_map(
-        lambda place: query(place, setting, at.size),
-        columns=columns,
-        rows=rows,
-        size=at.size,
-        aspect=at.aspect,
-    )
-    return Response(picture, media_type="image/png", headers={**headers, **more})
+        return Response(status_code=304, headers=headers)
+    frame, pitch, setting = Frame(SIDE, round(SIDE * at.aspect)), at.size + GAP_PX, _setting(at)
+    sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
+    # where too little is known the cell is hatched, as in reports
+    hatched = np.where(np.add.outer(np.arange(at.size), np.arange(at.size)) % HATCH_PX < 2, 110, 40)
+    made: Counter[str] = Counter()
+    for row, column in np.ndindex(rows, columns):
+        down, across = (row + 0.5) / rows, (column + 0.5) / columns
+        place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
+        answer = fitted.model.query(place, setting, at.size)
+        made[answer.answered_by] += 1
+        top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
+        known = answer.predicted_error < UNKNOWN and not answer.extrapolated
+        bright = np.round(np.sqrt(answer.kernel / answer.kernel.max()) * 255)
+        sheet[top : top + at.size, left : left + at.size] = bright if known else hatched
+    buffer = io.BytesIO()
+    Image.fromarray(sheet).save(buffer, "PNG")
+    headers[ANSWERED_BY] = "; ".join(name for name, _ in made.most_common())
+    return Response(buffer.getvalue(), media_type="image/png", headers=headers)

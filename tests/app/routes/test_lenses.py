@@ -68,15 +68,8 @@ def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> 
     assert kernel.sum() == pytest.approx(1, abs=1e-6)
     assert np.abs(centroid(kernel)).max() < 0.05
     assert answer["version"] == 1
-    assert answer["query"] | {"focal_length_mm": None, "focus_distance_m": None} == {
-        "r": 0.9,
-        "phi": 0.59,
-        "aperture": 1.4,
-        "channel": "g",
-        "size": 55,
-        "focal_length_mm": None,
-        "focus_distance_m": None,
-    }
+    asked = {"r": 0.9, "phi": 0.59, "aperture": 1.4, "channel": "g", "size": 55}
+    assert asked.items() <= answer["query"].items()
     assert answer["support"]["photos"] == 1
     assert answer["support"]["effective_samples"] > 0
     assert set(answer["bandwidth"]) >= {"r", "phi"}

@@ -1,42 +1,85 @@
-"""Pages; everything they do goes through the same API as others use."""
+"""Pages, and their parts that change while one looks; all they do goes through the same API as others use."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from pathlib import Path
-from typing import Any, Final, TypeAlias
-from urllib.parse import quote
+import hashlib
+import math
+import zipfile
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
+from jinja2 import Environment, PackageLoader, select_autoescape
+from pydantic import BeforeValidator, Field, TypeAdapter
 from starlette.exceptions import HTTPException
 
-from app.http.dependencies import CallDep, OneSession, call_of
-from app.pages import batch, lens_pages, parts, photo_pages, pictures, words
-from app.pages.rendering import page
-from lensmodel.core.errors import LensModelError
+from app.blobs import tiles
+from app.blobs.zipped import zipped
+from app.errors import InvalidParameterError, NotReadyError
+from app.http import errors, views
+from app.http.dependencies import Call, CallDep, OneSession, call_of
+from app.jobs.task_files import SHOWN, SIDES
+from app.pages import pictures, shown, words
+from app.routes.common import file_headers, find_lens, matches_tag
+from app.routes.corrections import begin, find_correction, list_corrections
+from app.routes.lenses import get_lens, list_calibrations, stored_report
+from app.routes.photos import find_photo, get_photo
+from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, blank_is_none
+from app.store.database import new_id
+from app.store.tables import CorrectionRow, LensRow, PhotoRow
+from lensmodel.core.errors import LensModelError, NoSamplesError
+from lensmodel.core.types import ZONES
+from lensmodel.photo.values import ENDINGS
+from lensmodel.report import LensReport, Side, Unit, compare
+from lensmodel.report.tables import place_table
+from lensmodel.workflow.correcting import SEEN_DB
 
-HERE: Final = Path(__file__).parent
+if TYPE_CHECKING:
+    from lensmodel.report.plots import Chart
+
+STATIC: Final = Path(__file__).parent / "static"
+HEADERS: Final = {
+    **errors.HEADERS,
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'self'"
+    ),
+}
+# Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have
+MAX_LENGTH: Final = 4000
+# Pixels of a preview at most (chosen): a second or two of work while the user waits
+MAX_PREVIEW_PIXELS: Final = 1_500_000
+SHOWN_VERSIONS: Final = 200  # Versions of the history on the page (chosen): the newest of them
+# Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm
+DEFAULT_ASPECT: Final = 1.5
+# Names of the nine places of a picture, with their rows and columns
+NAMES: Final = (
+    *("upper left", "upper middle", "upper right"),
+    *("left", "centre", "right"),
+    *("lower left", "lower middle", "lower right"),
+)
+PLACES: Final = tuple((name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True))
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 # What whoever is not signed in yet may see
 strangers = APIRouter(include_in_schema=False, route_class=OneSession)
+
+templates = Environment(loader=PackageLoader("app.pages"), autoescape=select_autoescape(), trim_blocks=True)
+templates.filters.update(words.FILTERS)
+templates.globals["picker_endings"] = ",".join((*sorted(ENDINGS), "image/*"))
 
 
 def include(site: APIRouter) -> None:
     """Add the pages and their files to the routes of the service."""
     site.include_router(strangers)
-    for part in (
-        router,
-        parts.router,
-        photo_pages.router,
-        batch.router,
-        lens_pages.router,
-        pictures.router,
-    ):
+    for part in (router, pictures.router):
         site.include_router(part, dependencies=[Depends(call_of)])
-    site.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+    site.mount("/static", StaticFiles(directory=STATIC), name="static")
 
 
 def install(app: FastAPI) -> None:
@@ -65,8 +108,7 @@ def _for_people(answer: Handler) -> Handler:
             return RedirectResponse(f"/sign-in?next={path}", 303)
         if plain.status_code < 400 or not _wants_page(request):
             return plain
-        title, detail = words.refusal(plain.status_code, str(error))
-        return page("missing.html", plain.status_code, title=title, detail=detail)
+        return page("missing.html", plain.status_code, status_code=plain.status_code, detail=str(error))
 
     return handle
 
@@ -78,10 +120,15 @@ def _wants_page(request: Request) -> bool:
     )
 
 
-@router.get("/")
-def home(call: CallDep) -> HTMLResponse:
-    """Show where photos are given and what became of them."""
-    return page("home.html", **parts.home(call)[1])
+def page(name: str, status: int = 200, **values: Any) -> HTMLResponse:  # noqa: ANN401 - what the template shows
+    """Return a page made from a template."""
+    return HTMLResponse(templates.get_template(name).render(**values), status, headers=HEADERS)
+
+
+@strangers.get("/sign-in")
+async def sign_in() -> HTMLResponse:
+    """Ask for a key."""
+    return page("sign_in.html")
 
 
 @router.get("/docs")
@@ -96,7 +143,345 @@ def interface(request: Request) -> HTMLResponse:
     return page("docs.html", operations=operations)
 
 
-@strangers.get("/sign-in")
-async def sign_in() -> HTMLResponse:
-    """Ask for a key."""
-    return page("sign_in.html")
+@router.get("/")
+def home(call: CallDep) -> HTMLResponse:
+    """Show where photos are given and what became of them."""
+    return page("home.html", **_home(call)[1])
+
+
+# --- photos and corrections ---------------------------------------------------------------------------
+
+
+def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
+    """Return a photo with its size in upright orientation."""
+    if (row.orientation or 1) <= 4:
+        return photo
+    return photo.model_copy(update={"width": row.height, "height": row.width})
+
+
+@router.get("/photos/{photo_id}")
+def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
+    """Show a photo: how to correct it, and what it taught."""
+    row = find_photo(call, photo_id)
+    photo = views.photo_out(row)
+    patches = call.store.photos.windows(photo_id)
+    left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
+    lens = None if photo.lens_id is None else get_lens(photo.lens_id, call)
+    candidates = [] if lens else shown.lenses_with_photos(call)
+    candidates = [each for each in candidates if each.samples or photo.state == "needs_lens"]
+    corrections = list_corrections(call, limit=50, photo_id=photo_id).items
+    corrections = [correction for correction in corrections if correction.roi is None]
+    done = next((correction for correction in corrections if correction.state == "succeeded"), None)
+    shown_by = f"/ui/photos/{photo_id}/tiles" if done is None else f"/ui/corrections/{done.id}/tiles"
+    better = done is not None and not (done.report or {}).get("nothing_to_correct")
+    return page(
+        "photo.html",
+        photo=_upright(photo, row),
+        can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
+        gently=row.kind == "jpeg",
+        used=sum(patch.state == "done" for patch in patches),
+        reasons=left_out.most_common(),
+        candidates=candidates,
+        known=lens.samples > 0 if lens else bool(candidates),
+        group=shown.grouped([row])[0],
+        lens=lens,
+        corrections=corrections,
+        done=done,
+        nothing=words.nothing_words(row.kind),
+        least=SEEN_DB,
+        before=f"{shown_by}/before",
+        after=f"{shown_by}/after" if better else None,
+        places=PLACES,
+    )
+
+
+class PreviewIn(Region):
+    """A part of the upright photo, in its pixels; and the lens, where the photo does not say it.
+
+    With `layers` it is also wanted as the sliders of texture and grain need it.
+    """
+
+    method: str = Field(default="standard", max_length=40)
+    lens_id: Id | None = None
+    layers: bool = False
+
+
+@router.post("/ui/photos/{photo_id}/preview", status_code=202)
+def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
+    """Begin to correct a part of a photo."""
+    row = find_photo(call, photo_id)
+    if not row.width or not row.height:
+        raise InvalidParameterError("the photo is not read yet: wait a moment")
+    if part.width * part.height > MAX_PREVIEW_PIXELS:
+        raise InvalidParameterError("the part is too large for a preview: zoom in")
+    turned = pictures.in_sensor(part, row.height, row.width, row.orientation or 1)
+    asked = part.model_dump(include={"method", "lens_id", "layers"})
+    output = {"format": "png8", "color_space": "srgb"}
+    request = CorrectionIn.model_validate(
+        {"photo_id": photo_id, "roi": turned.model_dump(), "output": output, **asked}
+    )
+    # not shared: who asks deletes it, while the next page may be asking for the same already
+    return {"id": begin(request, call, look=new_id()).id}
+
+
+@router.get("/corrections/{correction_id}")
+def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
+    """Show a corrected photo beside the original."""
+    plan = find_correction(call, correction_id)
+    correction, row = views.correction_out(plan), plan.photo
+    report = correction.report or {}
+    audit = report.get("audit") or {}
+    changed = not report.get("nothing_to_correct")
+    looked = correction.roi is None and changed
+    can_look = looked and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
+    zones, most_gain = words.gain_bars(report.get("zones") or {})
+    return page(
+        "correction.html",
+        correction=correction,
+        job=views.job_out(plan),
+        photo=_upright(views.photo_out(row), row),
+        can_look=can_look,
+        zones=zones if changed else [],
+        most_gain=most_gain,
+        nothing=words.nothing_words(row.kind),
+        learned_from=plan.lens.photo_count,
+        audit=words.held_back(audit) if changed else None,
+        held=words.held_map(audit, row.height or 0, row.width or 0, row.orientation or 1) if can_look else [],
+        places=PLACES,
+    )
+
+
+# --- several corrections ------------------------------------------------------------------------------
+
+Ids = Annotated[str, Query(max_length=MAX_LENGTH)]
+
+
+@router.get("/batch")
+def batch_page(ids: Ids, call: CallDep) -> HTMLResponse:
+    """Show how far the corrections are whose ids have commas between them."""
+    return page("batch.html", **_batch(call, ids)[1])
+
+
+@router.get("/batch.zip")
+def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
+    """Return the files of the corrections that are done."""
+    plans = [plan for plan in _plans(call, ids) if plan.state == "succeeded"]
+    if not plans:
+        raise NotReadyError("none of these corrections is done yet: wait for them")
+    files = zipped(_files(call, plans))
+    return StreamingResponse(files, media_type="application/zip", headers=file_headers("corrected.zip"))
+
+
+def _plans(call: Call, ids: str) -> list[CorrectionRow]:
+    return [find_correction(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
+
+
+def _files(call: Call, plans: Sequence[CorrectionRow]) -> Iterator[tuple[zipfile.ZipInfo, Iterable[bytes]]]:
+    """Yield the files of corrections, which are compressed already."""
+    used = set[str]()
+    for row in plans:
+        assert row.result_key is not None
+        assert row.result_bytes is not None
+        name = unused_name(row.result_name or row.public_id, used)
+        entry = zipfile.ZipInfo(name, row.photo.received_at.timetuple()[:6])
+        yield entry, call.storage.stream(row.result_key, 0, row.result_bytes)
+
+
+def unused_name(name: str, used: set[str]) -> str:
+    """Return a name that no file of the archive has yet."""
+    path, count, free = PurePath(name), 1, name
+    while free.casefold() in used:
+        count += 1
+        free = f"{path.stem} ({count}){path.suffix}"
+    used.add(free.casefold())
+    return free
+
+
+# --- lenses -------------------------------------------------------------------------------------------
+
+_APERTURE: Final = TypeAdapter[float](Aperture)
+ChosenAperture = Annotated[Aperture | None, BeforeValidator(blank_is_none), Query()]  # of a form
+
+
+@router.get("/lenses/{lens_id}")
+def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> HTMLResponse:
+    """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
+    lens, row = get_lens(lens_id, call), find_lens(call, lens_id)
+    photos, more = shown.photos(call, lens_id)
+    aspect, test = _aspect(call, row), _test(call, row)
+    apertures = lens.apertures if test is None else [number for number in test.apertures if number]
+    chosen = aperture or (apertures[0] if apertures else None)
+    question = {"size": 25, "aspect": aspect} | ({} if chosen is None else {"aperture": chosen})
+
+    def map_of(cells: int) -> str:
+        rows = max(2, round(math.sqrt(cells / aspect)))
+        grid = f"{max(2, round(rows * aspect))}x{rows}"
+        return f"/v1/lenses/{lens_id}/field.png?{urlencode({'grid': grid, **question})}"
+
+    return page(
+        "lens.html",
+        lens=lens,
+        counting=shown.counting(call, lens_id),
+        photos=photos,
+        more=more,
+        others=[other for other in shown.lenses_with_photos(call) if other.id != lens_id],
+        aspect=aspect,
+        apertures=apertures,
+        aperture=chosen,
+        map_of=map_of,
+        test=test,
+        found=None if test is None else test.at(chosen),
+    )
+
+
+@router.get("/lenses/{lens_id}/tests")
+def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
+    """Show what testers and researchers ask of a lens: charts, its blur at any point, its versions."""
+    lens, row = get_lens(lens_id, call), find_lens(call, lens_id)
+    before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
+    history = list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
+    photos, _ = shown.photos(call, lens_id)
+    test = _test(call, row)
+    gone = max((event.version for event in history if event.kind != "photo_added"), default=0)
+    return page(
+        "lens_tests.html",
+        lens=lens,
+        counting=shown.counting(call, lens_id),
+        history=history,
+        curve=_error_history(history),
+        versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
+        names={photo.id: photo.filename for photo in photos},
+        aspect=_aspect(call, row),
+        comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
+        test=test,
+        **({} if test is None else _charts(test, None, "c/px")),
+    )
+
+
+@router.get("/ui/lenses/{lens_id}/charts")
+def lens_charts(
+    lens_id: str,
+    call: CallDep,
+    aperture: ChosenAperture = None,
+    unit: Unit = "c/px",
+    against: Annotated[str, Query(max_length=60)] = "",
+) -> HTMLResponse:
+    """Show the charts of one aperture, or two lenses or apertures in one."""
+    from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
+
+    test = stored_report(call, find_lens(call, lens_id))
+    at = _APERTURE.validate_python(against.removeprefix("at ")) if against.startswith("at ") else None
+    if not against or (at is not None and at == aperture):
+        return page("_charts.html", **_charts(test, aperture, unit))
+    if at is not None:  # two apertures of one lens
+        sides = [Side(words.f_stop(number or 0.0), test.at(number)) for number in (aperture, at)]
+    else:
+        other = stored_report(call, find_lens(call, against))
+        same = aperture if aperture in other.apertures else None
+        sides = [Side(test.name, test.at(aperture)), Side(other.name, other.at(same))]
+    comparison = compare(*sides)
+    return page("_charts.html", comparison=comparison, charts=comparison_charts(comparison))
+
+
+def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, Any]:
+    from lensmodel.report.plots import charts  # noqa: PLC0415 - as above
+
+    return {"charts": charts(test, aperture, unit), "table": place_table(test)}
+
+
+def _error_history(history: Sequence[CalibrationOut]) -> Chart | None:
+    """Draw the errors of versions that were measured; None where one point would be no curve."""
+    from lensmodel.report.plots import error_history  # noqa: PLC0415 - as above
+
+    measured = [(event.version, event.error) for event in history if isinstance(event.error, Mapping)]
+    if len(measured) < 2:
+        return None
+    errors = {zone: [error.get(zone) for _, error in measured] for zone in ZONES}
+    return error_history([version for version, _ in measured], errors)
+
+
+def _test(call: Call, lens: LensRow) -> LensReport | None:
+    try:
+        return stored_report(call, lens)
+    except (NotReadyError, NoSamplesError):
+        return None
+
+
+def _aspect(call: Call, lens: LensRow) -> float:
+    """Return the commonest width over height of the photos of a lens, in sensor orientation."""
+    shape = call.store.lenses.shape_of(lens)
+    return DEFAULT_ASPECT if shape is None else round(shape[1] / shape[0], 4)
+
+
+# --- parts that change: htmx asks for them while there is work to wait for ----------------------------
+
+Open = Literal["home", "photo", "correction", "batch", "lens"]
+# Template, what it shows, and whether the page has to be made anew
+Part = tuple[str, Mapping[str, Any], bool]
+
+
+@router.get("/ui/parts")
+def parts(call: CallDep, page: Open = "home", id: Ids = "") -> Response:  # noqa: A002
+    """Return the part of a page as it is now, 304 where the browser has it; at the end ask for all."""
+    template, values, settled = _PARTS[page](call, id)
+    body = templates.get_template(template).render(**values).encode()
+    tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    if settled:
+        headers["HX-Refresh"] = "true"
+    elif matches_tag(call, tag):
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type="text/html", headers=headers)
+
+
+def _home(call: Call, _: str = "") -> Part:
+    """Return what is shown of all photos and lenses."""
+    photos, more = shown.photos(call)
+    lenses = shown.lenses_with_photos(call)
+    values = {
+        "photos": photos,
+        "more": more,
+        "lenses": lenses,
+        "groups": shown.waiting(call),
+        "next": shown.next_step(call, photos, lenses),
+    }
+    return "_home.html", values, False
+
+
+def _photo(call: Call, photo_id: str) -> Part:
+    photo = get_photo(photo_id, call)
+    return "_photo_state.html", {"photo": photo}, not words.active(photo)
+
+
+def _correction(call: Call, correction_id: str) -> Part:
+    plan = find_correction(call, correction_id)
+    values = {"correction": views.correction_out(plan), "job": views.job_out(plan)}
+    return "_correction_state.html", values, plan.state not in {"queued", "running"}
+
+
+def _batch(call: Call, ids: str) -> Part:
+    plans = _plans(call, ids)
+    left = [plan for plan in plans if plan.state in {"queued", "running"}]
+    part_done = sum(plan.progress_done / max(plan.progress_total, 1) for plan in left)
+    values = {
+        "rows": [(plan.photo.filename, views.correction_out(plan)) for plan in plans],
+        "left": len(left),
+        "share": len(plans) - len(left) + part_done,
+        "done": sum(plan.state == "succeeded" for plan in plans),
+        "ids": ids,
+    }
+    return "_batch.html", values, False
+
+
+def _lens(call: Call, lens_id: str) -> Part:
+    counting = shown.counting(call, lens_id)
+    return "_lens_state.html", {"lens": get_lens(lens_id, call), "counting": counting}, not counting
+
+
+_PARTS: Final[Mapping[Open, Callable[[Call, str], Part]]] = {
+    "home": _home,
+    "photo": _photo,
+    "correction": _correction,
+    "batch": _batch,
+    "lens": _lens,
+}

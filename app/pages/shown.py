@@ -94,13 +94,17 @@ class WaitingGroup:
     photos: list[PhotoRow]  # newest first
 
     @property
+    def told(self) -> tuple[str, str]:
+        """Body and focal length in words, empty where they tell nothing."""
+        return f"body {self.body}" if self.body else "", f"{self.focal_mm:g} mm" if self.focal_mm else ""
+
+    @property
     def name(self) -> str:
         """What to call the lens: its own name, else camera and focal length; empty where nothing is known."""
         if self.lens_model:
             maker = self.camera.split()[0] if self.camera else None
             return full_name(maker, self.lens_model) if self.lens_model[0].isdigit() else self.lens_model
-        body, focal = self.body and f"body {self.body}", self.focal_mm and f"{self.focal_mm:g} mm"
-        return ", ".join(part for part in (self.camera, body, focal) if part)
+        return ", ".join(filter(None, (self.camera, *self.told)))
 
     @property
     def key(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final, get_args
 
 from app.pages.pictures import turned_box
@@ -22,10 +22,16 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "developing": "Developing the photo",
     "selecting": "Looking for parts that show the blur",
     "needs_lens": "Waiting for your answer",
-    "counted": "Used",
     "stored": "Ready to correct",
     "excluded": "Left out, as you chose",
     "cancelled": "Left out",
+}
+CORRECTION_STATES: Final[Mapping[str, str]] = {
+    "queued": "In the queue",
+    "running": "Removing the blur",
+    "succeeded": "Done",
+    "failed": "This did not work",
+    "cancelled": "Cancelled",
 }
 FAILURES: Final[Mapping[str, str]] = {
     "no_usable_patches": "nothing in it shows the blur of the lens. A photo with fine detail in focus would",
@@ -66,9 +72,7 @@ REASONS: Final[Mapping[str, str]] = {
 
 def lens_name(lens: LensOut) -> str:
     """Name a lens as its owner would."""
-    if lens.label:
-        return lens.label
-    return full_name(lens.maker, lens.model) or "Unnamed lens"
+    return lens.label or full_name(lens.maker, lens.model) or "Unnamed lens"
 
 
 def f_stop(number: float) -> str:
@@ -89,17 +93,14 @@ def photo_state(photo: PhotoOut) -> str:
         return "At which aperture was it?"
     if photo.state == "estimating":
         return f"Measuring blur: {photo.patches.done} of {photo.patches.total} places"
-    words = PHOTO_STATES.get(photo.state, photo.state)
     if photo.state == "counted":
-        return f"{words}: blur measured at {counted(photo.patches.done, 'place')}"
-    return words
+        return f"Used: blur measured at {counted(photo.patches.done, 'place')}"
+    return PHOTO_STATES[photo.state]
 
 
 def failure(error: Problem | None) -> str:
     """Say why something failed: in our own words where we have some, else in those of the error."""
-    if error is None:
-        return "the reason was not recorded"
-    return FAILURES.get(error.code, error.detail)
+    return FAILURES.get(error.code, error.detail) if error else "the reason was not recorded"
 
 
 def state_class(photo: PhotoOut) -> str:
@@ -121,57 +122,28 @@ def duration(seconds: float) -> str:
 
 def correction_state(correction: CorrectionOut) -> str:
     """Say where a correction stands."""
-    return {
-        "queued": "In the queue",
-        "running": "Removing the blur",
-        "succeeded": f"Done, with version {correction.lens_version} of the lens",
-        "failed": "This did not work",
-        "cancelled": "Cancelled",
-    }.get(correction.state, correction.state)
+    version = (
+        f", with version {correction.lens_version} of the lens" if correction.state == "succeeded" else ""
+    )
+    return CORRECTION_STATES[correction.state] + version
+
+
+def file_name(correction: CorrectionOut) -> str:
+    """Name the kind of file that a correction makes."""
+    return FILES[correction.output["format"]]
 
 
 def correction_name(correction: CorrectionOut) -> str:
     """Name a correction by how it differs from others."""
-    words = [correction.method.capitalize()]
-    if correction.strength < 1:
-        words.append(f"strength {percent(correction.strength)}")
-    words.append(FILES.get(correction.output["format"], correction.output["format"]))
-    return ", ".join(words)
-
-
-def file_words(correction: CorrectionOut) -> str:
-    """Say what kind of file a correction made, and what it is good for."""
-    name = FILES.get(correction.output["format"], correction.output["format"])
-    if correction.output["format"] == "dng":
-        return f"{name}: open it in your RAW developer, and leave its own sharpening off."
-    return f"{name}. Its metadata say what was done, and with which lens."
-
-
-def waiting_words(groups: Sequence[WaitingGroup]) -> str:
-    """Say how many photos wait for their lens."""
-    count = sum(len(group.photos) for group in groups)
-    if count == 1:
-        return "One photo does not say which copy of a lens it was taken with."
-    return f"{count} photos do not say which copy of a lens they were taken with."
+    strength = f"strength {percent(correction.strength)}" if correction.strength < 1 else ""
+    return ", ".join(filter(None, (correction.method.capitalize(), strength, file_name(correction))))
 
 
 def group_name(group: WaitingGroup) -> str:
     """Say what the photos of a group have in common."""
-    body, focal = group.body and f"body {group.body}", group.focal_mm and f"{group.focal_mm:g} mm"
-    parts = (group.camera or "Unknown camera", body, group.lens_model, focal)
-    return f"{', '.join(part for part in parts if part)}: {counted(len(group.photos), 'photo')}"
-
-
-def refusal(status: int, detail: str) -> tuple[str, str]:
-    """Write title and text of a page that stands for one that cannot be shown."""
-    if status == 404:
-        return (
-            "Not here",
-            "There is nothing at this address. It may have been deleted, or the address is incomplete.",
-        )
-    if status < 500:
-        return "That did not work", detail
-    return "That is our fault", "Something went wrong here; the log says what. Try again in a moment."
+    body, focal = group.told
+    parts = filter(None, (group.camera or "Unknown camera", body, group.lens_model, focal))
+    return f"{', '.join(parts)}: {counted(len(group.photos), 'photo')}"
 
 
 def reason_words(reason: str | None) -> str:

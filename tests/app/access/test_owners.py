@@ -16,7 +16,7 @@ from sqlalchemy import select, update
 from starlette.testclient import TestClient
 
 from app.main import create_app
-from app.pages import lens_pages, photo_pages, pictures
+from app.pages import pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
 from app.store import Store, accounts
@@ -102,7 +102,7 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
     """Yield every path with every method: those of the OpenAPI document, and the pages that are not in it."""
     app: Any = client.app
     described = set(app.openapi()["paths"])
-    rooms = (page_routes, photo_pages, lens_pages, pictures)  # a stream of events has no end
+    rooms = (page_routes, pictures)  # a stream of events has no end
     hidden = [route for room in rooms for route in room.router.routes] + page_routes.strangers.routes
     pages = {
         route.path.replace("{kind}/{subject}", subject)

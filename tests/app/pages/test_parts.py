@@ -24,8 +24,8 @@ from app.jobs.inspection import body_key
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
-from app.pages.batch import unused_name
 from app.pages.pictures import in_sensor, turned_box
+from app.pages.routes import unused_name
 from app.pages.shown import grouped
 from app.pages.words import held_map, plain
 from app.runtime.settings import Settings

@@ -61,8 +61,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.add_middleware(Guard, allowed=chosen.hosts, max_upload_mb=chosen.max_upload_mb)
     app.add_middleware(RequestLog)  # the last is the outermost
-    errors.install(app)
-    pages.install(app)
+    for kind in errors.KINDS:
+        app.add_exception_handler(kind, pages.refusal)
     app.router.routes.extend(_routes())
     return app
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from obstore.exceptions import BaseError as StorageError
@@ -37,6 +37,13 @@ HEADERS: Final[Mapping[str, str]] = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+_OF_STORES: Final = (DBAPIError, PoolTimeoutError, StorageError, OSError)
+# Exceptions that are answered: all, but frameworks ask for those by name that are no bug
+KINDS: Final[tuple[type[Exception], ...]] = (
+    *(library.LensModelError, RequestValidationError, ValidationError, HTTPException, ClientDisconnect),
+    *_OF_STORES,
+    Exception,
+)
 # Status of the codes that errors have and jobs end with; all others are faults of ours
 STATUS_OF_CODE: Final[Mapping[str, int]] = {
     code: status
@@ -129,58 +136,42 @@ def _writable(value: object) -> str:
     return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def install(app: FastAPI) -> None:
-    """Add the handlers to an application."""
-
-    @app.exception_handler(library.LensModelError)
-    async def _known(request: Request, error: library.LensModelError) -> Response:
-        status = status_of(error)
-        if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, ServiceError):
-            log.error("unexpected %s", error.code, exc_info=error)
-        headers = error.headers if isinstance(error, ServiceError) else {}
-        return respond(request, status, error.code, str(error), headers=headers)
-
-    @app.exception_handler(RequestValidationError)
-    @app.exception_handler(ValidationError)
-    async def _invalid(request: Request, error: RequestValidationError | ValidationError) -> Response:
-        errors = field_errors(error.errors())
-        got = ((e, "" if e.value is None else f", got {e.value!r}") for e in errors)
-        detail = "; ".join(f"{e.field}: {e.message}{value}" for e, value in got)
-        return respond(request, 422, "invalid_parameter", detail, errors=errors)
-
-    @app.exception_handler(HTTPException)
-    async def _framework(request: Request, error: HTTPException) -> Response:
-        code = getattr(error, "code", "") or CODE_OF_STATUS.get(error.status_code, "invalid_request")
-        detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json for what there is"
-        return respond(request, error.status_code, code, detail, headers=error.headers)
-
-    @app.exception_handler(ClientDisconnect)
-    async def _gone(request: Request, error: ClientDisconnect) -> Response:
-        del error
-        return respond(request, 400, "malformed_upload", "the body ended early: send it again")
-
-    @app.exception_handler(DBAPIError)
-    @app.exception_handler(PoolTimeoutError)
-    @app.exception_handler(StorageError)
-    @app.exception_handler(OSError)
-    async def _away(request: Request, error: Exception) -> Response:
-        if is_no_room(error):
+def answer(request: Request, error: Exception) -> Response:
+    """Build the response for an exception of `KINDS`."""
+    errors: Sequence[FieldError] = ()
+    headers: Mapping[str, str] | None = None
+    match error:
+        case library.LensModelError():
+            status, code, detail = status_of(error), error.code, str(error)
+            if isinstance(error, ServiceError):
+                headers = error.headers
+            elif status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+                log.error("unexpected %s", code, exc_info=error)
+        case RequestValidationError() | ValidationError():
+            status, code, errors = 422, "invalid_parameter", field_errors(error.errors())
+            got = ((e, "" if e.value is None else f", got {e.value!r}") for e in errors)
+            detail = "; ".join(f"{e.field}: {e.message}{value}" for e, value in got)
+        case HTTPException():
+            status, headers = error.status_code, error.headers
+            code = getattr(error, "code", "") or CODE_OF_STATUS.get(status, "invalid_request")
+            detail = (
+                f"{request.method} {request.url.path}: {error.detail}; see /openapi.json for what there is"
+            )
+        case ClientDisconnect():
+            status, code, detail = 400, "malformed_upload", "the body ended early: send it again"
+        case _ if isinstance(error, _OF_STORES) and is_no_room(error):
             log.error("no room: %s", error)
+            status, code = 507, "quota_exceeded"
             detail = "there is no room for it: delete photos, or make room on the disk"
-            return respond(request, 507, "quota_exceeded", detail)
-        if not is_outage(error) and not isinstance(error, OperationalError):
-            return await _bug(request, error)
-        database = isinstance(error, SQLAlchemyError)
-        what = "database" if database else "storage"
-        log.error("%s: %s", what, getattr(error, "orig", error))
-        detail = f"the {what} does not answer; try again in a few seconds"
-        return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
-
-    @app.exception_handler(Exception)
-    async def _bug(request: Request, error: Exception) -> Response:
-        request_id = getattr(request.state, "request_id", None)  # no longer in the logging context here
-        log.error(
-            "unexpected error, request_id=%s", request_id, exc_info=error, extra={"request_id": request_id}
-        )
-        detail = "an error of ours; the log has it under this request_id"
-        return respond(request, 500, "internal_error", detail)
+        case _ if isinstance(error, _OF_STORES) and (is_outage(error) or isinstance(error, OperationalError)):
+            what = "database" if isinstance(error, SQLAlchemyError) else "storage"
+            log.error("%s: %s", what, getattr(error, "orig", error))
+            status, code, headers = 503, "busy", {"Retry-After": "5"}
+            detail = f"the {what} does not answer; try again in a few seconds"
+        case _:
+            request_id = getattr(request.state, "request_id", None)  # no longer in the logging context here
+            more = {"request_id": request_id}
+            log.error("unexpected error, request_id=%s", request_id, exc_info=error, extra=more)
+            status, code = 500, "internal_error"
+            detail = "an error of ours; the log has it under this request_id"
+    return respond(request, status, code, detail, errors=errors, headers=headers)

@@ -1,5 +1,5 @@
 """The web page: what a person sees of the service, rendered by the service itself."""
 
-from app.pages.routes import include, install
+from app.pages.routes import include, refusal
 
-__all__ = ["include", "install"]
+__all__ = ["include", "refusal"]

@@ -6,18 +6,16 @@ import hashlib
 import math
 import zipfile
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
 from pydantic import BeforeValidator, Field, TypeAdapter
-from starlette.exceptions import HTTPException
 
 from app.blobs import tiles
 from app.blobs.zipped import zipped
@@ -33,7 +31,7 @@ from app.routes.photos import find_photo, get_photo
 from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, blank_is_none
 from app.store.database import new_id
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
-from lensmodel.core.errors import LensModelError, NoSamplesError
+from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import ZONES
 from lensmodel.photo.values import ENDINGS
 from lensmodel.report import LensReport, Side, Unit, compare
@@ -82,35 +80,21 @@ def include(site: APIRouter) -> None:
     site.mount("/static", StaticFiles(directory=STATIC), name="static")
 
 
-def install(app: FastAPI) -> None:
-    """Let browsers have errors as pages."""
-    for kind in (LensModelError, HTTPException, RequestValidationError, Exception):
-        app.add_exception_handler(kind, _for_people(app.exception_handlers[kind]))
-
-
-Handler: TypeAlias = Callable[[Request, Any], Any]
-
-
-def _for_people(answer: Handler) -> Handler:
-    """Turn the response of an exception handler into a page where a browser requested one.
+async def refusal(request: Request, error: Exception) -> Response:
+    """Answer an exception: by a page where a browser asked for one, else as programs read it.
 
     An open page whose session has ended goes to the sign-in; one whose subject is gone, to the first page.
     """
-
-    async def handle(request: Request, error: Exception) -> Response:
-        waited = answer(request, error)
-        plain: Response = await waited if isinstance(waited, Awaitable) else waited
-        if plain.status_code in {401, 404} and "hx-request" in request.headers:
-            shown = quote(request.headers.get("hx-current-url", "/"), safe="/")
-            plain.headers["HX-Redirect"] = f"/sign-in?next={shown}" if plain.status_code == 401 else "/"
-        if plain.status_code == 401 and _wants_page(request):
-            path = quote(request.url.path, safe="/")
-            return RedirectResponse(f"/sign-in?next={path}", 303)
-        if plain.status_code < 400 or not _wants_page(request):
-            return plain
-        return page("missing.html", plain.status_code, status_code=plain.status_code, detail=str(error))
-
-    return handle
+    plain = errors.answer(request, error)
+    status = plain.status_code
+    if status in {401, 404} and "hx-request" in request.headers:
+        seen = quote(request.headers.get("hx-current-url", "/"), safe="/")
+        plain.headers["HX-Redirect"] = f"/sign-in?next={seen}" if status == 401 else "/"
+    if not _wants_page(request):
+        return plain
+    if status == 401:
+        return RedirectResponse(f"/sign-in?next={quote(request.url.path, safe='/')}", 303)
+    return page("missing.html", status, status_code=status, detail=str(error))
 
 
 def _wants_page(request: Request) -> bool:

@@ -7,6 +7,7 @@ Sources: ITU-T T.81, annex B (JPEG); "Portable Network Graphics, third edition",
 from __future__ import annotations
 
 import contextlib
+import io
 import mmap
 import re
 import statistics
@@ -16,6 +17,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
+
+from PIL.JpegImagePlugin import JpegImageFile
 
 from lensmodel.core.errors import (
     DecompressionBombError,
@@ -28,20 +31,11 @@ from lensmodel.photo.colour import profile_by_chunks
 from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
-HEAD_BYTES: Final = 64
-"""Bytes that `sniff` wants to see."""
-
-MAX_BLOCK_BYTES: Final = 8 << 20
-"""Largest ICC profile or XMP packet that is read."""
-
-BOMB_MEGAPIXELS: Final = 4.0
-"""Below this a false claim costs nothing worth refusing."""
-
-BOMB_PIXELS_PER_BYTE: Final = 200.0
-"""An evenly grey JPEG reaches about 100 pixels a byte, and a photograph is never evenly grey."""
-
-MAX_SEGMENTS: Final = 4096
-"""Segments of a JPEG or chunks of a PNG that are looked at; image data do not count."""
+HEAD_BYTES: Final = 64  # that `sniff` wants to see
+MAX_BLOCK_BYTES: Final = 8 << 20  # largest ICC profile, XMP packet or head of a JPEG that is read
+BOMB_MEGAPIXELS: Final = 4.0  # below this a false claim costs nothing worth refusing
+BOMB_PIXELS_PER_BYTE: Final = 200.0  # an evenly grey JPEG reaches 100, and a photograph is never evenly grey
+MAX_CHUNKS: Final = 4096  # of a PNG that are looked at; image data do not count
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,91 +136,44 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
 
 # --- JPEG --------------------------------------------------------------------------------------
 
-# Second bytes of markers: ITU-T T.81, table B.1.
-_START_OF_SCAN, _END_OF_IMAGE, _TABLES = 0xDA, 0xD9, 0xDB
-_BARE: Final = {0x00, 0x01, *range(0xD0, 0xD9), 0xFF}
-"""What is no segment: a stuffed byte, markers without a length, and fill bytes."""
-
-_FRAMES: Final = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers of frame headers; the others of the range are tables and an extension."""
+_END_OF_IMAGE: Final = b"\xff\xd9"  # marker: ITU-T T.81, table B.1
 
 
 def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
-    """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation."""
-    header, icc = Header("jpeg"), dict[int, bytes]()
-    for at, code, body in _segments(buffer):
-        if code in _FRAMES:
-            if len(body) < 6:
-                raise TruncatedImageError("the JPEG's frame header is cut off")
-            bits, height, width, channels = struct.unpack(">BHHB", body[:6])
-            header = replace(
-                header,
-                width=width,
-                height=height,
-                channels=channels,
-                bits=bits,
-                chroma_step=_chroma_step(body[6:]),
-            )
-        elif code == _START_OF_SCAN:  # in which a zero follows a byte of 0xFF
-            header = replace(header, whole=buffer.find(bytes((0xFF, _END_OF_IMAGE)), at) >= 0)
-        elif code == _TABLES:
-            header = replace(header, coarseness=_coarseness(body) or header.coarseness)
-        elif body.startswith(b"Exif\0") and (reader := TiffReader.open(body, 6)):
-            header = replace(header, tiff=(*header.tiff, reader))
-        elif body.startswith(b"http://ns.adobe.com/xap/1.0/\0"):
-            header = replace(header, xmp=body[29:])
-        elif body.startswith(b"ICC_PROFILE\0") and len(body) > 14:
-            icc[body[12]] = body[14:]
-    if not header.width or not header.height:
-        raise NotAnImageError("the JPEG has no frame header, or one without a size")
-    return replace(header, icc=b"".join(icc[part] for part in sorted(icc)) or None)
-
-
-def _chroma_step(components: bytes) -> tuple[int, int]:
-    """Rows and columns of pixels that share a value of chroma: luma's sampling factors over chroma's."""
-    if len(components) < 9:
-        return 1, 1  # grey
-    luma, chroma = components[1], components[4]
-    # a factor that is no power of two occurs in no camera's file, and is none of chroma's business here
-    rows, cols = (
-        own // other if other else 1 for own, other in ((luma & 15, chroma & 15), (luma >> 4, chroma >> 4))
+    """Let Pillow read the segments up to the first scan: frame size, EXIF, XMP, profile, quantisation."""
+    segments = io.BytesIO(buffer[:MAX_BLOCK_BYTES])
+    try:
+        image = JpegImageFile(segments)
+    except (OSError, SyntaxError, ValueError) as error:
+        if segments.read(1):
+            raise NotAnImageError("the JPEG has no frame header, or one without a size") from error
+        raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off") from error
+    exif = TiffReader.open(image.info.get("exif", b""), 6)
+    # a zero follows a byte of 0xFF in a scan, where the end is looked for: a thumbnail before it has its own
+    whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0
+    return Header(
+        "jpeg",
+        *image.size,
+        channels=image.layers,
+        bits=image.bits,
+        tiff=() if exif is None else (exif,),
+        xmp=image.info.get("xmp"),
+        icc=image.info.get("icc_profile"),
+        # cameras give the first table to luma
+        coarseness=float(statistics.median(image.quantization.get(0, [0]))),
+        chroma_step=_chroma_step(image.layer),
+        whole=whole,
     )
-    return (rows, cols) if {rows, cols} <= {1, 2, 4} else (1, 1)
 
 
-def _coarseness(tables: bytes) -> float:
-    """Median step of the first quantisation table, which cameras give to luma; 0 where it is not there."""
-    at = 0
-    while at < len(tables):
-        size = 128 if tables[at] >> 4 else 64
-        steps = tables[at + 1 : at + 1 + size]
-        if tables[at] & 15 == 0 and len(steps) == size:
-            return statistics.median(struct.unpack(">64H" if size == 128 else "64B", steps))
-        at += 1 + size
-    return 0.0
-
-
-def _segments(buffer: Buffer) -> Iterator[tuple[int, int, bytes]]:
-    """Yield place, marker code and content of each segment up to the first scan, which has none.
-
-    Stray bytes between them are passed over, as viewers do (libjpeg, `next_marker`).
-    """
-    at = 2
-    for _ in range(MAX_SEGMENTS):
-        at = buffer.find(b"\xff", at)
-        marker = b"" if at < 0 else bytes(buffer[at : at + 4])
-        if len(marker) < 4:
-            raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off")
-        code, length = marker[1], struct.unpack(">H", marker[2:])[0]
-        if code == _START_OF_SCAN:
-            yield at, code, b""
-        if code in {_START_OF_SCAN, _END_OF_IMAGE}:
-            return
-        if code in _BARE:
-            at += 1
-            continue
-        yield at, code, bytes(buffer[at + 4 : at + 2 + length])
-        at += 2 + length
+def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
+    """Rows and columns of pixels that share a value of chroma: luma's sampling factors over chroma's."""
+    if len(layers) < 3:
+        return 1, 1  # grey
+    (_, cols, rows, _), (_, chroma_cols, chroma_rows, _) = layers[:2]
+    step = rows // max(chroma_rows, 1), cols // max(chroma_cols, 1)
+    # a factor that is no power of two occurs in no camera's file, and is none of chroma's business here
+    return step if {*step} <= {1, 2, 4} else (1, 1)
 
 
 # --- PNG ---------------------------------------------------------------------------------------
@@ -267,7 +214,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
 def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
     """Yield name, start and length of the chunks; of a run of image data only the first."""
     at, count, before = 33, 0, b"IHDR"
-    while count < MAX_SEGMENTS:
+    while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
         if len(head) < 8:
             raise TruncatedImageError("the PNG ends before its end chunk; the upload was cut off")
@@ -295,22 +242,23 @@ def _inflated(packed: bytes) -> bytes | None:
 # --- TIFF, DNG and RAW files that look like TIFF -----------------------------------------------
 
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
-
-_RAW_PHOTOMETRIC: Final = {32803, 34892}
-"""PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3)."""
-
-_READ_COLOURS: Final = {0, 1, 2, 3, 6}
-"""PhotometricInterpretation: two kinds of grey, RGB, palette and YCbCr (TIFF 6.0, sections 3 to 6 and 21)."""
-
-_OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
-_JPEG: Final = {6, 7}  # Compression, of TIFF 6.0 and of its technical note 2
+_LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
+_JPEG: Final = {6, 7}  # compression, of TIFF 6.0 and of its technical note 2
+_RAW_COMPRESSION: Final = {
+    32767,
+    32769,
+    32770,
+    34713,
+    65000,
+    65535,
+}  # Sony, Epson, Samsung, Nikon, Kodak, Pentax
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
-_LOSSY: Final = 34892
-"""Compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"."""
-
-_RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}
-"""Of Sony, Epson, Samsung, Nikon, Kodak and Pentax."""
+# PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3); two kinds of
+# grey, RGB, palette and YCbCr (TIFF 6.0, sections 3 to 6 and 21); what else is said by name.
+_RAW_PHOTOMETRIC: Final = {32803, 34892}
+_READ_COLOURS: Final = {0, 1, 2, 3, 6}
+_OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
 
 
 def _read_tiff(buffer: Buffer, limits: Limits) -> Header:
@@ -418,7 +366,7 @@ def _coarseness_of_tiles(buffer: Buffer, tags: Tags) -> float:
     """Step of the quantised coefficients of a DNG by its first JPEG tile, which speaks for all; 0 unknown."""
     at, size = (tags.integer(tile) or tags.integer(strip) for tile, strip in ((324, 273), (325, 279)))
     with contextlib.suppress(NotAnImageError, TruncatedImageError):
-        return _read_jpeg(bytes(buffer[at : at + min(size, MAX_BLOCK_BYTES)]), Limits()).coarseness
+        return _read_jpeg(buffer[at : at + min(size, MAX_BLOCK_BYTES)], Limits()).coarseness
     return 0.0
 
 
@@ -437,19 +385,18 @@ def _strips(tags: Tags) -> tuple[tuple[int, ...], tuple[int, ...]]:
 def _check_strips(tags: Tags, file_bytes: int) -> None:
     """Refuse a picture whose strips or tiles do not lie in the file."""
     width, height = tags.integer(256), tags.integer(257)
-    if width <= 0 or height <= 0:
-        raise NotAnImageError(f"the TIFF gives no size ({width} x {height}); it holds no picture")
-    if not ({273, 324} & tags.keys() and {279, 325} & tags.keys()):
-        raise NotAnImageError("the TIFF has no strips or tiles; it holds no picture")
-    starts, lengths = _strips(tags)
-    if not starts or len(starts) != len(lengths):
-        raise TruncatedImageError(
-            f"the TIFF's table of strips, {len(starts)} with {len(lengths)} lengths, is damaged or cut off"
+    if width <= 0 or height <= 0 or not ({273, 324} & tags.keys() and {279, 325} & tags.keys()):
+        raise NotAnImageError(
+            f"the TIFF gives no size ({width} x {height}), or no strips: it holds no picture"
         )
-    if not _ends_inside(tags, file_bytes):
-        raise TruncatedImageError("the TIFF's pixel data go beyond the file's end; the upload was cut off")
+    starts, lengths = _strips(tags)
+    if not starts or len(starts) != len(lengths) or not _ends_inside(tags, file_bytes):
+        raise TruncatedImageError(
+            f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
+            "damaged; the upload was cut off"
+        )
     stored = width * height * tags.integer(277, 1) * max(tags.integer(258, 1), 1) / 8
-    if tags.integer(259, 1) == 1 and tags.integer(262, 1) != 6 and sum(lengths) < 0.999 * stored:
+    if tags.integer(259, 1) == 1 and sum(lengths) < 0.999 * stored:
         raise TruncatedImageError(
             f"the TIFF holds {sum(lengths)} bytes of pixels where {stored:.0f} are needed"
         )
@@ -488,7 +435,7 @@ def _read_raw(buffer: Buffer, limits: Limits) -> Header:
     if head.startswith(b"FUJIFILMCCD"):
         at = int.from_bytes(head[84:88], "big")  # of a JPEG
         with contextlib.suppress(NotAnImageError, TruncatedImageError):
-            preview = _read_jpeg(bytes(buffer[at : at + MAX_BLOCK_BYTES]), limits)
+            preview = _read_jpeg(buffer[at : at + MAX_BLOCK_BYTES], limits)
             return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
         return Header("raw")
     reader = TiffReader.open(buffer)

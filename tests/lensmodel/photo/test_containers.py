@@ -13,7 +13,7 @@ import tifffile
 from PIL import Image
 
 from lensmodel import photo
-from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
+from lensmodel.core.errors import TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
 
@@ -220,10 +220,10 @@ def test_stray_bytes_hide_nothing_that_follows_them(stray: bytes, segment: int, 
     assert (info.width, info.height, info.metadata.camera_model) == (64, 48, "T-1")
 
 
-def test_a_jpeg_of_stray_bytes_alone_is_no_photo(tmp_path: Path) -> None:
+def test_a_jpeg_of_stray_bytes_alone_ends_inside_its_header(tmp_path: Path) -> None:
     (tmp_path / "x.jpg").write_bytes(b"\xff\xd8\xff\xe0\0\x04ab" + b"\0\xff\0" * 20_000)
 
-    with pytest.raises(NotAnImageError):
+    with pytest.raises(TruncatedImageError):
         photo.inspect(tmp_path / "x.jpg")
 
 

@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import FieldPosition, Zone
 
-CENTER_ZONE_R = 0.3
-"""Zone "center" lies below this r."""
-
-CORNER_ZONE_R = 0.75
-"""Zone "corner" lies above this r."""
+CENTER_ZONE_R = 0.3  # zone "center" lies below this r
+CORNER_ZONE_R = 0.75  # zone "corner" lies above this r
 
 
 def zone_of(r: float) -> Zone:

@@ -137,41 +137,55 @@ class KernelDistance:
 def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDistance:
     """Compare kernel `a` with the reference `b`, both normalised, sub-pixel aligned.
 
-    The correlation c(d) = sum_f A(f) conj(B(f)) exp(-2 pi i f d) is maximised over the shift d,
-    first on whole pixels, then by Newton steps; by Parseval it yields both figures at once::
+    By Parseval the peak c of their correlation yields both figures at once::
 
         ncc = c / (|a| |b|)        rel_l2² = (|a|² + |b|² - 2 c) / |b|²
     """
     a, b = a / a.sum(), b / b.sum()
     n = int(scipy.fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
     fa, fb = _centred_fft(a, n), _centred_fft(b, n)
-    cross = fa * np.conj(fb)
-    surface = scipy.fft.ifft2(cross).real
-    peak = np.unravel_index(int(surface.argmax()), surface.shape)
-    # The peak of corr(a, b) at lag p says that a sits p pixels beyond b.
-    d = -np.array([(p + n // 2) % n - n // 2 for p in peak], dtype=np.float64)
-    freq = 2 * np.pi * scipy.fft.fftfreq(n)
-    w = np.stack(np.broadcast_arrays(freq[:, None], freq[None, :]))
-    for _ in range(8):
-        phased = cross * np.exp(-1j * (w[0] * d[0] + w[1] * d[1]))
-        gradient = np.array([(w[i] * phased.imag).sum() for i in range(2)])
-        hessian = -np.array([[(w[i] * w[j] * phased.real).sum() for j in range(2)] for i in range(2)])
-        if np.linalg.eigvalsh(hessian)[-1] >= 0:
-            break
-        step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)
-        d = d + step
-        if np.abs(step).max() < 1e-6:
-            break
-    c = float((cross * np.exp(-1j * (w[0] * d[0] + w[1] * d[1]))).real.sum()) / n**2
+    peak, c = correlation_peak(fa * np.conj(fb))
     aa, bb = float((a * a).sum()), float((b * b).sum())
-    inside = np.hypot(w[0], w[1]) <= np.pi
+    freq = scipy.fft.fftfreq(n)
+    inside = np.hypot(freq[:, None], freq[None, :]) <= 0.5
     difference = (np.abs(fa) - np.abs(fb))[inside]
     return KernelDistance(
         ncc=c / math.sqrt(aa * bb),
         rel_l2=math.sqrt(max(aa + bb - 2 * c, 0.0) / bb),
         mtf_rmse=float(np.sqrt(np.mean(difference**2))),
-        shift=(float(d[0]), float(d[1])),
+        shift=(-peak[0], -peak[1]),
     )
+
+
+def correlation_peak(cross: npt.NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
+    """Shift `(row, col)` at which the correlation of two square arrays is largest, and its value there.
+
+    `cross` is their cross spectrum A conj(B), of the full FFT; the shift says how far a lies beyond b. It is
+    found on whole pixels, then between them by Newton steps on the Fourier series::
+
+        c(d) = 1/n² sum_f cross(f) exp(2 pi i f d)
+    """
+    n = len(cross)
+    surface = scipy.fft.ifft2(cross).real
+    whole = (np.array(np.unravel_index(surface.argmax(), surface.shape)) + n // 2) % n - n // 2
+    d, freq = whole.astype(np.float64), 2.0 * np.pi * scipy.fft.fftfreq(n)
+
+    def phased() -> npt.NDArray[np.complex128]:
+        return cross * np.outer(np.exp(1j * freq * d[0]), np.exp(1j * freq * d[1]))
+
+    for _ in range(8):
+        waves = phased()
+        gradient = -np.array([freq @ waves.sum(axis=1).imag, freq @ waves.sum(axis=0).imag])
+        mixed = freq @ waves.real @ freq
+        own = [freq**2 @ waves.sum(axis=axis).real for axis in (1, 0)]
+        hessian = -np.array([[own[0], mixed], [mixed, own[1]]])
+        if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
+            break
+        step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)
+        d += step
+        if np.abs(step).max() < 1e-6:
+            break
+    return (float(d[0]), float(d[1])), float(phased().real.sum()) / n**2
 
 
 def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.complex128]:
@@ -181,9 +195,7 @@ def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.comp
     return scipy.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
-TOKEN_LENGTH: Final = 192
-"""Numbers of the token of a patch."""
-
+TOKEN_LENGTH: Final = 192  # numbers of the token of a patch
 KINDS: Final[tuple[PatchKind, ...]] = get_args(PatchKind)
 
 

@@ -227,8 +227,7 @@ def _undated(icc: bytes) -> bytes:
     return icc[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + icc[36:]
 
 
-USUAL_GAMMA: Final = 1.0 / 0.45455
-"""By which files approximate the curve of sRGB."""
+USUAL_GAMMA: Final = 1.0 / 0.45455  # by which files approximate the curve of sRGB
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ _CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
 _BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
 """Most of the height by which pixels beside it stand out (chosen): beside points of light a tenth."""
 
-_MANY: Final = 3.0
-"""Where so many times more are sure than likely, the likely ones are defects too (chosen)."""
+_MANY: Final = 3.0  # where so many times more are sure than likely, the likely ones are defects too (chosen)
 
 _MOST: Final = 2e-3
 """Share of the pixels above which what was found is a picture after all, such as a sky of stars (chosen)."""

@@ -35,8 +35,7 @@ from lensmodel.photo.raster import ORIENTATION, develop_raster, read_pixels, tur
 from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw
 from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PhotoMetadata, remarks_log
 
-MIN_SIDE = 16
-"""Smaller pictures are icons, not photos."""
+MIN_SIDE = 16  # smaller pictures are icons, not photos
 
 _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
 """Compressions of DNG that LibRaw, as built for Python, opens but cannot decode."""

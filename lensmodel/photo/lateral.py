@@ -12,11 +12,11 @@ from scipy import fft, ndimage, optimize
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import correlation_peak
 from lensmodel.core.types import Channel, Plane, Planes
 
 Polynomial = tuple[float, float, float, float]
 IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)  # r -> r
-
 _CELLS = 10  # cells per side that each give a few points: corners must not be outvoted by the middle
 _POINTS = 5  # of each block of the frame: its strongest corners (chosen)
 _WINDOW = 48  # pixels that are correlated: more than any lateral colour, of one shift (chosen)
@@ -24,10 +24,9 @@ _SEARCH = 8  # largest shift looked for, pixels
 _MIN_CORRELATION = 0.8  # of two channels: below, colours differ and edges do not match (chosen)
 _MIN_POINTS = 30
 """That a polynomial of four terms is fitted to: some seven for each, of which a few may be wrong (chosen)."""
-_LARGEST = 0.1
-"""Of each term, relative to the radius (chosen): lenses stay below a hundredth."""
-
+_LARGEST = 0.1  # of each term, relative to the radius (chosen): lenses stay below a hundredth
 _BAND = 1024  # rows at once: memory (chosen)
+_TAPER = np.outer(np.hanning(_WINDOW + 1)[:-1], np.hanning(_WINDOW + 1)[:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,50 +170,21 @@ def _shift(moved: NDArray[np.float64], reference: NDArray[np.float64]) -> tuple[
 
     The second window follows the whole-pixel shift, so that the taper cuts both the same.
     """
-    taper = np.hanning(_WINDOW + 1)[:-1]
-    weight = taper[:, None] * taper[None, :]
     inner = slice(_SEARCH, _SEARCH + _WINDOW)
-    still = reference[inner, inner] * weight
-    whole = (0, 0)
+    still, whole, part = reference[inner, inner] * _TAPER, (0, 0), (0.0, 0.0)
     for _ in range(2):
-        rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
-        cross = fft.rfft2(moved[rows, cols] * weight) * np.conj(fft.rfft2(still))
-        surface = fft.irfft2(cross, (_WINDOW, _WINDOW))
-        peak = np.unravel_index(int(surface.argmax()), surface.shape)
-        step = [(int(p) + _WINDOW // 2) % _WINDOW - _WINDOW // 2 for p in peak]
-        whole = (whole[0] + step[0], whole[1] + step[1])
-        if max(abs(whole[0]), abs(whole[1])) >= _SEARCH:
+        whole = (whole[0] + round(part[0]), whole[1] + round(part[1]))
+        if max(map(abs, whole)) >= _SEARCH:
             return None
-        if step == [0, 0]:
+        rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
+        cut = moved[rows, cols] * _TAPER
+        part, _ = correlation_peak(fft.fft2(cut) * np.conj(fft.fft2(still)))
+        if max(map(abs, part)) <= 0.5:
             break
-    rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
-    cut = moved[rows, cols] * weight
     likeness = float((cut * still).sum() / math.sqrt((cut**2).sum() * (still**2).sum() + 1e-30))
-    if likeness < _MIN_CORRELATION:
+    if likeness < _MIN_CORRELATION or max(map(abs, part)) > 1.0:
         return None
-    fraction = _refined(fft.fft2(cut) * np.conj(fft.fft2(still)))
-    if max(abs(fraction[0]), abs(fraction[1])) > 1.0:
-        return None
-    return whole[0] + fraction[0], whole[1] + fraction[1]
-
-
-def _refined(cross: NDArray[np.complex128]) -> tuple[float, float]:
-    """Peak of the correlation between pixels, by Newton steps on its Fourier series."""
-    freq = 2.0 * np.pi * fft.fftfreq(_WINDOW)
-    d = np.zeros(2)
-    for _ in range(6):
-        phased = cross * np.outer(np.exp(1j * freq * d[0]), np.exp(1j * freq * d[1]))
-        by_row, by_col = phased.sum(axis=1), phased.sum(axis=0)
-        gradient = -np.array([freq @ by_row.imag, freq @ by_col.imag])
-        mixed = freq @ phased.real @ freq
-        hessian = -np.array([[freq**2 @ by_row.real, mixed], [mixed, freq**2 @ by_col.real]])
-        if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
-            break
-        step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)
-        d += step
-        if np.abs(step).max() < 1e-5:
-            break
-    return float(d[0]), float(d[1])
+    return whole[0] + part[0], whole[1] + part[1]
 
 
 def _fit(r: NDArray[np.float64], shift: NDArray[np.float64], half_diagonal: float) -> Polynomial:

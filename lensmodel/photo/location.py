@@ -26,8 +26,7 @@ from lensmodel.photo.containers import MAX_BLOCK_BYTES, opened_header, png_chunk
 from lensmodel.photo.tiff import EXIF, GPS, MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, TiffReader, Value
 from lensmodel.photo.values import Limits
 
-MAX_BLOCKS: Final = 64
-"""Exif blocks of one file: the photo's, and one for each preview."""
+MAX_BLOCKS: Final = 64  # Exif blocks of one file: the photo's, and one for each preview
 
 MAX_TAGS: Final = 64
 """Tags of a GPS directory; there are 32. What has more is none."""
@@ -47,8 +46,7 @@ _XMP_GPS: Final = re.compile(rb":[Gg][Pp][Ss]\w{1,40}" + _VALUE)
 _PACKED: Final = re.compile(rb"Raw profile type |XML:com\.adobe\.xmp\x00\x01")
 """How the text of a PNG chunk begins that holds metadata in a form that cannot be searched."""
 
-_HIDDEN: Final = b"prVt"
-"""Type of a chunk that every reader skips: ancillary, private, safe to copy."""
+_HIDDEN: Final = b"prVt"  # type of a chunk that every reader skips: ancillary, private, safe to copy
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,7 @@ from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_de
 
 _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
 _GREEN: Final = 1  # the number of green among the colours of a mosaic
-_BAND: Final = 16
-"""Rows that are judged together by `Mosaic.of`."""
+_BAND: Final = 16  # rows that are judged together by `Mosaic.of`
 
 _CLUSTER: Final = 0.005
 """Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
@@ -26,11 +25,8 @@ _CLUSTER: Final = 0.005
 _STRAYS: Final = 0.02
 """Share of a pile that may lie above it: hot pixels; more is a bright part of the picture."""
 
-_EDGE: Final = 0.02
-"""Share of a pile below its lower end: 0 would take the darkest stray (chosen)."""
-
-_LOWEST_PILE: Final = 0.8
-"""Lowest level, relative to the stated one, at which sensors were seen to clip."""
+_EDGE: Final = 0.02  # share of a pile below its lower end: 0 would take the darkest stray (chosen)
+_LOWEST_PILE: Final = 0.8  # lowest level, relative to the stated one, at which sensors were seen to clip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,40 +152,31 @@ class Mosaic:
 
         at = np.arange(first, len(counts))
         middle = int(at[np.argmax(sums[np.minimum(at + width, len(counts))] - sums[at])]) + width // 2
-        low, high = middle - 2 * width, middle + 2 * width
+        low, high = max(middle - 2 * width, 0), middle + 2 * width
         pile, below, above = (within(low, high), within(2 * low - high, low), within(high, len(counts)))
-        total = within(0, len(counts))
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
-        if not max(50, 2e-5 * total) < pile < 0.5 * total or pile < 5 * below or above > _STRAYS * pile:
+        if not max(50, 2e-5 * sums[-1]) < pile < 0.5 * sums[-1] or pile < 5 * below or above > _STRAYS * pile:
             return None
         # what of the picture lies under the pile as it does below it does not belong to it
-        inside = np.cumsum(counts[max(low, 0) :] - below / (high - low))
+        inside = np.cumsum(counts[low:] - below / (high - low))
         first = int(np.argmax(inside >= _EDGE * pile))
-        last = int(
-            np.searchsorted(
-                np.cumsum(counts[max(low, 0) :]), (1.0 - _STRAYS / 2.0) * within(low, len(counts))
-            )
-        )
-        return max(low, 0) + first, max(low, 0) + last
+        last = np.searchsorted(np.cumsum(counts[low:]), (1.0 - _STRAYS / 2.0) * (pile + above))
+        return low + first, low + int(last)
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""
         if not self.is_bayer or min(self.colours.shape) < 2:
             return None
-        (a, b), (c, d) = (
-            [1 if colour == 3 else int(colour) for colour in row] for row in self.colours[:2, :2]
-        )
+        cell = self.colours[:2, :2]
+        (a, b), (c, d) = np.where(cell == 3, 1, cell).tolist()
         return ((a, b), (c, d))
 
     def sites(self, white: int) -> list[Plane]:
         """Red, green and blue at half the size, without interpolation; black 0, `white` 1."""
         planes: dict[int, Plane] = {}
-        for row in (0, 1):
-            for col in (0, 1):
-                colour = int(self.colours[row, col])
-                values = self.values[row::2, col::2].astype(np.float32)
-                black = np.float32(self.black[colour])
-                planes.setdefault(
-                    1 if colour == 3 else colour, (values - black) / (np.float32(white) - black)
-                )
+        for row, col in np.ndindex(2, 2):
+            colour = int(self.colours[row, col])
+            black = np.float32(self.black[colour])
+            values = self.values[row::2, col::2].astype(np.float32)
+            planes.setdefault(1 if colour == 3 else colour, (values - black) / (np.float32(white) - black))
         return [planes[k] for k in sorted(planes)]

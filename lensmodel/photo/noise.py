@@ -11,8 +11,7 @@ from scipy import ndimage
 
 from lensmodel.core.types import NoiseModel, Plane, Planes
 
-BLOCK: Final = 8
-"""Side of the blocks in pixels: flat places of this size exist in almost any photo."""
+BLOCK: Final = 8  # side of the blocks in pixels: flat places of this size exist in almost any photo
 
 GRAIN: Final = 4
 """Side in pixels of blocks whose means tell of coarse grain: fine grain averages out there (chosen)."""
@@ -21,17 +20,12 @@ _GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)
 """Shares of the pixels darker than the levels at which grain is compared (chosen)."""
 
 _BINS: Final = 24  # levels at most, from dark to bright (chosen): a line of two terms needs no more
-_FLAT_SHARE: Final = 0.15
-"""Share of the blocks of one level, the least textured, that count (chosen)."""
-
+_FLAT_SHARE: Final = 0.15  # share of the blocks of one level, the least textured, that count (chosen)
 _MIN_BLOCKS: Final = 24  # of a level (chosen): 1,536 pixels tell a standard deviation within some percent
 _ENOUGH_PIXELS: Final = 3_000_000  # of a plane (chosen): more would not change the fit
 _MAD_TO_SIGMA: Final = 1.4826  # of a normal distribution: 1 / its upper quartile
-_CUT: Final = 1.5
-"""Standard deviations beyond which a difference counts as no more than that: see `_scale`."""
-
-_CUT_POWER: Final = 0.778465
-"""Mean of min(z^2, _CUT^2) of a standard normal z."""
+_CUT: Final = 1.5  # standard deviations beyond which a difference counts as no more than that: see `_scale`
+_CUT_POWER: Final = 0.778465  # mean of min(z^2, _CUT^2) of a standard normal z
 
 # The difference of two Laplacians: unit gain for white noise, blind to planes and to edges
 # along the axes. J. Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, eq. 2.

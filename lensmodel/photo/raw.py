@@ -58,16 +58,14 @@ red and blue and 1.9 times in green, and at the highest it is about half.
 """
 
 _FULL: Final = 65535.0  # 16 bits
-
-_ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}
-"""How LibRaw says that a picture is turned -> EXIF orientation."""
+_ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}  # how LibRaw says that a picture is turned -> EXIF orientation
 
 _LEAST_SHARE: Final = 0.25
 """No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
 
 
+# CRW, CR2, MRW: LibRaw reads every camera that wrote them, so that one it does not know is damaged.
 _KNOWN_WHOLE: Final = ((6, b"HEAPCCDR"), (8, b"CR\x02"), (0, b"\0MRM"))
-"""CRW, CR2, MRW: LibRaw reads every camera that wrote them, so that one it does not know is damaged."""
 
 
 @contextmanager
@@ -77,22 +75,18 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
         with rawpy.RawPy() as raw:
             raw.open_file(str(path))
             yield raw
-    except LensModelError:
+    except (LensModelError, MemoryError):
         raise
-    except rawpy.LibRawFileUnsupportedError as error:
+    except (rawpy.LibRawFileUnsupportedError, rawpy.LibRawIOError) as error:
         with path.open("rb") as file:
             head = file.read(16)
-        if any(head[at : at + len(magic)] == magic for at, magic in _KNOWN_WHOLE):
+        if isinstance(error, rawpy.LibRawIOError) or any(head.startswith(m, at) for at, m in _KNOWN_WHOLE):
             raise TruncatedImageError(
                 "the RAW file is damaged, or ends before its data do: the upload may have been cut off"
             ) from error
         raise UnsupportedFormatError(
             "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
         ) from error
-    except rawpy.LibRawIOError as error:
-        raise TruncatedImageError("the RAW file ends before its data do; the upload was cut off") from error
-    except MemoryError:
-        raise
     except Exception as error:
         raise RawDecodeError(
             f"LibRaw cannot decode this file ({error}); convert it to DNG or TIFF"
@@ -132,7 +126,7 @@ def develop_raw(
     sensor_noise = _sensor_noise(mosaic, white)
     defects = 0 if mosaic is None else mosaic.repair(others)
     balance = _white_balance(raw, mosaic)
-    planes = _developed(raw, white, balance, _spans(raw, header.white) if mosaic is None else None)
+    planes = _developed(raw, white, balance, header.white if mosaic is None else ())
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
     cfa = None if mosaic is None else mosaic.bayer_pattern()
@@ -164,64 +158,54 @@ def develop_raw(
         grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
         remarks=(
             *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
-            *(("1 defective pixel of its sensor is replaced",) if defects == 1 else ()),
             *((f"{defects} defective pixels of its sensor are replaced",) if defects > 1 else ()),
+            *(("1 defective pixel of its sensor is replaced",) if defects == 1 else ()),
         ),
     )
 
 
-def _spans(raw: rawpy.RawPy, white: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Levels from black to the white that a DNG states, of channels without a mosaic; None if they are wrong.
-
-    LibRaw takes the black of such files off their values, but not off their white.
-    """
-    if not white:
-        return None
-    colours = min(raw.num_colors, 3)
-    spans = np.resize(np.resize(white, colours) - np.array(raw.black_level_per_channel[:colours], float), 3)
-    return spans if spans.min() > 0.0 else None
-
-
 def _developed(
-    raw: rawpy.RawPy,
-    white: int,
-    balance: tuple[float, float, float],
-    spans: NDArray[np.float64] | None,
+    raw: rawpy.RawPy, white: int, balance: tuple[float, float, float], stated: tuple[int, ...]
 ) -> Planes:
     """Demosaic with white balance, then take the balance off again.
 
     Demosaicing fills in the fine detail of red and blue from green, as if their contrasts were
     equal. That is roughly so after white balance only: without it the red of a camera whose
-    red is 0.4 of its green gets detail that is 2.5 times too strong.
+    red is 0.4 of its green gets detail that is 2.5 times too strong. `stated` is the white that a DNG without
+    a mosaic states: LibRaw takes the black of such files off their values, but not off their white.
     """
-    share = np.asarray(balance) / max(balance)
-    share = np.maximum(share, _LEAST_SHARE)
+    share = np.maximum(np.asarray(balance) / max(balance), _LEAST_SHARE)
+    full, colours = share, min(raw.num_colors, 3)
     # LibRaw applies this after it took the black level off, so it counts from black.
     saturation = None if white == raw.white_level else white - min(raw.black_level_per_channel)
-    if spans is not None:
-        saturation = round(spans.max())
-    developed = raw.postprocess(
-        demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
-        gamma=(1, 1),
-        no_auto_bright=True,
-        output_bps=16,
-        output_color=rawpy.ColorSpace.raw,
-        user_wb=[float(share[0]), float(share[1]), float(share[2]), float(share[1])],
-        user_flip=0,
-        user_sat=saturation,
-        adjust_maximum_thr=0.0,  # else LibRaw makes the brightest pixel of each photo the white
-        highlight_mode=rawpy.HighlightMode.Ignore,  # the strongest channel reaches 65535, none is cut
-        median_filter_passes=0,
-        fbdd_noise_reduction=rawpy.FBDDNoiseReductionMode.Off,
+    if stated:
+        black = np.array(raw.black_level_per_channel[:colours], dtype=float)
+        spans = np.resize(np.resize(stated, colours) - black, 3)
+        if spans.min() > 0.0:
+            saturation, full = round(spans.max()), share * spans / spans.max()
+    rgb = np.asarray(
+        raw.postprocess(
+            demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
+            gamma=(1, 1),
+            no_auto_bright=True,
+            output_bps=16,
+            output_color=rawpy.ColorSpace.raw,
+            user_wb=[float(share[0]), float(share[1]), float(share[2]), float(share[1])],
+            user_flip=0,
+            user_sat=saturation,
+            adjust_maximum_thr=0.0,  # else LibRaw makes the brightest pixel of each photo the white
+            highlight_mode=rawpy.HighlightMode.Ignore,  # the strongest channel reaches 65535, none is cut
+            median_filter_passes=0,
+            fbdd_noise_reduction=rawpy.FBDDNoiseReductionMode.Off,
+        )
     )
-    rgb = np.asarray(developed)
     if rgb.ndim != 3 or rgb.shape[2] not in {1, 3}:
         raise UnsupportedFormatError("only RAW files of three colours, or none, are read")
     planes: Planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
-    # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
-    saturated = np.floor(_FULL * share * (1.0 if spans is None else spans / spans.max()))
     for k, plane in enumerate(planes):
-        np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], np.float32(1 / saturated[k]), out=plane)
+        # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
+        scale = np.float32(1 / np.floor(_FULL * full[k]))
+        np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], scale, out=plane)
         np.minimum(plane, np.float32(1.0), out=plane)
     if float(planes.max()) <= 0.0:
         raise RawDecodeError("the developed photo is black everywhere; the file holds no picture")
@@ -258,22 +242,21 @@ def _plane_noise(
 
 def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:
     """Multipliers of the camera, green 1: as written, else as its own JPEG shows, else daylight."""
-    r, g, b = (float(v) for v in raw.camera_whitebalance[:3])
-    if _sound(r, g, b):
-        return r / g, 1.0, b / g
+    if known := _relative(*raw.camera_whitebalance[:3]):
+        return known
     table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
-    balance = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
-    if balance is not None and _sound(balance[0], 1.0, balance[1]):
-        return balance[0], 1.0, balance[1]
-    r, g, b = (float(v) for v in raw.daylight_whitebalance[:3])
-    if _sound(r, g, b):
+    shown = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
+    if shown is not None and (known := _relative(shown[0], 1.0, shown[1])):
+        return known
+    if known := _relative(*raw.daylight_whitebalance[:3]):
         log.info("the RAW file does not say its white balance; daylight is assumed")
-        return r / g, 1.0, b / g
-    return 1.0, 1.0, 1.0
+    return known or (1.0, 1.0, 1.0)
 
 
-def _sound(r: float, g: float, b: float) -> bool:
-    return min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20
+def _relative(r: float, g: float, b: float) -> tuple[float, float, float] | None:
+    """Multipliers relative to that of green; None where they are absurd."""
+    sound = min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20
+    return (float(r) / float(g), 1.0, float(b) / float(g)) if sound else None
 
 
 def _colour(
@@ -295,26 +278,15 @@ def _colour(
 _Grid: TypeAlias = NDArray[np.float64]
 """Means over blocks, `(row, col, colour)`."""
 
-_BLOCKS: Final = 96
-"""Blocks along the longer side: a few pixels of misplacement do not matter then, and 6,000 are enough."""
-
+_BLOCKS: Final = 96  # along the longer side: a few pixels of misplacement do not matter then
 _SMALLEST_JPEG: Final = 2 * _BLOCKS  # pixels; the shorter side may have half, one to a block (chosen)
 _MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory: so many take 200 MB (chosen)
-_ASPECT: Final = 0.03
-"""How much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs."""
-
-_LIKENESS: Final = 0.8
-"""Least correlation of the lightness of both; a JPEG of something else stays far below."""
-
-_MIDTONES: Final = (0.15, 0.8)
-"""Numbers of the JPEG, full is 1, in which a camera's tone curve is nearest to sRGB."""
-
+_ASPECT: Final = 0.03  # how much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs
+_LIKENESS: Final = 0.8  # least correlation of the lightness of both; a JPEG of something else stays far below
+_MIDTONES: Final = (0.15, 0.8)  # of the JPEG's numbers, in which a camera's tone curve is nearest to sRGB
 _UNCLIPPED: Final = 0.5  # largest mean of a block, full is 1 (chosen): leaves brighter pixels room
-_NEUTRAL: Final = 1.6
-"""Largest over smallest of the linear colours: curves and saturation settings change strong colours more."""
-
-_LEAST_BLOCKS: Final = 24
-"""Fewer near-neutral blocks than this may all be of one object that is not grey."""
+_NEUTRAL: Final = 1.6  # largest over smallest colour: settings of the camera change strong colours more
+_LEAST_BLOCKS: Final = 24  # fewer near-neutral blocks than this may all be of one object that is not grey
 
 
 def balance_of_rendition(
@@ -332,38 +304,28 @@ def balance_of_rendition(
     """
     if mosaic is None or not mosaic.is_bayer or (picture := _jpeg_of(raw)) is None:
         return None
-    sites = mosaic.sites(mosaic.white)
-    if len(sites) != 3:
-        return None
-    height, width = sites[0].shape
-    rows, cols = round(_BLOCKS * height / max(height, width)), round(_BLOCKS * width / max(height, width))
-    if min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
+    sites = np.stack(mosaic.sites(mosaic.white), axis=-1)
+    height, width, colours = sites.shape
+    rows, cols = (round(_BLOCKS * side / max(height, width)) for side in (height, width))
+    if colours != 3 or min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
         return None
     if abs(np.log(picture.width * height / (picture.height * width))) > _ASPECT:
         return None
-    numbers = np.asarray(picture.resize((4 * cols, 4 * rows), Image.Resampling.BOX), dtype=np.float64) / 255.0
-    sensor = np.stack([_block_means(site[:, :, None], rows, cols)[..., 0] for site in sites], axis=-1)
-    shown = _block_means(srgb_to_linear(numbers), rows, cols)
-    return _balance(_block_means(numbers, rows, cols), shown, sensor, to_srgb)
-
-
-def _balance(
-    numbers: _Grid, shown: _Grid, sensor: _Grid, to_srgb: Matrix | None
-) -> tuple[float, float] | None:
-    picture, values = (np.sqrt(np.maximum(grid[..., 1], 0.0)).ravel() for grid in (shown, sensor))
-    if min(float(picture.std()), float(values.std())) < 1e-6:
+    pixels = np.asarray(picture.resize((4 * cols, 4 * rows), Image.Resampling.BOX), dtype=np.float64) / 255.0
+    numbers, shown, sensor = (
+        _block_means(values, rows, cols) for values in (pixels, srgb_to_linear(pixels), sites)
+    )
+    greens = [np.sqrt(np.maximum(grid[..., 1], 0.0)).ravel() for grid in (shown, sensor)]
+    if min(float(green.std()) for green in greens) < 1e-6 or np.corrcoef(np.stack(greens))[0, 1] < _LIKENESS:
         return None
-    if float(np.corrcoef(picture, values)[0, 1]) < _LIKENESS:
-        return None
+    balanced = shown if to_srgb is None else shown @ np.linalg.inv(to_srgb).T
     most = numbers.max(axis=-1)
     used = (most > _MIDTONES[0]) & (most < _MIDTONES[1]) & (sensor.max(axis=-1) < _UNCLIPPED)
     used &= (shown.max(axis=-1) < _NEUTRAL * shown.min(axis=-1)) & (sensor.min(axis=-1) > 0.0)
-    balanced = shown[used] if to_srgb is None else shown[used] @ np.linalg.inv(to_srgb).T
-    part = sensor[used][balanced.min(axis=-1) > 0.0]
-    balanced = balanced[balanced.min(axis=-1) > 0.0]
-    if len(part) < _LEAST_BLOCKS:
+    used &= balanced.min(axis=-1) > 0.0
+    if used.sum() < _LEAST_BLOCKS:
         return None
-    red, green, blue = (balanced / part).T
+    red, green, blue = (balanced[used] / sensor[used]).T
     return float(np.median(red / green)), float(np.median(blue / green))
 
 

@@ -47,9 +47,7 @@ _FORMATS: Final[Mapping[int, str]] = {
     9: "i", 10: "ii", 11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q",
 }  # fmt: skip
 _SIZES: Final = {kind: struct.calcsize("=" + code) for kind, code in _FORMATS.items()}
-_VERSIONS: Final = {42, 43, 0x55, 0x4F52, 0x5352}
-"""TIFF, BigTIFF, Panasonic RW2, and two of Olympus ORF."""
-
+_VERSIONS: Final = {42, 43, 0x55, 0x4F52, 0x5352}  # TIFF, BigTIFF, Panasonic RW2, and two of Olympus ORF
 _MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG; as a distance, infinity
 
 

@@ -21,8 +21,7 @@ RAW_ENDINGS: Final = frozenset(f".{ending}" for ending in _RAW.split())
 
 ENDINGS: Final = RAW_ENDINGS | {".jpg", ".jpeg", ".tif", ".tiff", ".png"}
 
-SOFTWARE: Final = "lensmodel"
-"""Names this program in the files that it writes."""
+SOFTWARE: Final = "lensmodel"  # names this program in the files that it writes
 
 CORRECTED: Final = "-corrected"
 """Ends the names of what `lensmodel correct` wrote: it says nothing about its lens any more."""

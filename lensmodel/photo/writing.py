@@ -37,8 +37,7 @@ from lensmodel.photo.tiff import BYTE, EXIF, GPS, UNDEFINED, Written, laid_out, 
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
 from lensmodel.photo.xmp import xmp_packet
 
-_ROWS: Final = 256
-"""Rows that are encoded at a time: bounds the memory of the conversion."""
+_ROWS: Final = 256  # rows that are encoded at a time: bounds the memory of the conversion
 
 _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""

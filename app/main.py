@@ -20,7 +20,7 @@ from app.http.dependencies import Fresh, Services, call_of
 from app.http.middleware import Guard, RequestLog
 from app.http.model_cache import ModelCache
 from app.routes import account, corrections, health, jobs, lenses, photos, psf
-from app.routes.common import problems
+from app.routes.common import PROBLEMS
 from app.runtime.outage import missable
 from app.runtime.settings import Settings
 from app.store import Store
@@ -80,7 +80,7 @@ def _routes() -> tuple[BaseRoute, ...]:
     # most requests, and need not be done again for an application with other settings
     router = APIRouter(generate_unique_id_function=_operation)
     router.include_router(health.probes)
-    router.include_router(account.sign_ins, prefix="/v1")
+    router.include_router(account.sign_ins, prefix="/v1", responses=PROBLEMS)
     resources = (
         psf,  # first: routes are tried in their order, and this one is asked for most often
         photos,
@@ -96,7 +96,7 @@ def _routes() -> tuple[BaseRoute, ...]:
             resource.router,
             prefix="/v1",
             dependencies=[Depends(call_of)],
-            responses=problems(401, 403, 404, 409, 422, 429),
+            responses=PROBLEMS,
         )
     pages.include(router)
     return tuple(router.routes)

@@ -6,10 +6,12 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, fields
 from inspect import iscoroutinefunction
+from operator import attrgetter
 from typing import Annotated, Any, Generic, TypeVar
+from urllib.parse import urlencode
 
 from fastapi import Depends, Request, Response, Security
 from fastapi.routing import APIRoute
@@ -18,12 +20,22 @@ from starlette.concurrency import run_in_threadpool
 
 from app.access import Gate, Who
 from app.blobs.storage import Storage
+from app.errors import UnknownError
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
-from app.schemas import Readiness
+from app.schemas import Model, Page, Readiness
 from app.store import Store
+from app.store.tables import CorrectionRow, LensRow, PhotoRow
 
 T = TypeVar("T")
+M = TypeVar("M", bound=Model)
+
+
+def found(what: str, key: str, row: T | None) -> T:
+    """Return what was looked up of the owner; refuse what is not there, or somebody else's."""
+    if row is None:
+        raise UnknownError(what, key)
+    return row
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +80,38 @@ class Call(Services):
     def owner(self) -> str:
         """Owner of the data that the request concerns."""
         return self.who.owner
+
+    def photo(self, photo_id: str) -> PhotoRow:
+        """Return a photo of the owner."""
+        return found("photo", photo_id, self.store.photos.get(photo_id, self.owner))
+
+    def lens(self, lens_id: str) -> LensRow:
+        """Return a lens of the owner."""
+        return found("lens", lens_id, self.store.lenses.get(lens_id, self.owner))
+
+    def correction(self, correction_id: str) -> CorrectionRow:
+        """Return a correction of the owner with its photo and lens."""
+        return found("correction", correction_id, self.store.jobs.get(correction_id, self.owner))
+
+    def knows(self, tag: str) -> bool:
+        """Say whether the request already has the answer of this tag (RFC 9110, 13.1.2)."""
+        sent = self.request.headers.get("if-none-match", "")
+        return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
+
+    def page(
+        self,
+        rows: Sequence[T],
+        limit: int,
+        make: Callable[[T], M],
+        cursor: Callable[[T], str] = attrgetter("public_id"),
+    ) -> Page[M]:
+        """Return a page of what one row more was read of, with the address of the next one."""
+        items, following = [make(row) for row in rows[:limit]], None
+        if len(rows) > limit:
+            query = {**self.request.query_params, "cursor": cursor(rows[limit - 1])}
+            following = f"{self.request.url.path}?{urlencode(query)}"
+            self.response.headers["Link"] = f'<{following}>; rel="next"'
+        return Page(items=items, next=following)
 
     @classmethod
     def of(cls, request: Request, response: Response, who: Who) -> Call:

@@ -15,8 +15,6 @@ from app.blobs.storage import Storage
 from app.errors import InvalidParameterError, NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
 from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
-from app.routes.corrections import find_correction
-from app.routes.photos import find_photo
 from app.schemas import Region
 from app.store.tables import CorrectionRow
 
@@ -48,7 +46,7 @@ def _stored(call: Call, key: str) -> bytes:
 @router.get("/ui/photos/{photo_id}/thumbnail.jpg")
 def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
     """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
-    folder = find_photo(call, photo_id).folder
+    folder = call.photo(photo_id).folder
     with suppress(FileNotFoundError):
         return _picture(call.storage.get(f"{folder}{THUMBNAIL}"))
     with suppress(NotReadyError):
@@ -59,7 +57,7 @@ def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
 def _tiles_of(call: CallDep, kind: Kind, subject: str, which: Which) -> str:
     """Return the key of the tiles of a photo, or of one side of a correction."""
     if kind == "photos":
-        return f"{find_photo(call, subject).folder}{SHOWN}"
+        return f"{call.photo(subject).folder}{SHOWN}"
     return f"{_compared(call, subject).run_folder}{SIDES[which]}"
 
 
@@ -85,7 +83,7 @@ def tile_of_picture(call: CallDep, key: Tiles, half: Half, col: Number, row: Num
 
 
 def _compared(call: Call, correction_id: str) -> CorrectionRow:
-    row = find_correction(call, correction_id)
+    row = call.correction(correction_id)
     if row.state != "succeeded":
         raise NotReadyError(f"correction {correction_id} is {row.state}: wait for its job")
     return row

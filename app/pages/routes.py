@@ -24,10 +24,10 @@ from app.http import errors, views
 from app.http.dependencies import Call, CallDep, OneSession, call_of
 from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown, words
-from app.routes.common import file_headers, find_lens, matches_tag
-from app.routes.corrections import begin, find_correction, list_corrections
+from app.routes.common import file_headers
+from app.routes.corrections import begin, list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
-from app.routes.photos import find_photo, get_photo
+from app.routes.photos import get_photo
 from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, blank_is_none
 from app.store.database import new_id
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
@@ -146,7 +146,7 @@ def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
 @router.get("/photos/{photo_id}")
 def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
-    row = find_photo(call, photo_id)
+    row = call.photo(photo_id)
     photo = views.photo_out(row)
     patches = call.store.photos.windows(photo_id)
     left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
@@ -193,7 +193,7 @@ class PreviewIn(Region):
 @router.post("/ui/photos/{photo_id}/preview", status_code=202)
 def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
     """Begin to correct a part of a photo."""
-    row = find_photo(call, photo_id)
+    row = call.photo(photo_id)
     if not row.width or not row.height:
         raise InvalidParameterError("the photo is not read yet: wait a moment")
     if part.width * part.height > MAX_PREVIEW_PIXELS:
@@ -211,7 +211,7 @@ def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
 @router.get("/corrections/{correction_id}")
 def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
-    plan = find_correction(call, correction_id)
+    plan = call.correction(correction_id)
     correction, row = views.correction_out(plan), plan.photo
     report = correction.report or {}
     audit = report.get("audit") or {}
@@ -257,7 +257,7 @@ def batch_archive(ids: Ids, call: CallDep) -> StreamingResponse:
 
 
 def _plans(call: Call, ids: str) -> list[CorrectionRow]:
-    return [find_correction(call, key) for key in dict.fromkeys(filter(None, ids.split(",")))]
+    return [call.correction(key) for key in dict.fromkeys(filter(None, ids.split(",")))]
 
 
 def _files(call: Call, plans: Sequence[CorrectionRow]) -> Iterator[tuple[zipfile.ZipInfo, Iterable[bytes]]]:
@@ -290,7 +290,7 @@ ChosenAperture = Annotated[Aperture | None, BeforeValidator(blank_is_none), Quer
 @router.get("/lenses/{lens_id}")
 def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> HTMLResponse:
     """Show what a lens does to pictures, whether it is a good copy, and which photo would help."""
-    lens, row = get_lens(lens_id, call), find_lens(call, lens_id)
+    lens, row = get_lens(lens_id, call), call.lens(lens_id)
     photos, more = shown.photos(call, lens_id)
     aspect, test = _aspect(call, row), _test(call, row)
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
@@ -321,7 +321,7 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
 @router.get("/lenses/{lens_id}/tests")
 def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     """Show what testers and researchers ask of a lens: charts, its blur at any point, its versions."""
-    lens, row = get_lens(lens_id, call), find_lens(call, lens_id)
+    lens, row = get_lens(lens_id, call), call.lens(lens_id)
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, _ = shown.photos(call, lens_id)
@@ -353,14 +353,14 @@ def lens_charts(
     """Show the charts of one aperture, or two lenses or apertures in one."""
     from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
 
-    test = stored_report(call, find_lens(call, lens_id))
+    test = stored_report(call, call.lens(lens_id))
     at = _APERTURE.validate_python(against.removeprefix("at ")) if against.startswith("at ") else None
     if not against or (at is not None and at == aperture):
         return page("_charts.html", **_charts(test, aperture, unit))
     if at is not None:  # two apertures of one lens
         sides = [Side(words.f_stop(number or 0.0), test.at(number)) for number in (aperture, at)]
     else:
-        other = stored_report(call, find_lens(call, against))
+        other = stored_report(call, call.lens(against))
         same = aperture if aperture in other.apertures else None
         sides = [Side(test.name, test.at(aperture)), Side(other.name, other.at(same))]
     comparison = compare(*sides)
@@ -413,7 +413,7 @@ def parts(call: CallDep, page: Open = "home", id: Ids = "") -> Response:  # noqa
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if settled:
         headers["HX-Refresh"] = "true"
-    elif matches_tag(call, tag):
+    elif call.knows(tag):
         return Response(status_code=304, headers=headers)
     return Response(body, media_type="text/html", headers=headers)
 
@@ -438,7 +438,7 @@ def _photo(call: Call, photo_id: str) -> Part:
 
 
 def _correction(call: Call, correction_id: str) -> Part:
-    plan = find_correction(call, correction_id)
+    plan = call.correction(correction_id)
     values = {"correction": views.correction_out(plan), "job": views.job_out(plan)}
     return "_correction_state.html", values, plan.state not in {"queued", "running"}
 

@@ -13,7 +13,6 @@ from app.http.dependencies import Call
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
-from app.routes.common import find_lens
 from app.schemas import LensOut, PhotoOut
 from app.store.tables import PhotoRow
 from lensmodel.core.names import camera_name, full_name, name_key
@@ -59,7 +58,7 @@ def lenses_with_photos(call: Call) -> list[LensOut]:
 
 def counting(call: Call, lens_id: str) -> bool:
     """Whether a worker has yet to measure the newest version of a lens."""
-    lens = find_lens(call, lens_id)
+    lens = call.lens(lens_id)
     newest = call.store.lenses.history(lens, after=lens.version - 1)
     return lens.sample_count > 0 and any(event.metrics is None for event in newest)
 

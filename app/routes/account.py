@@ -14,7 +14,7 @@ from starlette.responses import StreamingResponse
 from app.access import COOKIE, SESSION
 from app.blobs.account_data import erase, exported
 from app.http.dependencies import CallDep, OneSession, ProbeDep
-from app.routes.common import file_answer, file_headers, problems
+from app.routes.common import file_answer, file_headers
 from app.routes.photos import most
 from app.runtime.settings import LOOPBACK
 from app.schemas import AccountOut, SessionOut, SignIn
@@ -61,7 +61,7 @@ def erase_account(call: CallDep) -> None:
     call.response.delete_cookie(COOKIE)
 
 
-@sign_ins.post("/session", status_code=201, responses=problems(401, 422, 429))
+@sign_ins.post("/session", status_code=201)
 async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
     gate = call.gate
@@ -77,14 +77,14 @@ async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     return SessionOut.model_validate({"owner": who.owner, "scopes": who.scopes, "needed": True})
 
 
-@sign_ins.get("/session", responses=problems(401))
+@sign_ins.get("/session")
 async def get_session(call: CallDep) -> SessionOut:
     """Return who is signed in."""
     needed = call.who.key_id is not None
     return SessionOut.model_validate({"owner": call.owner, "scopes": call.who.scopes, "needed": needed})
 
 
-@sign_ins.delete("/session", status_code=204, responses=problems(422))
+@sign_ins.delete("/session", status_code=204)
 async def sign_out(call: ProbeDep) -> None:
     """Sign the browser out."""
     await run_in_threadpool(call.gate.sign_out, call.request)

@@ -1,20 +1,18 @@
-"""What several routes share: look-ups, pages, files, and which problems an endpoint may answer with."""
+"""What several routes share: look-ups, pages, files, and how answers are described."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from operator import attrgetter
-from typing import Annotated, Any, Final, TypeAlias, TypeVar
-from urllib.parse import quote, urlencode
+from typing import Annotated, Any, Final, TypeAlias
+from urllib.parse import quote
 
 from fastapi import Query
 
-from app.errors import UnknownError
+from app.errors import ConflictError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
-from app.other_lens import Described
-from app.schemas import Model, OptionalName, Page, Problem
+from app.other_lens import REMEDY, Described, difference
+from app.schemas import OptionalName, Problem
 from app.store.tables import LensRow, PhotoRow
 from lensmodel.core.names import camera_name
 
@@ -24,21 +22,13 @@ Cursor = Annotated[str | None, Query(pattern=_ID, description="from `next` of th
 OnlyId = Annotated[str | None, Query(pattern=_ID)]
 OnlyName = Annotated[OptionalName, Query()]
 
-M = TypeVar("M", bound=Model)
-T = TypeVar("T")
 Answers: TypeAlias = dict[int | str, dict[str, Any]]
-
-
-def problems(*statuses: int, also: Answers | None = None) -> Answers:
-    """Return the OpenAPI entries of the problems that an endpoint may answer with, and of `also`."""
-    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
-    answers: Answers = {
-        status: {"model": Problem, "description": "Problem", "content": {MEDIA_TYPE: schema}}
-        for status in (*statuses, 500, 503)
-    }
-    return answers | (also or {})
-
-
+# OpenAPI entries of what any endpoint may answer
+_PROBLEM: Final = {"schema": {"$ref": "#/components/schemas/Problem"}}
+PROBLEMS: Final[Answers] = {
+    status: {"model": Problem, "description": "Problem", "content": {MEDIA_TYPE: _PROBLEM}}
+    for status in ("4XX", "5XX")
+}
 NOT_CHANGED: Final[Answers] = {304: {"description": "Not changed"}}
 
 
@@ -58,53 +48,19 @@ def file_headers(name: str, *, inline: bool = False, cache: str = "private, no-c
     }
 
 
-def matches_tag(call: Call, tag: str) -> bool:
-    """Say whether a request already has the answer of this tag (RFC 9110, 13.1.2)."""
-    sent = call.request.headers.get("if-none-match", "")
-    return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
+def check_same_lens(call: Call, lens: LensRow, other: LensRow | PhotoRow, what: str) -> None:
+    """Refuse a photo, or a lens, that seems to be of another lens, as the command line does."""
+    why = difference(_described(call, lens), _described(call, other))
+    if why is not None:
+        raise ConflictError(f"{what}: {why}; {REMEDY}", code="other_lens")
 
 
-def found(what: str, key: str, row: T | None) -> T:
-    """Return what was looked up of the owner; refuse what is not there, or somebody else's."""
-    if row is None:
-        raise UnknownError(what, key)
-    return row
-
-
-def find_lens(call: Call, lens_id: str) -> LensRow:
-    """Return a lens of the owner."""
-    return found("lens", lens_id, call.store.lenses.get(lens_id, call.owner))
-
-
-def described_lens(call: Call, lens: LensRow) -> Described:
-    """Return what is known of a lens by itself and by its newest photos."""
-    own = call.store.photos.page(call.owner, before=None, limit=200, lens_id=lens.public_id)
-    return _described(lens.maker, lens.model, lens.serial, own)
-
-
-def described_photo(photo: PhotoRow) -> Described:
-    """Return what a photo says of its lens."""
-    return _described(photo.lens_maker, photo.lens_model, photo.lens_serial, [photo])
-
-
-def _described(
-    maker: str | None, model: str | None, serial: str | None, photos: Sequence[PhotoRow]
-) -> Described:
+def _described(call: Call, it: LensRow | PhotoRow) -> Described:
+    """Return what is known of a lens by itself and its newest photos, or what a photo says of its lens."""
+    if isinstance(it, PhotoRow):
+        maker, model, serial, photos = it.lens_maker, it.lens_model, it.lens_serial, [it]
+    else:
+        maker, model, serial = it.maker, it.model, it.serial
+        photos = call.store.photos.page(call.owner, before=None, limit=200, lens_id=it.public_id)
     cameras = {camera_name(row.camera_maker, row.camera_model) for row in photos if row.camera_model}
     return Described(maker, model, serial, cameras, [row.focal_mm for row in photos if row.focal_mm])
-
-
-def paged(
-    call: Call,
-    rows: Sequence[T],
-    limit: int,
-    make: Callable[[T], M],
-    cursor: Callable[[T], str] = attrgetter("public_id"),
-) -> Page[M]:
-    """Return a page of what one row more was read of, with the address of the next one, also in `Link`."""
-    items, following = [make(row) for row in rows[:limit]], None
-    if len(rows) > limit:
-        query = {**call.request.query_params, "cursor": cursor(rows[limit - 1])}
-        following = f"{call.request.url.path}?{urlencode(query)}"
-        call.response.headers["Link"] = f'<{following}>; rel="next"'
-    return Page(items=items, next=following)

@@ -10,33 +10,24 @@ from starlette.responses import StreamingResponse
 
 from app.errors import ConflictError, InvalidParameterError, NotReadyError
 from app.http import views
-from app.http.dependencies import Call, CallDep, OneSession
+from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.model_cache import check_version
-from app.other_lens import REMEDY, difference
-from app.routes.common import (
-    NOT_CHANGED,
-    Cursor,
-    Limit,
-    OnlyId,
-    described_lens,
-    described_photo,
-    file_answer,
-    file_headers,
-    find_lens,
-    found,
-    matches_tag,
-    paged,
-    problems,
-)
-from app.routes.photos import SEND_AGAIN, check_usage, find_photo
+from app.routes import common
+from app.routes.common import Cursor, Limit, OnlyId
+from app.routes.photos import SEND_AGAIN, check_usage
 from app.schemas import V1, CorrectionIn, CorrectionOut, Page
 from app.store.photos import stored_settings
 from app.store.samples import LensState
-from app.store.tables import CorrectionRow, LensRow, PhotoRow
+from app.store.tables import LensRow, PhotoRow
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.correction import deconvolvers
 
 router = APIRouter(tags=["corrections"], route_class=OneSession)
+_RESULT: Final[common.Answers] = {
+    **common.file_answer("image/*", "The file"),
+    **common.file_answer("image/*", "A part", 206),
+    **common.NOT_CHANGED,
+}
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 
 
@@ -52,14 +43,14 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
 
 def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
     """Begin a correction, or find the same one; what is its `own` tells it from others."""
-    photo = find_photo(call, options.photo_id)
+    photo = call.photo(options.photo_id)
     if options.method not in deconvolvers:
         raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
     _check_read(photo)
     _check_region(photo, options)
     lens = _lens_for(call, photo, options.lens_id)
     if not options.any_lens and lens.id != photo.lens_id:
-        _check_lens(call, photo, lens)
+        common.check_same_lens(call, lens, photo, f"{photo.filename} seems to be of another lens")
     version = _version_for(call, lens, options.lens_version)
     usage = call.store.accounts.usage(call.owner)
     check_usage(call.settings, usage, usage.working_corrections, "corrections")
@@ -102,22 +93,13 @@ def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
 
 def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     if lens_id is not None:
-        return find_lens(call, lens_id)
+        return call.lens(lens_id)
     lens = photo.lens or call.store.lenses.by_identity(photo)
     if lens is not None:
         return lens
     raise MetadataMissingError(
         f"photo {photo.public_id} does not say which lens it was taken with: send lens_id"
     )
-
-
-def _check_lens(call: Call, photo: PhotoRow, lens: LensRow) -> None:
-    """Refuse a photo that seems to be of another lens, as the command line does."""
-    why = difference(described_lens(call, lens), described_photo(photo))
-    if why is not None:
-        raise ConflictError(
-            f"{photo.filename} seems to be of another lens: {why}; {REMEDY}", code="other_lens"
-        )
 
 
 def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
@@ -133,25 +115,20 @@ def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
     return lens.version
 
 
-def find_correction(call: Call, correction_id: str) -> CorrectionRow:
-    """Return a correction of the owner with its photo and lens."""
-    return found("correction", correction_id, call.store.jobs.get(correction_id, call.owner))
-
-
 @router.get("/corrections")
 def list_corrections(
     call: CallDep, limit: Limit = 50, cursor: Cursor = None, photo_id: OnlyId = None
 ) -> Page[CorrectionOut]:
     """List corrections, newest first, optionally of one photo."""
-    photo = None if photo_id is None else find_photo(call, photo_id)
+    photo = None if photo_id is None else call.photo(photo_id)
     rows = call.store.jobs.page(call.owner, before=cursor, limit=limit + 1, photo=photo)
-    return paged(call, rows, limit, views.correction_out)
+    return call.page(rows, limit, views.correction_out)
 
 
 @router.get("/corrections/{correction_id}")
 def get_correction(correction_id: str, call: CallDep) -> CorrectionOut:
     """Return one correction."""
-    return views.correction_out(find_correction(call, correction_id))
+    return views.correction_out(call.correction(correction_id))
 
 
 @router.delete("/corrections/{correction_id}", status_code=204)
@@ -164,13 +141,11 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
 @router.get(
     "/corrections/{correction_id}/result",
     response_class=Response,
-    responses=problems(
-        416, also=file_answer("image/*", "The file") | file_answer("image/*", "A part", 206) | NOT_CHANGED
-    ),
+    responses=_RESULT,
 )
 def get_correction_result(correction_id: str, call: CallDep) -> Response:
     """Return the corrected photo, whole or in part."""
-    row = find_correction(call, correction_id)
+    row = call.correction(correction_id)
     if row.state != "succeeded":
         raise NotReadyError(
             f"correction {correction_id} is {row.state}: "
@@ -180,8 +155,8 @@ def get_correction_result(correction_id: str, call: CallDep) -> Response:
     assert row.result_key is not None
     assert row.result_bytes is not None
     tag = f'"{row.result_etag}"'
-    headers = {"ETag": tag, "Accept-Ranges": "bytes", **file_headers(row.result_name or "corrected")}
-    if matches_tag(call, tag):
+    headers = {"ETag": tag, "Accept-Ranges": "bytes", **common.file_headers(row.result_name or "corrected")}
+    if call.knows(tag):
         return Response(status_code=304, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:

@@ -15,8 +15,8 @@ from starlette.concurrency import run_in_threadpool
 
 from app.errors import ConflictError, UnknownError
 from app.http import views
-from app.http.dependencies import Call, CallDep, OneSession
-from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer, found, paged
+from app.http.dependencies import Call, CallDep, OneSession, found
+from app.routes.common import NOT_CHANGED, Cursor, Limit, file_answer
 from app.routes.photos import SEND_AGAIN
 from app.schemas import JobOut, Page
 
@@ -47,7 +47,7 @@ def list_jobs(call: CallDep, limit: Limit = 50, cursor: Cursor = None) -> Page[J
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
     corrections = call.store.jobs.page(call.owner, before=cursor, limit=limit + 1)
     newest: list[views.Worked] = sorted([*photos, *corrections], key=attrgetter("public_id"), reverse=True)
-    return paged(call, newest, limit, views.job_out)
+    return call.page(newest, limit, views.job_out)
 
 
 @router.get("/jobs/{job_id}", response_model=JobOut, responses=NOT_CHANGED)

@@ -17,22 +17,8 @@ from starlette.concurrency import run_in_threadpool
 from app.errors import ConflictError, InvalidParameterError, NotReadyError, ServiceError, UnknownError
 from app.http import upload
 from app.http.dependencies import Call, CallDep, OneSession
-from app.other_lens import REMEDY, difference
-from app.routes import jobs
-from app.routes.common import (
-    NOT_CHANGED,
-    Answers,
-    Cursor,
-    Limit,
-    OnlyName,
-    described_lens,
-    file_answer,
-    file_headers,
-    find_lens,
-    matches_tag,
-    paged,
-    problems,
-)
+from app.routes import common, jobs
+from app.routes.common import Cursor, Limit, OnlyName
 from app.routes.photos import delete_photo, receiving, recorded
 from app.schemas import MAX_VERSION, V1, CalibrationOut, LateralOut, LensChange, LensIn, LensOut, Page
 from app.store.lenses import report_key
@@ -48,7 +34,7 @@ router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 _PAGE: Final = 200  # photos that are read at once (chosen): bounds the memory that a large lens takes
 _PROFILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
-_READING: Final[Answers] = {202: {"model": LensOut, "description": "Still being read: `Location` is its job"}}
+_READING: Final = {"model": LensOut, "description": "Still being read: `Location` is its job"}
 # Codes with which the reading of a profile is refused as such; all others are conflicts
 _REFUSALS: Final = frozenset({"malformed_upload", "image_too_large", "unknown_lens", "other_lens"})
 # Photos whose names a report looks at, at most (chosen): it lists some, and says how many more there are
@@ -69,7 +55,7 @@ def list_lenses(
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
     described = dict(zip([row.id for row in rows], _described(call, rows), strict=True))
-    return paged(call, rows, limit, lambda row: described[row.id])
+    return call.page(rows, limit, lambda row: described[row.id])
 
 
 def _described(call: Call, rows: list[LensRow]) -> list[LensOut]:
@@ -82,7 +68,7 @@ def _described(call: Call, rows: list[LensRow]) -> list[LensOut]:
 @router.get("/lenses/{lens_id}")
 def get_lens(lens_id: str, call: CallDep) -> LensOut:
     """Return one lens."""
-    return _described(call, [find_lens(call, lens_id)])[0]
+    return _described(call, [call.lens(lens_id)])[0]
 
 
 @router.post("/lenses", status_code=201)
@@ -98,18 +84,17 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
     Merged, its photos teach the other lens, which is returned, and it is forgotten; lenses that seem to be
     two are merged only with `any_lens`.
     """
-    lens = find_lens(call, lens_id)
+    lens = call.lens(lens_id)
     if len(change.model_fields_set - {"any_lens"}) != 1:
         raise InvalidParameterError("send label or merge_into")
     if change.merge_into is None:
         call.store.lenses.rename(lens_id, call.owner, change.label)
         return get_lens(lens_id, call)
-    target = find_lens(call, change.merge_into)
+    target = call.lens(change.merge_into)
     if target.id == lens.id:
         raise InvalidParameterError("merge_into names the lens itself: name the other one")
-    why = None if change.any_lens else difference(described_lens(call, target), described_lens(call, lens))
-    if why is not None:
-        raise ConflictError(f"the two seem to be different lenses: {why}; {REMEDY}", code="other_lens")
+    if not change.any_lens:
+        common.check_same_lens(call, target, lens, "the two seem to be different lenses")
     if not call.store.lenses.merge(lens_id, change.merge_into, call.owner):
         raise ConflictError(f"lens {lens_id} still learns from photos: wait for their jobs, then merge")
     return get_lens(change.merge_into, call)
@@ -130,8 +115,8 @@ def list_calibrations(
     cursor: Annotated[int, Query(ge=0, le=MAX_VERSION, description="from `next` of the page before")] = 0,
 ) -> Page[CalibrationOut]:
     """Return the history of a lens, oldest first: one item for each version."""
-    rows = call.store.lenses.history(find_lens(call, lens_id), after=cursor, limit=limit + 1)
-    return paged(call, rows, limit, CalibrationOut.of, lambda row: str(row.version))
+    rows = call.store.lenses.history(call.lens(lens_id), after=cursor, limit=limit + 1)
+    return call.page(rows, limit, CalibrationOut.of, lambda row: str(row.version))
 
 
 @router.get("/lenses/{lens_id}/lateral-colour")
@@ -141,7 +126,7 @@ def get_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     The median over the counted photos, coefficient by coefficient: one photo without edges near
     the corners cannot spoil it.
     """
-    lens = find_lens(call, lens_id)
+    lens = call.lens(lens_id)
     lateral = call.store.lenses.lateral_of(lens)
     red, blue = (_measured(lateral, colour) for colour in ("red", "blue"))
     if not red or not blue:
@@ -174,11 +159,11 @@ def _middle(polynomials: list[list[float]]) -> tuple[float, float, float, float]
 @router.get(
     "/lenses/{lens_id}/profile",
     response_class=Response,
-    responses=file_answer("application/zip", "A .lensprofile"),
+    responses=common.file_answer("application/zip", "A .lensprofile"),
 )
 def get_lens_profile(lens_id: str, call: CallDep) -> Response:
     """Return all that was learned of a lens as one file, which the command line reads too."""
-    lens = find_lens(call, lens_id)
+    lens = call.lens(lens_id)
     model = call.models.get(lens_id).model
     named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
     identity = {name: value for name, value in named.items() if value}
@@ -186,7 +171,7 @@ def get_lens_profile(lens_id: str, call: CallDep) -> Response:
     out = io.BytesIO()
     write_profile(out, LensProfile(model, identity, photos))
     name = lens.label or full_name(lens.maker, lens.model) or "lens"
-    headers = file_headers(f"{name}.lensprofile")
+    headers = common.file_headers(f"{name}.lensprofile")
     return Response(out.getvalue(), media_type="application/zip", headers=headers)
 
 
@@ -204,7 +189,7 @@ def _filenames(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
 
 @router.put(
     "/lenses/{lens_id}/profile",
-    responses=problems(400, 408, 413, 507, also=_READING),
+    responses={202: _READING},
     openapi_extra={"requestBody": {"required": True, "content": _PROFILE}},
 )
 async def add_lens_profile(
@@ -217,7 +202,7 @@ async def add_lens_profile(
     A worker reads it: the answer is the lens with it, or 202 where that takes longer than a long poll.
     The same profile a second time changes nothing. It must have been learned with the model of the lens.
     """
-    await run_in_threadpool(find_lens, call, lens_id)
+    await run_in_threadpool(call.lens, lens_id)
     async with receiving(call) as (public_id, key):
         digest, size = await upload.receive_profile(call.request, call.storage, key)
     file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
@@ -274,15 +259,15 @@ def stored_report(call: Call, lens: LensRow) -> LensReport:
 @router.get(
     "/lenses/{lens_id}/report.{form}",
     response_class=Response,
-    responses={200: {"content": _REPORT, "description": "Report"}, **NOT_CHANGED},
+    responses={200: {"content": _REPORT, "description": "Report"}, **common.NOT_CHANGED},
 )
 def get_lens_report(lens_id: str, form: Form, call: CallDep) -> Response:
     """Return the test of a lens: its first sentence is for photographers, the rest what testers expect."""
-    lens = find_lens(call, lens_id)
+    lens = call.lens(lens_id)
     test = stored_report(call, lens)
     tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{form}"'
-    headers = {"ETag": tag, **file_headers(f"{test.name}-report.{form}", inline=form == "pdf")}
-    if matches_tag(call, tag):
+    headers = {"ETag": tag, **common.file_headers(f"{test.name}-report.{form}", inline=form == "pdf")}
+    if call.knows(tag):
         return Response(status_code=304, headers=headers)
     photos = call.store.photos.page(call.owner, before=None, limit=_NAMED, lens_id=lens_id, state="counted")
     cameras = [camera_name(photo.camera_maker, photo.camera_model) for photo in photos]

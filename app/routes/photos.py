@@ -14,9 +14,9 @@ from structlog.contextvars import bind_contextvars
 
 from app.errors import BusyError, ConflictError, InvalidParameterError, QuotaError, ServiceError
 from app.http import middleware, upload, views
-from app.http.dependencies import Call, CallDep, OneSession
+from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.middleware import CLOSE
-from app.routes.common import Cursor, Limit, OnlyId, find_lens, found, paged, problems
+from app.routes.common import Answers, Cursor, Limit, OnlyId
 from app.runtime.settings import MIB, Settings
 from app.schemas import (
     V1,
@@ -59,10 +59,7 @@ _BODY: Final = {
 }
 _UPLOAD: Final = {"requestBody": {"required": True, "content": _BODY}}
 
-# Of uploads and the checks before them
-_RECEIVED: Final = problems(
-    400, 408, 413, 415, 507, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
-)
+_RECEIVED: Final[Answers] = {200: {"model": PhotoOut, "description": "The same bytes are known"}}
 
 
 @router.post("/photos", status_code=202, responses=_RECEIVED, openapi_extra=_UPLOAD)
@@ -84,7 +81,7 @@ async def create_photo(call: CallDep) -> PhotoOut:
 @router.post("/lenses/{lens_id}/measurements", status_code=202, responses=_RECEIVED, openapi_extra=_UPLOAD)
 async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
     """Store a photo made to measure a lens that is known, and measure it; `kind` says what it shows."""
-    await run_in_threadpool(find_lens, call, lens_id)
+    await run_in_threadpool(call.lens, lens_id)
     return await _received(call, lens_id)
 
 
@@ -120,7 +117,7 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
     try:
         _check_kind(call, fields, measured=measured)
         if fields.lens_id is not None:
-            find_lens(call, fields.lens_id)
+            call.lens(fields.lens_id)
         received = recorded(
             call,
             public_id,
@@ -152,7 +149,7 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
             "calibrate=false, and its id as reference_id with the open one"
         )
     if fields.reference_id is not None:
-        find_photo(call, fields.reference_id)
+        call.photo(fields.reference_id)
     if fields.selector is not None:
         if fields.kind is not None:
             raise InvalidParameterError("selector and kind exclude each other: leave one out")
@@ -219,11 +216,6 @@ def _folder(key: str) -> str:
     return f"{key.rpartition('/')[0]}/"
 
 
-def find_photo(call: Call, photo_id: str) -> PhotoRow:
-    """Return a photo of the owner."""
-    return found("photo", photo_id, call.store.photos.get(photo_id, call.owner))
-
-
 @router.get("/photos")
 def list_photos(
     call: CallDep,
@@ -234,19 +226,19 @@ def list_photos(
 ) -> Page[PhotoOut]:
     """List photos, newest first."""
     rows = call.store.photos.page(call.owner, before=cursor, limit=limit + 1, lens_id=lens_id, state=state)
-    return paged(call, rows, limit, views.photo_out)
+    return call.page(rows, limit, views.photo_out)
 
 
 @router.get("/photos/{photo_id}")
 def get_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
-    return views.photo_out(find_photo(call, photo_id))
+    return views.photo_out(call.photo(photo_id))
 
 
 @router.get("/photos/{photo_id}/patches")
 def list_patches(photo_id: str, call: CallDep) -> Page[PatchOut]:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
-    photo = find_photo(call, photo_id)
+    photo = call.photo(photo_id)
     return Page[PatchOut](items=[PatchOut.of(row) for row in call.store.photos.windows(photo.public_id)])
 
 
@@ -263,7 +255,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     A photo that waited for its lens, or was still being worked on, starts again with what is
     now known. A counted one changes its lens's model at once.
     """
-    photo = find_photo(call, photo_id)
+    photo = call.photo(photo_id)
     if not change.model_fields_set:
         raise InvalidParameterError(
             "nothing to change: send lens_id, new_lens, aperture, excluded or another field"
@@ -277,7 +269,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     done = call.store.photos.change(
         photo_id, call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
     )
-    photo = find_photo(call, photo_id)
+    photo = call.photo(photo_id)
     if not done:
         raise ConflictError(
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
@@ -291,7 +283,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     if sum(way is not None for way in ways) > 1:
         raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
-        return find_lens(call, change.lens_id).public_id
+        return call.lens(change.lens_id).public_id
     maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
     if change.new_lens is not None:
         return LensName(maker, model, None, label=change.new_lens.label)
@@ -315,10 +307,10 @@ def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
     if change.lens_id is not None and change.new_lens is not None:
         raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
-        find_lens(call, change.lens_id)
+        call.lens(change.lens_id)
     keys = list(dict.fromkeys(change.photo_ids))
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
     label = None if change.new_lens is None else change.new_lens.label
     call.store.photos.change_several(keys, call.owner, given, lens_id=change.lens_id, label=label)
-    items = [views.photo_out(find_photo(call, key)) for key in keys]
+    items = [views.photo_out(call.photo(key)) for key in keys]
     return Page[PhotoOut](items=items, next=None)

@@ -14,9 +14,9 @@ from fastapi import APIRouter, Query, Response
 from PIL import Image
 
 from app.errors import InvalidParameterError, ServiceError
-from app.http.dependencies import Call, CallDep, OneSession
+from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.model_cache import Fitted
-from app.routes.common import NOT_CHANGED, Answers, file_answer, found, matches_tag, problems
+from app.routes.common import NOT_CHANGED, Answers, file_answer
 from app.schemas import FieldQuery, KernelOut, PsfOut, PsfQuery, Setting, Support, Units
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.geometry import Frame
@@ -78,7 +78,7 @@ _QUERY: Final = {
 @router.get(
     "/lenses/{lens_id}/psf",
     response_class=Response,
-    responses=problems(406, also=_ANSWERS),
+    responses=_ANSWERS,
     openapi_extra=_QUERY,
 )
 def get_psf(lens_id: str, call: CallDep) -> Response:
@@ -165,7 +165,7 @@ def _fitted(lens_id: str, at: Setting, call: Call, form: str = "") -> tuple[Fitt
     tag = f'"{fitted.lens_id}-v{fitted.state.version}-e{fitted.state.rebuild_epoch}-{digest}"'
     fresh = "no-cache" if at.version is None else "max-age=3600"
     headers = {"ETag": tag, "Cache-Control": f"private, {fresh}", "Vary": "Accept"}
-    return (None if matches_tag(call, tag) else fitted), headers
+    return (None if call.knows(tag) else fitted), headers
 
 
 def _setting(at: Setting) -> LensSettings:

@@ -171,7 +171,7 @@ class UploadFields(Taken):
 class NewLens(Question):
     """A lens that only its owner can tell from others."""
 
-    label: Name
+    label: Name = Field(description="what its owner calls it")
 
 
 class PhotoChange(Taken):
@@ -184,14 +184,12 @@ class PhotoChange(Taken):
     )
 
 
-class PhotosChange(Question):
+class PhotosChange(Settings):
     """What to say of several photos at once: which lens it was, and at which settings."""
 
     photo_ids: list[Id] = Field(min_length=1, max_length=1000)
     lens_id: Id | None = None
     new_lens: NewLens | None = None
-    aperture: Aperture | None = None
-    focal_length_mm: FocalLength | None = None
 
 
 class PatchCounts(Model):
@@ -381,12 +379,6 @@ class LensChange(Question):
     label: Name | None = Field(None, description="what its owner calls it; null takes the name away")
     merge_into: Id | None = Field(None, description="the lens that this one is a part of")
     any_lens: bool = Field(default=False, description="merge lenses too that seem to be two")
-
-
-class LensIn(Question):
-    """A lens of which nothing is known yet but its name."""
-
-    label: Name = Field(description="what its owner calls it")
 
 
 class CalibrationOut(Model):

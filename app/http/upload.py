@@ -38,7 +38,7 @@ class Uploaded:
     """An upload that is complete and stored."""
 
     sha256: str
-    size: int
+    byte_size: int
     kind: str
     filename: str
     fields: UploadFields
@@ -55,8 +55,9 @@ def safe_name(name: str | None) -> str:
     return shown[:200] or "photo"
 
 
-async def receive(request: Request, storage: Storage, key: str) -> Uploaded:
+async def receive(request: Request, storage: Storage, key: str, lens_id: str | None) -> Uploaded:
     """Store the photo that a request brings under `key`; return it with what is said about it."""
+    own = {} if lens_id is None else {"lens_id": lens_id}
     query = {name: value for name, value in request.query_params.items() if name != "filename"}
     UploadFields.model_validate(query)  # before the body: a wrong query need not send it
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -64,17 +65,20 @@ async def receive(request: Request, storage: Storage, key: str) -> Uploaded:
         raise ServiceError(f"a form without a file: {REMEDY}", code="malformed_upload")
     if kind != "multipart/form-data":
         stored = await _stored(request.stream(), storage, key, photo.sniff)
-        name, fields = request.query_params.get("filename"), UploadFields.model_validate(query)
+        name, fields = request.query_params.get("filename"), UploadFields.model_validate(query | own)
     else:
         async with read_form(request) as (file, said):
-            fields, name = UploadFields.model_validate({**query, **said}), file.filename
+            fields, name = UploadFields.model_validate(query | said | own), file.filename
             stored = await _stored(_pieces(file), storage, key, photo.sniff)
     return Uploaded(*stored, safe_name(name), fields)
 
 
-async def receive_profile(request: Request, storage: Storage, key: str) -> tuple[str, int]:
-    """Store a lens profile under `key`; return its SHA-256 and size. A worker reads it."""
-    return (await _stored(request.stream(), storage, key, _sniff_profile))[:2]
+async def receive_profile(request: Request, storage: Storage, key: str, lens_id: str) -> Uploaded:
+    """Store a profile for a lens under `key`, which a worker reads; another lens may be sent the same."""
+    digest, size, kind = await _stored(request.stream(), storage, key, _sniff_profile)
+    name = f"{lens_id}.lensprofile"
+    same = hashlib.sha256(f"{name}|{digest}".encode()).hexdigest()
+    return Uploaded(same, size, kind, name, UploadFields(lens_id=lens_id))
 
 
 def _sniff_profile(head: bytes) -> str:

@@ -102,24 +102,21 @@ def correction_layer(
     return _picture(_stored(call, f"{row.run_folder}{LAYER_FILES[name]}"), "image/png")
 
 
+# Of each EXIF orientation: whether rows and columns change places, and which then count from the other end
+_TURNS: Final = {1: "", 2: "c", 3: "rc", 4: "r", 5: "t", 6: "tc", 7: "trc", 8: "tr"}
+
+
 def turned_box(
     top: int, left: int, bottom: int, right: int, height: int, width: int, orientation: int
 ) -> tuple[int, int, int, int]:
     """Turn a part of a picture of `height` x `width` by EXIF orientation: top, left, height, width."""
-    corners = [
-        {
-            1: (row, col),
-            2: (row, width - col),
-            3: (height - row, width - col),
-            4: (height - row, col),
-            5: (col, row),
-            6: (col, height - row),
-            7: (width - col, height - row),
-            8: (width - col, row),
-        }.get(orientation, (row, col))
-        for row, col in ((top, left), (bottom, right))
-    ]
-    (top, bottom), (left, right) = (sorted(places) for places in zip(*corners, strict=True))
+    turn = _TURNS.get(orientation, "")
+    if "t" in turn:
+        top, left, bottom, right, height, width = left, top, right, bottom, width, height
+    if "r" in turn:
+        top, bottom = height - bottom, height - top
+    if "c" in turn:
+        left, right = width - right, width - left
     return top, left, bottom - top, right - left
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import io
 import json
 import time
@@ -20,9 +19,9 @@ from app.http.dependencies import Call, CallDep, OneSession
 from app.routes import common, jobs
 from app.routes.common import Cursor, Limit, OnlyName
 from app.routes.photos import delete_photo, receiving, recorded
-from app.schemas import MAX_VERSION, V1, CalibrationOut, LateralOut, LensChange, LensIn, LensOut, Page
+from app.schemas import MAX_VERSION, V1, CalibrationOut, LateralOut, LensChange, LensOut, NewLens, Page
 from app.store.lenses import report_key
-from app.store.tables import PHOTO_FINAL, PROFILE_FILE, LensRow, PhotoRow
+from app.store.tables import PHOTO_FINAL, LensRow, PhotoRow
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import camera_name, full_name
@@ -72,7 +71,7 @@ def get_lens(lens_id: str, call: CallDep) -> LensOut:
 
 
 @router.post("/lenses", status_code=201)
-def create_lens(new: LensIn, call: CallDep) -> LensOut:
+def create_lens(new: NewLens, call: CallDep) -> LensOut:
     """Create a lens, to add a profile to; photos create theirs by themselves."""
     return get_lens(call.store.lenses.create(call.owner, new.label), call)
 
@@ -204,8 +203,10 @@ async def add_lens_profile(
     """
     await run_in_threadpool(call.lens, lens_id)
     async with receiving(call) as (public_id, key):
-        digest, size = await upload.receive_profile(call.request, call.storage, key)
-    file = await run_in_threadpool(_record, call, lens_id, any_lens, public_id, key, digest, size)
+        uploaded = await upload.receive_profile(call.request, call.storage, key, lens_id)
+    said = {"any_lens": True} if any_lens else {}
+    file: PhotoRow | None
+    file = (await run_in_threadpool(recorded, call, public_id, key, uploaded, **said)).photo
     end = time.monotonic() + jobs.LONG_POLL_S
     while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
         await asyncio.sleep(jobs.LOOK_S)
@@ -219,24 +220,6 @@ async def add_lens_profile(
         call.response.status_code = 202
         call.response.headers["Location"] = f"{V1}/jobs/{file.public_id}"
     return await run_in_threadpool(get_lens, lens_id, call)
-
-
-def _record(
-    call: Call, lens_id: str, any_lens: bool, public_id: str, key: str, digest: str, size: int
-) -> PhotoRow | None:
-    """Store the file of a profile like that of a photo; another lens may be sent the same."""
-    name = f"{lens_id}.lensprofile"
-    return recorded(
-        call,
-        public_id,
-        key,
-        sha256=hashlib.sha256(f"{name}|{digest}".encode()).hexdigest(),
-        filename=name,
-        kind=PROFILE_FILE,
-        byte_size=size,
-        calibrate=True,
-        given={"lens_id": lens_id} | ({"any_lens": True} if any_lens else {}),
-    ).photo
 
 
 # --- reports ------------------------------------------------------------------------------------------

@@ -104,10 +104,7 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
 async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
     """Receive a photo; with a lens, it must be a measurement of that lens."""
     async with receiving(call) as (public_id, key):
-        uploaded = await upload.receive(call.request, call.storage, key)
-    if lens_id is not None:
-        fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
-        uploaded = replace(uploaded, fields=fields)
+        uploaded = await upload.receive(call.request, call.storage, key, lens_id)
     return await run_in_threadpool(_take, call, public_id, uploaded, key, lens_id is not None)
 
 
@@ -118,17 +115,7 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
         _check_kind(call, fields, measured=measured)
         if fields.lens_id is not None:
             call.lens(fields.lens_id)
-        received = recorded(
-            call,
-            public_id,
-            key,
-            sha256=uploaded.sha256,
-            filename=uploaded.filename,
-            kind=uploaded.kind,
-            byte_size=uploaded.size,
-            calibrate=fields.calibrate,
-            given=fields.model_dump(exclude={"calibrate"}, exclude_none=True),
-        )
+        received = recorded(call, public_id, key, uploaded)
     except ServiceError:
         call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
         raise
@@ -196,10 +183,19 @@ def most(settings: Settings, usage: Usage) -> tuple[int, int]:
     )
 
 
-def recorded(call: Call, public_id: str, key: str, **fields: Any) -> Received:  # noqa: ANN401 - of `receive`
+def recorded(call: Call, public_id: str, key: str, file: upload.Uploaded, **more: object) -> Received:
     """Create the row of an upload, or find that of the same bytes; return it as it is then."""
     received = call.store.photos.receive(
-        call.owner, public_id=public_id, blob_key=key, may_be_new=call.who.key_id is None, **fields
+        call.owner,
+        public_id=public_id,
+        blob_key=key,
+        may_be_new=call.who.key_id is None,
+        sha256=file.sha256,
+        filename=file.filename,
+        kind=file.kind,
+        byte_size=file.byte_size,
+        calibrate=file.fields.calibrate,
+        given=file.fields.model_dump(exclude={"calibrate"}, exclude_none=True) | more,
     )
     if received.photo.public_id != public_id:
         if received.wants_file:  # its file was given up: this is the same one
@@ -300,17 +296,14 @@ def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
 
     Each photo changes as by itself; where one is gone nothing changes.
     """
-    if (change.lens_id is None) == (change.new_lens is None) and not change.model_fields_set & {
-        *GIVEN_SETTINGS
-    }:
+    if not change.model_fields_set - {"photo_ids"}:
         raise InvalidParameterError("send lens_id or new_lens, or the settings of these photos")
-    if change.lens_id is not None and change.new_lens is not None:
-        raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
+        if change.new_lens is not None:
+            raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
         call.lens(change.lens_id)
     keys = list(dict.fromkeys(change.photo_ids))
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
     label = None if change.new_lens is None else change.new_lens.label
     call.store.photos.change_several(keys, call.owner, given, lens_id=change.lens_id, label=label)
-    items = [views.photo_out(call.photo(key)) for key in keys]
-    return Page[PhotoOut](items=items, next=None)
+    return Page[PhotoOut](items=[views.photo_out(call.photo(key)) for key in keys])

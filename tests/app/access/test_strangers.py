@@ -268,16 +268,6 @@ def test_a_path_cannot_forge_a_line_of_the_log(client: TestClient, caplog: pytes
 # --- small things of HTTP ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("body", [{"aperture": True}, {"focal_length_mm": False}, {"focus_distance_m": True}])
-def test_true_is_no_number(client: TestClient, steps: Any, body: dict[str, bool]) -> None:
-    photo = steps.receive()
-
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json=body)
-
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
-    assert steps.fresh(photo).given == {}
-
-
 # --- pictures ---------------------------------------------------------------------------------
 
 

@@ -190,40 +190,6 @@ def test_a_lens_without_samples_cannot_correct(client: TestClient, steps: Steps)
     assert (answer.status_code, answer.json()["code"]) == (409, "no_samples")
 
 
-IMPOSSIBLE: list[tuple[dict[str, Any], int, str]] = [
-    ({"method": "magic"}, 422, "invalid_parameter"),
-    ({"method": ""}, 422, "invalid_parameter"),
-    ({"strength": 1.5}, 422, "invalid_parameter"),
-    ({"strength": "NaN"}, 422, "invalid_parameter"),
-    ({"halo": -0.1}, 422, "invalid_parameter"),
-    ({"halo": "NaN"}, 422, "invalid_parameter"),
-    ({"denoise": 1.5}, 422, "invalid_parameter"),
-    ({"output": {"format": "bmp"}}, 422, "invalid_parameter"),
-    ({"output": {"quality": 0}}, 422, "invalid_parameter"),
-    ({"output": {"color_space": "adobe"}}, 422, "invalid_parameter"),
-    ({"roi": {"x": 0, "y": 0, "width": 6001, "height": 10}}, 422, "invalid_parameter"),
-    ({"roi": {"x": -1, "y": 0, "width": 10, "height": 10}}, 422, "invalid_parameter"),
-    ({"roi": {"x": 0, "y": 0, "width": 0, "height": 10}}, 422, "invalid_parameter"),
-    ({"lens_id": "nothing"}, 404, "unknown_lens"),
-    ({"lens_version": 7}, 409, "conflict"),
-    ({"lens_version": 0}, 422, "invalid_parameter"),
-    ({"iterations": 5}, 422, "invalid_parameter"),
-    ({"photo_id": "nothing"}, 404, "unknown_photo"),
-    ({"photo_id": 7}, 422, "invalid_parameter"),
-    ({"photo_id": "../../x"}, 422, "invalid_parameter"),
-]
-
-
-def test_a_wish_that_cannot_be_is_refused(client: TestClient, steps: Steps) -> None:
-    photo = steps.counted().public_id
-    for wish, status, code in IMPOSSIBLE:
-        answer = post(client, **({"photo_id": photo} | wish))
-
-        assert (wish, answer.status_code, answer.json()["code"]) == (wish, status, code)
-        assert answer.json()["detail"], wish
-        assert wish.get("method") != "magic" or "standard" in answer.json()["detail"]  # one of those known
-
-
 def test_the_result_waits_for_the_work(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
     run = store.jobs.start(made["id"], 1)
@@ -278,14 +244,6 @@ def test_parts_of_the_result_join_to_the_whole(client: TestClient, finished: str
     assert (first.status_code, first.headers["content-range"]) == (206, f"bytes 0-99/{len(FILE)}")
     assert first.content + rest.content == FILE
     assert (changed.status_code, changed.content) == (200, FILE)
-
-
-def test_an_unchanged_result_is_not_sent_again(client: TestClient, finished: str) -> None:
-    path = f"/v1/corrections/{finished}/result"
-    tag = client.get(path).headers["etag"]
-
-    assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
-    assert client.get(path, headers={"If-None-Match": "*"}).status_code == 304
 
 
 def test_a_range_beyond_the_end_is_not_satisfiable(client: TestClient, finished: str) -> None:

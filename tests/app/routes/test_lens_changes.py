@@ -41,10 +41,6 @@ def test_several_photos_are_named_at_once(client: TestClient, steps: Steps, stor
     assert len({row.given["lens_id"] for row in rows}) == 1
     assert {row.given["aperture"] for row in rows} == {2.0}
     assert {row.state for row in rows} == {"received"}
-    both = {"photo_ids": keys, "new_lens": {"label": "Mine"}, "lens_id": "x"}
-    assert client.patch("/v1/photos", json=both).status_code == 422
-    assert client.patch("/v1/photos", json={"photo_ids": keys}).status_code == 422
-    assert client.patch("/v1/photos", json={"photo_ids": ["gone"], "lens_id": "x"}).status_code == 404
 
 
 def test_a_lens_is_renamed_and_named_after_its_model_again(client: TestClient, steps: Steps) -> None:
@@ -52,7 +48,6 @@ def test_a_lens_is_renamed_and_named_after_its_model_again(client: TestClient, s
 
     assert client.patch(f"/v1/lenses/{lens}", json={"label": "Old one"}).json()["label"] == "Old one"
     assert client.patch(f"/v1/lenses/{lens}", json={"label": None}).json()["label"] is None
-    assert client.patch(f"/v1/lenses/{lens}", json={}).status_code == 422
 
 
 def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -> None:
@@ -67,7 +62,6 @@ def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -
     assert (merged["id"], merged["photos"], merged["samples"]) == (second, 2, 12)
     assert client.get(f"/v1/lenses/{first}").status_code == 404
     assert steps.lens_id(one) == second
-    assert client.patch(f"/v1/lenses/{second}", json={"merge_into": second}).status_code == 422
     busy = steps.receive()
     steps.inspect(busy, serial="3")
     third = steps.lens_id(busy)
@@ -140,7 +134,6 @@ def test_a_lens_is_made_of_a_profile_alone(client: TestClient, steps: Steps) -> 
     taken = client.put(f"/v1/lenses/{made.json()['id']}/profile", content=sent)
     assert (taken.status_code, taken.json()["photos"]) == (200, 1)
     assert "Given away" in client.get("/").text
-    assert client.post("/v1/lenses", json={"label": ""}).status_code == 422
 
 
 def test_a_profile_is_not_read_beside_the_keys_of_the_database(
@@ -208,7 +201,6 @@ def test_a_report_that_is_not_made_yet_says_so(client: TestClient, steps: Steps)
     answer = client.get(f"/v1/lenses/{lens}/report.json")
 
     assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
-    assert client.get("/v1/lenses/gone/report.json").status_code == 404
 
 
 def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) -> None:

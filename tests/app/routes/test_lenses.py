@@ -140,10 +140,11 @@ def test_an_unchanged_psf_is_not_sent_again_and_a_changed_one_is(
     client: TestClient, steps: Steps, lens: str
 ) -> None:
     path = f"{lens}/psf?r=0.9&phi=0.59&aperture=1.4"
-    first = client.get(path)
-    tag = {"If-None-Match": first.headers["etag"]}
-    again = client.get(path, headers=tag)
-    assert (again.status_code, again.content) == (304, b"")
+    for asked in (f"{lens}/field.png?aperture=1.4&grid=4x3&size=15", path):
+        first = client.get(asked)
+        tag = {"If-None-Match": first.headers["etag"]}
+        again = client.get(asked, headers=tag)
+        assert (again.status_code, again.content) == (304, b"")
     assert client.get(f"{path}&channel=r", headers=tag).status_code == 200
 
     steps.counted(patches=6, width=4.0)
@@ -263,9 +264,6 @@ def test_the_field_map_has_a_kernel_for_each_cell(client: TestClient, lens: str)
     picture = np.asarray(Image.open(io.BytesIO(answer.content)))
     assert picture.shape == (3 * 17 + 2, 4 * 17 + 2)
     assert sum(bool(picture[2 + 17 * k : 17 + 17 * k].max() == 255) for k in range(3)) == 3
-    tag = answer.headers["etag"]
-    same = client.get(f"{lens}/field.png?aperture=1.4&grid=4x3&size=15", headers={"If-None-Match": tag})
-    assert same.status_code == 304
 
 
 def test_the_field_map_hatches_what_is_not_known(client: TestClient, lens: str) -> None:
@@ -275,13 +273,6 @@ def test_the_field_map_hatches_what_is_not_known(client: TestClient, lens: str) 
     assert set(cell.ravel()) == {40, 110}
     np.testing.assert_array_equal(cell, cell.T)  # strokes, not a kernel
     assert (cell[0, :2] == 110).all()
-
-
-@pytest.mark.parametrize("grid", ["0x3", "26x1", "axb", "9", "-1x2"])
-def test_a_bad_grid_is_refused(client: TestClient, lens: str, grid: str) -> None:
-    answer = client.get(f"{lens}/field.png?grid={grid}")
-
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
 
 
 def test_the_history_has_one_item_for_each_version(client: TestClient, steps: Steps, store: Store) -> None:

@@ -87,26 +87,6 @@ def test_formats_limits_and_version_are_told(client: TestClient, settings: Setti
     assert client.get("/v1/version").json()["api"] == "v1"
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "status", "code"),
-    [
-        ("GET", "/nothing", 404, "not_found"),
-        ("GET", "/v1/nothing", 404, "not_found"),
-        ("PUT", "/v1/photos", 405, "method_not_allowed"),
-        ("PUT", "/v1/lenses", 405, "method_not_allowed"),
-        ("GET", "/v1/lenses/x/psf.exe?r=0", 422, "invalid_parameter"),
-    ],
-)
-def test_the_framework_speaks_problem_json_too(
-    client: TestClient, method: str, path: str, status: int, code: str
-) -> None:
-    answer = client.request(method, path)
-
-    assert (answer.status_code, answer.json()["code"]) == (status, code)
-    assert answer.headers["content-type"] == "application/problem+json"
-    assert {"type", "title", "status", "detail", "code", "errors", "request_id"} <= set(answer.json())
-
-
 def test_our_own_fault_is_a_problem_without_its_cause(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -277,29 +257,6 @@ HOSTILE = [
     "{}",
     "true",
 ]
-
-
-@pytest.mark.parametrize(
-    ("method", "path", "body"),
-    [
-        ("GET", f"/v1/lenses/LENS/psf?r=0&version={10**20}", None),
-        ("GET", f"/v1/lenses/LENS/calibrations?cursor={10**20}", None),
-        ("POST", "/v1/corrections", b'{"photo_id": "PHOTO", "lens_version": 100000000000000000000}'),
-        ("POST", "/v1/corrections", b'{"photo_id": "\\ud800", "\\ud800": 1}'),
-    ],
-)
-def test_what_no_column_and_no_text_can_hold_is_refused(
-    client: TestClient, steps: Any, method: str, path: str, body: bytes | None
-) -> None:
-    photo = steps.counted()
-    lens = steps.lens_id(photo)
-    content = None if body is None else body.replace(b"PHOTO", photo.public_id.encode())
-
-    answer = client.request(
-        method, path.replace("LENS", lens), content=content, headers={"Content-Type": "application/json"}
-    )
-
-    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
 
 
 def test_no_question_that_the_description_allows_for_brings_the_service_down(

@@ -1,0 +1,194 @@
+"""What holds for all resources: pages, tags, ids of nothing, what is deleted, and what makes no sense."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from app.blobs.storage import Storage
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.jobs import Result
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+
+
+@dataclass(frozen=True)
+class Things:
+    """One of each: a counted photo, its lens, a finished correction."""
+
+    photo: str
+    lens: str
+    correction: str
+
+    def filled(self, text: str) -> str:
+        """Return a text with the ids in place of their names."""
+        return (
+            text.replace("PHOTO", self.photo)
+            .replace("LENS", self.lens)
+            .replace("CORRECTION", self.correction)
+        )
+
+
+@pytest.fixture
+def things(steps: Steps, store: Store, settings: Settings) -> Things:
+    photo = steps.counted()
+    row = steps.correct(photo, method="fast", strength=1.0, output={"format": "png8"}, roi=None)
+    Storage(settings.storage).put("corrections/x/result", b"the file")
+    run = store.jobs.start(row.public_id, row.epoch)
+    assert run is not None
+    assert store.jobs.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
+    return Things(photo.public_id, steps.lens_id(photo), row.public_id)
+
+
+# --- lists ------------------------------------------------------------------------------------------
+
+
+def corrections(steps: Steps, number: int) -> list[str]:
+    photo = steps.counted()
+    asked = {"method": "fast", "output": {"format": "png8"}, "roi": None}
+    return [steps.correct(photo, strength=k / 10, **asked).public_id for k in range(number)]
+
+
+MAKERS: dict[str, Callable[[Steps, int], list[str]]] = {
+    "/v1/photos": lambda steps, number: [steps.receive().public_id for _ in range(number)],
+    "/v1/jobs": lambda steps, number: [steps.receive().public_id for _ in range(number)],
+    "/v1/lenses": lambda steps, number: [
+        steps.lens_id(steps.counted(serial=str(k), patches=1)) for k in range(number)
+    ],
+    "/v1/corrections": corrections,
+}
+
+
+@pytest.mark.parametrize("path", MAKERS)
+def test_pages_join_without_gap_or_overlap(client: TestClient, steps: Steps, path: str) -> None:
+    made, seen = MAKERS[path](steps, 5), list[str]()
+    link: str | None = f"{path}?limit=2"
+    while link is not None:
+        answer = client.get(link)
+        seen += [item["id"] for item in answer.json()["items"]]
+        link = answer.json()["next"]
+        assert answer.headers.get("link") == (None if link is None else f'<{link}>; rel="next"')
+
+    assert seen == made[::-1]
+
+
+@pytest.mark.parametrize("path", MAKERS)
+def test_a_bad_page_is_refused(client: TestClient, path: str) -> None:
+    for query in ("limit=0", "limit=201", "limit=x", f"cursor={'x' * 50}"):
+        answer = client.get(f"{path}?{query}")
+
+        assert (query, answer.status_code, answer.json()["code"]) == (query, 422, "invalid_parameter")
+
+
+# --- one thing --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/v1/jobs/PHOTO", "/v1/jobs/CORRECTION", "/v1/corrections/CORRECTION/result", "/ui/parts?page=home"],
+)
+def test_what_has_not_changed_is_not_sent_again(client: TestClient, things: Things, path: str) -> None:
+    first = client.get(things.filled(path))
+
+    for known, status in ((first.headers["etag"], 304), ('"other"', 200)):
+        again = client.get(things.filled(path), headers={"If-None-Match": known})
+        assert (known, again.status_code, bool(again.content)) == (known, status, status == 200)
+
+
+@pytest.mark.parametrize("kind", ["photos", "jobs", "lenses", "corrections"])
+def test_an_unknown_id_is_a_plain_404(client: TestClient, kind: str) -> None:
+    codes = {f"unknown_{kind.removesuffix('es').removesuffix('s')}", "unknown_lens", "not_found"}
+    for bad in ("nothing", "..", "%2e%2e%2fetc", "a' OR 1=1 --", "💥", "x" * 3000, "%00"):
+        answer = client.get(f"/v1/{kind}/{bad}")
+
+        assert (bad, answer.status_code) == (bad, 404)
+        assert answer.json()["code"] in codes, bad
+
+
+# --- what makes no sense ----------------------------------------------------------------------------
+
+INVALID = "invalid_parameter"
+NEW = {"label": "mine"}
+# A bad change of a photo is refused with 422, a bad wish for a correction too
+CHANGES: list[object] = [
+    *({}, [], {"colour": "red"}, {"lens_id": "a", "lens_serial": "b"}, {"lens_model": "EF"}),
+    *({"aperture": bad} for bad in (0.1, "wide", True)),
+    *({"focal_length_mm": False}, {"focus_distance_m": True}),
+    *({"new_lens": {"label": ""}}, {"lens_serial": "\x07"}),
+]
+WISHES: list[dict[str, Any]] = [
+    *({"method": "magic"}, {"method": ""}, {"strength": 1.5}, {"strength": "NaN"}, {"iterations": 5}),
+    *({"halo": -0.1}, {"halo": "NaN"}, {"denoise": 1.5}, {"lens_version": 0}, {"lens_version": 10**20}),
+    *({"output": bad} for bad in ({"format": "bmp"}, {"quality": 0}, {"color_space": "adobe"})),
+    {"roi": {"x": 0, "y": 0, "width": 6001, "height": 10}},
+    {"roi": {"x": -1, "y": 0, "width": 10, "height": 10}},
+    {"roi": {"x": 0, "y": 0, "width": 0, "height": 10}},
+    *({"photo_id": 7}, {"photo_id": "../../x"}),
+]
+REFUSED: list[tuple[str, str, Any, int, str]] = [
+    *(("PATCH", "/v1/photos/PHOTO", change, 422, INVALID) for change in CHANGES),
+    ("PATCH", "/v1/photos/PHOTO", {"lens_id": "nothing"}, 404, "unknown_lens"),
+    *(("POST", "/v1/corrections", {"photo_id": "PHOTO"} | wish, 422, INVALID) for wish in WISHES),
+    ("POST", "/v1/corrections", {"photo_id": "nothing"}, 404, "unknown_photo"),
+    ("POST", "/v1/corrections", {"photo_id": "PHOTO", "lens_id": "nothing"}, 404, "unknown_lens"),
+    ("POST", "/v1/corrections", {"photo_id": "PHOTO", "lens_version": 7}, 409, "conflict"),
+    ("PATCH", "/v1/photos", {"photo_ids": ["PHOTO"]}, 422, INVALID),
+    (
+        "PATCH",
+        "/v1/photos",
+        {"photo_ids": ["PHOTO"], "lens_id": "x", "new_lens": {"label": "y"}},
+        422,
+        INVALID,
+    ),
+    ("PATCH", "/v1/photos", {"photo_ids": ["gone"], "lens_id": "LENS"}, 404, "unknown_photo"),
+    ("PATCH", "/v1/photos", {"photo_ids": ["PHOTO"], "lens_id": "gone"}, 404, "unknown_lens"),
+    ("PATCH", "/v1/lenses/LENS", {}, 422, INVALID),
+    ("PATCH", "/v1/lenses/LENS", {"merge_into": "LENS"}, 422, INVALID),
+    ("POST", "/v1/lenses", {"label": ""}, 422, INVALID),
+    *(
+        ("GET", f"/v1/lenses/LENS/field.png?grid={grid}", None, 422, INVALID)
+        for grid in ("0x3", "26x1", "axb", "9", "-1x2")
+    ),
+    *(("GET", f"/v1/jobs/PHOTO?wait={wait}", None, 422, INVALID) for wait in ("-1", "21", "nan", "soon")),
+    ("GET", f"/v1/lenses/LENS/psf?r=0&version={10**20}", None, 422, INVALID),
+    ("GET", f"/v1/lenses/LENS/calibrations?cursor={10**20}", None, 422, INVALID),
+    ("GET", "/v1/lenses/LENS/psf.exe?r=0", None, 422, INVALID),
+    ("GET", "/v1/lenses/gone/report.json", None, 404, "unknown_lens"),
+    ("GET", "/v1/photos?state=lost", None, 422, INVALID),
+    ("GET", "/nothing", None, 404, "not_found"),
+    ("GET", "/v1/nothing", None, 404, "not_found"),
+    ("PUT", "/v1/photos", None, 405, "method_not_allowed"),
+    ("PUT", "/v1/lenses", None, 405, "method_not_allowed"),
+]
+
+
+def test_what_makes_no_sense_is_refused_with_a_problem(client: TestClient, things: Things) -> None:
+    for method, path, body, status, code in REFUSED:
+        content = None if body is None else things.filled(json.dumps(body))
+        headers = {"Content-Type": "application/json"}
+        answer = client.request(method, things.filled(path), content=content, headers=headers)
+
+        case, problem = (method, path, body), answer.json()
+        assert (case, answer.status_code, problem["code"]) == (case, status, code)
+        assert answer.headers["content-type"] == "application/problem+json", case
+        assert {"type", "title", "status", "detail", "errors", "request_id"} <= set(problem), case
+        assert problem["detail"], case
+        assert body != {"photo_id": "PHOTO", "method": "magic"} or "standard" in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    "body", [b"{", b"", b"\xff\xfe", b'{"aperture": NaN}', b"[" * 5000, b'{"\\ud800": "\\ud800"}']
+)
+def test_bad_json_is_a_problem_and_not_a_crash(client: TestClient, things: Things, body: bytes) -> None:
+    for method, path in (("PATCH", "/v1/photos/PHOTO"), ("POST", "/v1/corrections")):
+        headers = {"Content-Type": "application/json"}
+        answer = client.request(method, things.filled(path), content=body, headers=headers)
+
+        assert answer.status_code in {400, 422}
+        assert answer.headers["content-type"] == "application/problem+json"

@@ -52,9 +52,7 @@ Aperture = Annotated[float, Field(ge=0.5, le=128, description="f-number")]
 FocalLength = Annotated[float, Field(ge=0.1, le=20000, description="mm")]
 FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, description="m")]
 PixelPitch = Annotated[float, Field(gt=0.1, le=1000, description="micrometres")]
-KernelSize = Annotated[
-    int, Field(ge=3, le=MAX_PSF_SIZE, description="odd side in pixels"), AfterValidator(_odd)
-]
+KernelSize = Annotated[int, Field(ge=3, le=MAX_PSF_SIZE, description="odd side"), AfterValidator(_odd)]
 
 
 # Where the row of a table has what we send: under its own name unless an alias says otherwise
@@ -148,19 +146,14 @@ class Taken(Settings):
 
 
 class UploadFields(Taken):
-    """What an owner may say about a photo.
-
-    The lens that it names goes before that of the file; a setting counts where the file says none.
-    """
+    """What an owner may say of a photo: its lens goes before that of the file, settings after them."""
 
     calibrate: bool = Field(default=True, description="false only stores the photo to correct it")
     kind: MeasurementKind | None = Field(
-        default=None, description="what a photo made to measure the lens shows; nothing for ordinary photos"
+        None, description="what it shows, if it was made to measure the lens"
     )
-    reference_id: Id | None = Field(default=None, description="of a pair: the photo closed to about f/8")
-    selector: Name | None = Field(
-        default=None, description="who chooses its patches, one of GET /v1/formats; r-map by default"
-    )
+    reference_id: Id | None = Field(None, description="of a pair: the photo closed to about f/8")
+    selector: Name | None = Field(None, description="who chooses its patches: one of GET /v1/formats")
 
     @field_validator("*", mode="before")
     @classmethod
@@ -179,9 +172,7 @@ class PhotoChange(Taken):
 
     new_lens: NewLens | None = None
     excluded: bool | None = None
-    calibrate: bool | None = Field(
-        None, description="true: learn the lens from a photo that was stored without"
-    )
+    calibrate: bool | None = Field(None, description="true: learn the lens from a photo that was only stored")
 
 
 class PhotosChange(Settings):
@@ -275,19 +266,12 @@ class CorrectionIn(Question):
     any_lens: bool = Field(default=False, description="also where the photo seems to be of another lens")
     method: str = Field("standard", min_length=1, max_length=60)
     strength: float = Field(1.0, ge=0, le=1)
-    halo: float | None = Field(
-        None,
-        ge=0,
-        description="how far beside edges to leave the range of light around; default: by the model's error",
-    )
+    halo: float | None = Field(None, ge=0, description="how far edges may overshoot; default: by the lens")
     texture: float = Field(1.0, ge=0, le=1, description="how much of its faint texture the photo keeps")
     denoise: float = Field(0.0, ge=0, le=1, description="how much of the photo's grain to take away")
     output: OutputOptions = OutputOptions()
     roi: Region | None = None
-    layers: bool = Field(
-        default=False,
-        description="with roi: keep it without faint texture and without grain as well, for a preview to mix",
-    )
+    layers: bool = Field(default=False, description="of a roi: without texture and grain too, for a preview")
 
 
 class CorrectionOut(Model):
@@ -382,7 +366,7 @@ class LensChange(Question):
 
 
 class CalibrationOut(Model):
-    """One version of a lens: what changed, and how good the model was then."""
+    """One version of a lens: what changed, and the held-out error of its model once that is measured."""
 
     version: int
     kind: str
@@ -390,11 +374,7 @@ class CalibrationOut(Model):
     samples_added: int
     samples: int
     photos: int
-    error: dict[str, Any] | float | None = Field(
-        None,
-        validation_alias=AliasPath("metrics", "error"),
-        description="held-out error, once it is measured",
-    )
+    error: dict[str, Any] | None = Field(None, validation_alias=AliasPath("metrics", "error"))
     coverage: dict[str, Any] | None = Field(None, validation_alias=AliasPath("metrics", "coverage"))
     created_at: datetime
 
@@ -429,9 +409,7 @@ class PsfQuery(Setting):
 
     r: float = Field(ge=0, le=1, description="half diagonals: 0 centre, 1 corner")
     phi: float = Field(0.0, ge=-100, le=100, description="radians, counter-clockwise from the right")
-    pixel_pitch_um: float | None = Field(
-        None, gt=0.1, le=100, description="pixel of the answer; that of most photos by default"
-    )
+    pixel_pitch_um: float | None = Field(None, gt=0.1, le=100, description="default: that of most photos")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
 
 
@@ -449,20 +427,11 @@ class Support(Model):
     effective_samples: float
     photos: int
     extrapolated: bool
-    beyond: list[str] = Field(
-        default_factory=list, description="in which variables it lies outside the samples"
-    )
+    beyond: list[str] = Field([], description="in which variables it lies outside the samples")
     predicted_error: float | None
-    answered_by: str = Field(
-        description="what made the answer: network, regression, or network and regression; the numbers here "
-        "are of that"
-    )
-    weights: str = Field(default="", description="fingerprint of the network's weights")
-    nearest: float = Field(
-        default=0.0,
-        description="distance to the nearest sample: 1 is a fifth of the half diagonal, a stop, or half an "
-        "octave of focal length",
-    )
+    answered_by: str = Field(description="network, regression, or network and regression")
+    weights: str = Field("", description="fingerprint of the network's weights")
+    nearest: float = Field(0.0, description="distance to the nearest sample: 1 is a stop, or a fifth of r")
 
 
 class Units(Model):
@@ -497,9 +466,7 @@ class Readiness(Model):
 
     status: Literal["ready", "not ready"]
     checks: dict[str, str]
-    sandbox: dict[str, bool] = Field(
-        description="Which measures of the kernel confine what decodes photos, in all workers."
-    )
+    sandbox: dict[str, bool] = Field(description="which measures confine what decodes photos")
 
 
 class VersionOut(Model):

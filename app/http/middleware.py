@@ -144,7 +144,7 @@ class Guard:
 
     def _check_host(self, headers: Headers) -> None:
         host = headers.get("host", "")
-        name = _host_name(host)
+        name = host_name(host)
         # addresses and local names, which no stranger can own
         local = (
             "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()
@@ -161,7 +161,7 @@ class Guard:
         origin = headers.get("origin")
         place = "" if origin is None else origin.partition("://")[2].lower()
         ours = origin is None or (place and place == headers.get("host", "").lower())
-        allowed = ours or _host_name(place) in self._allowed
+        allowed = ours or host_name(place) in self._allowed
         if not allowed or headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
             raise BodyError(
                 403,
@@ -200,7 +200,7 @@ def declared_length(headers: Headers) -> int | None:
     return int(declared) if declared.isdecimal() and len(declared) <= 18 else None
 
 
-def _host_name(host: str) -> str:
+def host_name(host: str) -> str:
     """Return the name in a Host header, without its port."""
     try:
         return (urlsplit(f"//{host}").hostname or "").lower()

@@ -78,7 +78,7 @@ async def receive_profile(request: Request, storage: Storage, key: str, lens_id:
     digest, size, kind = await _stored(request.stream(), storage, key, _sniff_profile)
     name = f"{lens_id}.lensprofile"
     same = hashlib.sha256(f"{name}|{digest}".encode()).hexdigest()
-    return Uploaded(same, size, kind, name, UploadFields(lens_id=lens_id))
+    return Uploaded(same, size, kind, name, UploadFields.model_validate({"lens_id": lens_id}))
 
 
 def _sniff_profile(head: bytes) -> str:

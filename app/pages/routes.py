@@ -377,7 +377,7 @@ def _error_history(history: Sequence[CalibrationOut]) -> Chart | None:
     """Draw the errors of versions that were measured; None where one point would be no curve."""
     from lensmodel.report.plots import error_history  # noqa: PLC0415 - as above
 
-    measured = [(event.version, event.error) for event in history if isinstance(event.error, Mapping)]
+    measured = [(event.version, event.error) for event in history if event.error]
     if len(measured) < 2:
         return None
     errors = {zone: [error.get(zone) for _, error in measured] for zone in ZONES}

@@ -29,7 +29,7 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
 CORRECTION_STATES: Final[Mapping[str, str]] = {
     "queued": "In the queue",
     "running": "Removing the blur",
-    "succeeded": "Done",
+    "succeeded": "Done, with version {version} of the lens",
     "failed": "This did not work",
     "cancelled": "Cancelled",
 }
@@ -122,10 +122,7 @@ def duration(seconds: float) -> str:
 
 def correction_state(correction: CorrectionOut) -> str:
     """Say where a correction stands."""
-    version = (
-        f", with version {correction.lens_version} of the lens" if correction.state == "succeeded" else ""
-    )
-    return CORRECTION_STATES[correction.state] + version
+    return CORRECTION_STATES[correction.state].format(version=correction.lens_version)
 
 
 def file_name(correction: CorrectionOut) -> str:
@@ -151,11 +148,9 @@ def reason_words(reason: str | None) -> str:
     return REASONS.get(reason or "", reason or "no reason noted")
 
 
-def error_words(error: Mapping[str, float | None] | float | None) -> str:
+def error_words(error: Mapping[str, float | None] | None) -> str:
     """Write a held-out error in percent, one figure a zone."""
-    if isinstance(error, Mapping) and error:
-        return ", ".join(percent(error.get(zone)) for zone in ZONES)
-    return percent(error) if isinstance(error, float) else "not yet known"
+    return ", ".join(percent(error.get(zone)) for zone in ZONES) if error else "not yet known"
 
 
 def percent(share: float | None) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Final
-from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
@@ -14,6 +12,7 @@ from starlette.responses import StreamingResponse
 from app.access import COOKIE, SESSION
 from app.blobs.account_data import erase, exported
 from app.http.dependencies import CallDep, OneSession, ProbeDep
+from app.http.middleware import host_name
 from app.routes.common import file_answer, file_headers
 from app.routes.photos import most
 from app.runtime.settings import LOOPBACK
@@ -22,7 +21,6 @@ from app.schemas import AccountOut, SessionOut, SignIn
 router = APIRouter(tags=["account"], route_class=OneSession)
 # Open to strangers, of whom one may be about to sign in
 sign_ins = APIRouter(tags=["account"], route_class=OneSession)
-HTTPS: Final = "https"
 
 
 @router.get("/account")
@@ -64,8 +62,7 @@ def erase_account(call: CallDep) -> None:
 @sign_ins.post("/session", status_code=201)
 async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
-    gate = call.gate
-    who, token = await run_in_threadpool(gate.sign_in, credentials.key.strip())
+    who, token = await run_in_threadpool(call.gate.sign_in, credentials.key.strip())
     call.response.set_cookie(
         COOKIE,
         token,
@@ -88,15 +85,10 @@ async def get_session(call: CallDep) -> SessionOut:
 async def sign_out(call: ProbeDep) -> None:
     """Sign the browser out."""
     await run_in_threadpool(call.gate.sign_out, call.request)
-    call.response.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=must_be_secure(call.request))
+    call.response.delete_cookie(COOKIE)
 
 
 def must_be_secure(request: Request) -> bool:
     """Say whether the cookie may travel by HTTPS only: everywhere but between programs of one machine."""
-    if HTTPS in {request.url.scheme, request.headers.get("x-forwarded-proto", "").lower()}:
-        return True
-    try:
-        name = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
-    except ValueError:
-        return True
-    return name not in LOOPBACK
+    encrypted = "https" in {request.url.scheme, request.headers.get("x-forwarded-proto", "").lower()}
+    return encrypted or host_name(request.headers.get("host", "")) not in LOOPBACK

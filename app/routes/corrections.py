@@ -173,18 +173,13 @@ def get_correction_result(correction_id: str, call: CallDep) -> Response:
 
 def byte_range(header: str | None, size: int) -> tuple[int, int]:
     """Return the part of a file that a Range header asks for, its end excluded."""
-    # Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows
     match = _RANGE.fullmatch(header.strip()) if header else None
-    if match is None or match.group(0) == "bytes=-":
-        return 0, size
-    first, last = match.groups()
-    if not first:
-        start, end = max(size - int(last), 0), size
-    else:
-        start, end = int(first), min(int(last) + 1, size) if last else size
-    if last and first and int(last) < int(first):
-        return 0, size
-    if start >= size or start >= end:
+    first, last = match.groups() if match else ("", "")
+    if not (first or last) or (first and last and int(last) < int(first)):
+        return 0, size  # anything but one plain range asks for all of it, as RFC 9110 (14.2) allows
+    start = int(first) if first else max(size - int(last), 0)
+    end = min(int(last) + 1, size) if first and last else size
+    if start >= end:
         raise InvalidParameterError(
             f"range {header!r} lies beyond the {size} bytes of the file",
             headers={"Content-Range": f"bytes */{size}"},

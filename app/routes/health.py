@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Final, get_args
 
@@ -16,15 +16,7 @@ from app.routes.photos import GIB, MAX_UNFINISHED
 from app.routes.psf import MEDIA_TYPES
 from app.runtime import metrics
 from app.sandbox import confine
-from app.schemas import (
-    MAX_PSF_SIZE,
-    ColorSpace,
-    FormatsOut,
-    LimitsOut,
-    OutputFormat,
-    Readiness,
-    VersionOut,
-)
+from app.schemas import MAX_PSF_SIZE, ColorSpace, FormatsOut, LimitsOut, OutputFormat, Readiness, VersionOut
 from app.store import migrate
 from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
@@ -53,22 +45,14 @@ def get_readiness(call: ProbeDep) -> Readiness:
 
 
 def _readiness(call: Call) -> Readiness:
+    """Try all at once, in daemon threads: one that hangs must delay neither the response nor the exit."""
     confined: dict[str, bool] = {}
     tried: dict[str, Callable[[], None]] = {
         "schema": lambda: _schema(call),
         "storage": call.storage.check_usable,
         "worker": lambda: confined.update(_worker(call)),
     }
-    checks = _outcomes(tried)
-    if call.settings.needs_keys:  # strangers learn what is wrong, but no addresses
-        checks = {name: outcome.partition(":")[0] for name, outcome in checks.items()}
-    ready = all(outcome == "ok" for outcome in checks.values())
-    return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confined)
-
-
-def _outcomes(probes: Mapping[str, Callable[[], None]]) -> dict[str, str]:
-    """Try all at once, in daemon threads: one that hangs must delay neither the response nor the exit."""
-    outcomes = dict.fromkeys(probes, f"TimeoutError: no answer within {READY_S:g} s")
+    outcomes = dict.fromkeys(tried, f"TimeoutError: no answer within {READY_S:g} s")
 
     def run(name: str, probe: Callable[[], None]) -> None:
         try:
@@ -78,13 +62,17 @@ def _outcomes(probes: Mapping[str, Callable[[], None]]) -> dict[str, str]:
         else:
             outcomes[name] = "ok"
 
-    threads = [threading.Thread(target=run, args=each, daemon=True) for each in probes.items()]
+    threads = [threading.Thread(target=run, args=each, daemon=True) for each in tried.items()]
     end = time.monotonic() + READY_S
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(max(end - time.monotonic(), 0.0))
-    return dict(outcomes)
+    checks = dict(outcomes)  # as it is now
+    if call.settings.needs_keys:  # strangers learn what is wrong, but no addresses
+        checks = {name: outcome.partition(":")[0] for name, outcome in checks.items()}
+    ready = all(outcome == "ok" for outcome in checks.values())
+    return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confined)
 
 
 def _schema(call: Call) -> None:

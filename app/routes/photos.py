@@ -18,16 +18,7 @@ from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.middleware import CLOSE
 from app.routes.common import Answers, Cursor, Limit, OnlyId
 from app.runtime.settings import MIB, Settings
-from app.schemas import (
-    V1,
-    Page,
-    PatchOut,
-    PhotoChange,
-    PhotoOut,
-    PhotosChange,
-    PhotoState,
-    UploadFields,
-)
+from app.schemas import V1, Page, PatchOut, PhotoChange, PhotoOut, PhotosChange, PhotoState, UploadFields
 from app.store import LensName
 from app.store.accounts import Usage
 from app.store.database import new_id

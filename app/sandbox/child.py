@@ -9,21 +9,21 @@ import contextlib
 import errno
 import importlib
 import json
+import multiprocessing
 import os
 import resource
+import struct
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from app.sandbox import confine
 from app.sandbox.account import SystemAccount
-from app.sandbox.outcome import RESULT, TaskLimits
+from app.sandbox.outcome import MAX_TEXT, NO_ROOM, REPORT, TaskLimits
 from lensmodel.core import files
 from lensmodel.core.errors import LensModelError
 
@@ -31,26 +31,20 @@ ProgressHook: TypeAlias = Callable[[int, int], None]
 # Called as `task(arguments, folder, progress)`; returns what JSON can write
 Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
 PRINTED: Final = "printed"  # file of what a task printed
-# Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes
-MAX_TEXT: Final = 4000
+PROGRESS: Final = "progress"  # file of how far it came: `STEPS`, done and all
+STEPS: Final = struct.Struct("=ii")
+_MAX_OPEN: Final = 1 << 16  # more files than the fork server has open
 _MIB: Final = 1024 * 1024  # bytes
 # Default niceness of tasks above that of the worker (chosen): a tenth of the weight of one at 0, see sched(7)
 NICENESS: Final = 10
-# Seconds between two messages of progress (chosen): a bar that moves, and hardly any work for the parent
-_PROGRESS_S: Final = 0.1
 _KEPT_ENVIRONMENT: Final = (
-    *("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "SYSTEMROOT"),
+    *("LANG", "LC_ALL", "NUMBA_CACHE_DIR"),
     "TMPDIR",  # where the fork server listens; a task has a folder of its own instead
     *("PYTHONPATH", "PYTHONHASHSEED", "PYTHONDONTWRITEBYTECODE", "PYTHONWARNINGS"),
 )
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-# How an OSError ends a task; any other is a bug
-_ENDINGS: Final[Mapping[int | None, str]] = {
-    errno.ENOSPC: "no_room",
-    errno.EDQUOT: "no_room",
-    errno.EFBIG: "memory_limit",
-    errno.ENOMEM: "memory_limit",
-}
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_TOO_LARGE: Final = (errno.EFBIG, errno.ENOMEM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,45 +57,58 @@ class Order:
     folder: Path
     limits: TaskLimits
     niceness: int
-    reads: tuple[Path, ...] | None  # None: it may also read all else, use the network and start programs
+    reads: tuple[Path, ...]
     account: SystemAccount | None
 
 
-def main(order: Order, line: Connection) -> None:
+def main(order: Order) -> None:
     """Run one order."""
+    _close_others()
     _print_to(order.folder / PRINTED)
-    tasks = importlib.import_module(order.module)  # our own code, not readable after this
+    tasks: Mapping[str, Task] = importlib.import_module(order.module).TASKS  # not readable after this
     _save_nothing_compiled()
     vars(files)["replacing"] = _in_place
+    steps = os.open(order.folder / PROGRESS, os.O_WRONLY)
     _contain(order)
-    if order.reads is not None:
-        if order.account is not None:
-            os.umask(0o007)  # the worker reads its files as a member of its group
-        confine.confine(order.folder, order.reads, order.account)
+    if order.account is not None:
+        os.umask(0o007)  # the worker reads its files as a member of its group
+    confine.confine(order.folder, order.reads, order.account)
     # no thread before this line: it would keep the permissions that the others gave up
-    threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
-    last = 0.0
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def progress(done: int, total: int) -> None:
-        nonlocal last
-        if done >= total or time.monotonic() - last > _PROGRESS_S:
-            last = time.monotonic()
-            _tell(line, done=int(done), total=int(total))
+        os.pwrite(steps, STEPS.pack(done, total), 0)
 
-    function: Task = tasks.TASKS[order.task]
     try:
-        result = json.dumps(function(json.loads(order.arguments), order.folder, progress), allow_nan=False)
-        (order.folder / RESULT).write_text(result, encoding="utf-8")
-        _tell(line, end="ok")
+        value = tasks[order.task](json.loads(order.arguments), order.folder, progress)
+        _report(order.folder, end="ok", value=value)
     except LensModelError as error:
-        _tell(line, end="error", code=error.code, text=str(error))
+        _report(order.folder, end="error", code=error.code, text=str(error)[-MAX_TEXT:])
     except Exception as error:  # noqa: BLE001 - the parent must learn of any failure
         number = errno.ENOMEM if isinstance(error, MemoryError) else getattr(error, "errno", None)
-        end = _ENDINGS.get(number, "bug")
-        _tell(line, end=end, code=type(error).__name__, text=traceback.format_exc())
-    finally:
-        with contextlib.suppress(OSError):  # what it printed is not worth an outcome
-            sys.stdout.flush()
+        if number in _FULL:
+            sys.exit(NO_ROOM)
+        if number not in _TOO_LARGE:
+            traceback.print_exc()
+        end = "memory_limit" if number in _TOO_LARGE else "bug"
+        _report(order.folder, end=end, code=type(error).__name__)
+
+
+def _report(folder: Path, **report: object) -> None:
+    """Report how a task ended; by the exit status where even that does not fit."""
+    text = json.dumps(report, allow_nan=False)
+    try:
+        (folder / REPORT).write_text(text, encoding="utf-8")
+    except OSError:
+        sys.exit(NO_ROOM)
+
+
+def _close_others() -> None:
+    """Close what it has from the fork server but the pipe that ends with the parent: others depend on it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    for first, end in ((3, parent.sentinel), (parent.sentinel + 1, _MAX_OPEN)):
+        os.closerange(first, end)
 
 
 def _print_to(path: Path) -> None:
@@ -179,17 +186,9 @@ def _address_space() -> int:
     return pages * resource.getpagesize()
 
 
-def _end_with_parent(line: Connection) -> None:
-    """Exit when the parent's end of the connection closes, however the parent ended."""
-    with contextlib.suppress(OSError, EOFError):
-        line.recv_bytes()
-    os._exit(70)
-
-
-def _tell(line: Connection, **message: object) -> None:
-    if "text" in message:
-        message["text"] = str(message["text"])[-MAX_TEXT:]
-    try:
-        line.send_bytes(json.dumps(message).encode())
-    except OSError:
-        os._exit(70)  # the parent is gone
+def _end_with_parent() -> None:
+    """Exit when the parent ends, in whatever way."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(os.EX_SOFTWARE)

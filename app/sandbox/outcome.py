@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
+import os
 import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
-log = logging.getLogger(__name__)
-
 Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
-RESULT: Final = "result.json"  # file of what a task returned
+REPORT: Final = "result.json"  # file in which a child reports how its task ended, and what it returned
 # Bytes of JSON that are read from a task at most (chosen): far more than any returns, arrays are files
 MAX_RESULT: Final = 16 * 1024 * 1024
+# Characters of an error's code and text at most (chosen): those of the library have a line or two
+MAX_CODE: Final = 100
+MAX_TEXT: Final = 4000
+NO_ROOM: Final = os.EX_TEMPFAIL  # exit status of a child that could not write, its report included
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,45 +52,47 @@ class Outcome:
     detail: str = ""
 
 
-def outcome_of(message: dict[str, Any], status: int, folder: Path, limits: TaskLimits) -> Outcome:
-    """Return the outcome from the last message of a child, if any, and its exit status (or -signal)."""
-    code, text = (str(message.get(key, "")) for key in ("code", "text"))
-    match message.get("end"):
-        case "ok" if status == 0:
-            outcome = _result(folder / RESULT)
+def ended(ending: Ending, detail: str = "the work was cancelled") -> Outcome:
+    """Return an outcome whose code is how it ended."""
+    return Outcome(ending, code=ending, detail=detail)
+
+
+def outcome_of(status: int, folder: Path, limits: TaskLimits) -> Outcome:
+    """Return the outcome of a child from its exit status (or -signal) and the report in its folder."""
+    if status:
+        return _died(status, limits)
+    report = _report(folder / REPORT)
+    code, text = str(report.get("code", ""))[:MAX_CODE], str(report.get("text", ""))[:MAX_TEXT]
+    match report.get("end"):
+        case "ok":
+            return Outcome("ok", value=report.get("value"))
         case "error":
-            outcome = Outcome("error", code=code, detail=text)
+            return Outcome("error", code=code, detail=text)
         case "memory_limit":
-            outcome = ended("memory_limit", f"needs more than {limits.memory_mb} MiB: give a smaller photo")
-        case "no_room":
-            outcome = ended("outage", "there is no room on the disk for the work")
-        case "bug":
-            log.error("unforeseen %s in a task:\n%s", code, text)
-            why = f"an unforeseen {code} stopped the work; the log of the worker says where"
-            outcome = Outcome("crashed", code="internal_error", detail=why)
+            return ended("memory_limit", f"needs more than {limits.memory_mb} MiB: give a smaller photo")
         case _:
-            outcome = _died(status, limits)
-    return outcome
+            why = f"an unforeseen {code or 'end'} stopped the work; the log of the worker says where"
+            return Outcome("crashed", code="internal_error", detail=why)
 
 
 def _died(status: int, limits: TaskLimits) -> Outcome:
-    """Return the outcome of a child that could not say how it ended."""
+    """Return the outcome of a child that could not report."""
+    if status == NO_ROOM:
+        return ended("outage", "there is no room on the disk for the work")
     if -status == signal.SIGXCPU:
         text = f"took more than {limits.processor_s} s of processor time; give a smaller photo"
         return ended("time_limit", text)
     name = next((known.name for known in signal.Signals if known == -status), "unknown")
     how = f"signal {-status} ({name})" if status < 0 else f"exit status {status}"
     # SIGKILL comes not from the task nor from us, but from the kernel, out of memory
-    died: Ending = "outage" if -status == signal.SIGKILL else "crashed"
-    return ended(died, f"the process that did the work died: {how}")
+    killed = -status == signal.SIGKILL
+    return ended("outage" if killed else "crashed", f"the process that did the work died: {how}")
 
 
-def ended(ending: Ending, detail: str = "the work was cancelled") -> Outcome:
-    """Return an outcome whose code is how it ended."""
-    return Outcome(ending, code=ending, detail=detail)
-
-
-def _result(path: Path) -> Outcome:
-    if path.stat().st_size > MAX_RESULT:
-        return Outcome("crashed", code="internal_error", detail="the task returned more than may be read")
-    return Outcome("ok", value=json.loads(path.read_text(encoding="utf-8")))
+def _report(path: Path) -> dict[str, Any]:
+    """Read the report of a child as untrusted: nothing where it is no JSON object, or too large."""
+    try:
+        report = json.loads(path.read_text(encoding="utf-8")) if path.stat().st_size <= MAX_RESULT else None
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}

@@ -3,9 +3,10 @@
 Photos come from anywhere, and the libraries that decode them are large. So each piece of work
 runs in a child of a fork server: limited in memory, processor time, wall time, file size and
 open files, without the service's environment, killed when the result is no longer wanted
-or the parent is gone. What comes back is JSON and files, never a pickle: a child that was
-taken over by a hostile file cannot run code in its parent; nor, where the kernel has the means of
-`app.sandbox.confine`, read what is not its task's, reach a network, or start a program.
+or the parent is gone. What comes back are files, JSON among them, never a pickle: a child that
+was taken over by a hostile file cannot run code in its parent, nor keep it waiting; nor, where the
+kernel has the means of `app.sandbox.confine`, read what is not its task's, reach a network, or
+start a program.
 """
 
 from __future__ import annotations
@@ -24,27 +25,21 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing import forkserver
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from app.sandbox import child
 from app.sandbox.account import SystemAccount
-from app.sandbox.outcome import Outcome, TaskLimits, ended, outcome_of
+from app.sandbox.outcome import REPORT, Outcome, TaskLimits, ended, outcome_of
 from lensmodel.core.types import ignore_step
 
-# Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not
-MAX_MESSAGE: Final = 64 * 1024
-MAX_NUMBER: Final = 2**31 - 1  # of an INTEGER column
-
-TASKS_MODULE = "app.jobs.tasks"  # default module of the tasks; tests of the workers replace it
+TASKS_MODULE = "app.jobs.tasks"  # has `TASKS`; tests replace it
 # Bytes of what a task printed that are logged at most (chosen): an honest one says a few lines
 MAX_SAID: Final = 64 * 1024
 log = logging.getLogger(__name__)
-
-
-# Seconds between two questions whether a task is still wanted (chosen): each reads a row
+# Seconds between two looks at a child (chosen): each reads a row
 POLL_S: Final = 0.25
 
 
@@ -54,8 +49,7 @@ class Budget:
     def __init__(self, slots: int, memory_mb: int) -> None:
         self._changed = threading.Condition()
         self._queue: deque[object] = deque()
-        self._slots, self._memory = slots, memory_mb
-        self.memory_mb = memory_mb
+        self._slots, self._memory, self.memory_mb = slots, memory_mb, memory_mb
 
     @contextlib.contextmanager
     def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
@@ -66,25 +60,25 @@ class Budget:
         def is_next() -> bool:
             return self._queue[0] is ticket and self._slots > 0 and self._memory >= memory
 
-        with self._changed:
-            self._queue.append(ticket)
+        self._queue.append(ticket)
         try:
             while not entered and wanted():  # without the lock: it reads a row
                 with self._changed:
                     entered = self._changed.wait_for(is_next, POLL_S)
-                    self._slots -= entered
-                    self._memory -= memory * entered
+                    self._take(entered, memory)
         finally:
-            with self._changed:
-                self._queue.remove(ticket)
-                self._changed.notify_all()
+            self._queue.remove(ticket)
+            self._take(0, 0)  # the next one may be first now
         try:
             yield entered
         finally:
-            with self._changed:
-                self._slots += entered
-                self._memory += memory * entered
-                self._changed.notify_all()
+            self._take(-entered, memory)
+
+    def _take(self, slots: int, memory_mb: int) -> None:
+        with self._changed:
+            self._slots -= slots
+            self._memory -= slots * memory_mb
+            self._changed.notify_all()
 
 
 class Sandbox:
@@ -95,20 +89,15 @@ class Sandbox:
         scratch: Path,
         budget: Budget,
         *,
-        module: str | None = None,
-        preload: Sequence[str] | None = None,
         cache: Path | None = None,
         account: SystemAccount | None = None,
         niceness: int = child.NICENESS,
     ) -> None:
-        self._niceness = niceness
-        self.scratch, self.budget, self.account = scratch, budget, account
-        self._confined = True
+        self.scratch, self.budget, self.account, self._niceness = scratch, budget, account, niceness
         configured = os.environ.get("NUMBA_CACHE_DIR")
         self.cache = Path(configured).resolve() if configured and self.account is None else cache
-        self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
+        self._context.set_forkserver_preload([child.__name__, TASKS_MODULE])
         self._alone = threading.Lock()  # the exit status of a child can be read only once
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
@@ -164,74 +153,67 @@ class Sandbox:
             if not entered:
                 return ended("cancelled")
             reads = [*reads, *([] if self.cache is None else [self.cache])]
+            (folder / child.PROGRESS).write_bytes(child.STEPS.pack(0, 0))
+            (folder / REPORT).unlink(missing_ok=True)  # of a try before
             if self.account is not None:
                 self.account.may_change(folder)
                 for path in reads:
                     self.account.may_read(path)
             order = child.Order(
-                self._module,
+                TASKS_MODULE,
                 task,
                 json.dumps(dict(arguments)),
                 folder.resolve(),
                 limits,
                 self._niceness,
-                tuple(path.resolve() for path in reads) if self._confined else None,
+                tuple(path.resolve() for path in reads),
                 self.account,
             )
-            line, far_end = self._context.Pipe(duplex=True)
-            process = self._context.Process(target=child.main, args=(order, far_end), daemon=True)
+            process = self._context.Process(target=child.main, args=(order,), daemon=True)
             self._serve()
-            with line:
-                with far_end, self._alone:
+            with (folder / child.PROGRESS).open("rb", buffering=0) as steps:
+                with self._alone:
                     process.start()
                 try:
-                    outcome = self._watched(process, line, folder, limits, wanted, on_progress)
+                    outcome = self._watched(process, order, steps, wanted, on_progress)
                 finally:
-                    self._end(process)
+                    status = self._end(process)
             _leave_plain_files(folder)
-            _log_printed(task, folder / child.PRINTED)
+            outcome = outcome or outcome_of(status, folder, limits)
+            (folder / child.PROGRESS).unlink(missing_ok=True)
+            _log_printed(task, folder / child.PRINTED, crashed=outcome.ending == "crashed")
             return outcome
 
     def _watched(
         self,
         process: ForkServerProcess,
-        line: Connection,
-        folder: Path,
-        limits: TaskLimits,
+        order: child.Order,
+        steps: BinaryIO,
         wanted: Callable[[], bool],
         on_progress: child.ProgressHook,
-    ) -> Outcome:
-        """Read messages until the child has ended, or must be killed."""
-        last: dict[str, Any] = {}
-        waiting: list[Any] = [line, process.sentinel]
-        deadline, next_look = time.monotonic() + limits.wall_s, 0.0
+    ) -> Outcome | None:
+        """Wait until the child has ended; return the outcome of one that must be killed."""
+        limits, last = order.limits, child.STEPS.pack(0, 0)
+        deadline = time.monotonic() + limits.wall_s
         while True:
-            ready = wait(waiting, timeout=POLL_S)
-            if line in ready:
-                message = _read(line)
-                if message is None:
-                    waiting.remove(line)
-                elif "end" in message:
-                    last = message
-                else:
-                    on_progress(_number(message.get("done")), _number(message.get("total")))
-            elif ready:  # it has ended, and all messages are read
-                with self._alone:
-                    process.join()
-                return outcome_of(last, process.exitcode or 0, folder, limits)
-            if time.monotonic() > next_look:
-                next_look = time.monotonic() + POLL_S
-                if not wanted():
-                    return ended("cancelled")
-                if _overflows(folder, limits):
-                    text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
-                    return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
+            ready = wait([process.sentinel], min(POLL_S, max(0.0, deadline - time.monotonic())))
+            now = os.pread(steps.fileno(), child.STEPS.size, 0)
+            if now != last and len(now) == child.STEPS.size:
+                on_progress(*(max(0, count) for count in child.STEPS.unpack(now)))
+                last = now
+            if ready:
+                return None
+            if not wanted():
+                return ended("cancelled")
+            if _overflows(order.folder, limits):
+                text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
+                return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
             if time.monotonic() > deadline:
                 text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
                 return ended("time_limit", text)
 
-    def _end(self, process: ForkServerProcess) -> None:
-        """Kill the child and all processes that it started, if they still run."""
+    def _end(self, process: ForkServerProcess) -> int:
+        """Kill the child and all processes that it started, if they still run; return its exit status."""
         assert process.pid is not None
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -239,12 +221,9 @@ class Sandbox:
             if process.is_alive():
                 process.kill()
             process.join()
+            status = process.exitcode or 0
             process.close()
-
-
-def _number(value: object) -> int:
-    """Return a number of a progress message as a column can hold it."""
-    return min(max(value, 0), MAX_NUMBER) if isinstance(value, int) else 0
+        return status
 
 
 def _overflows(written: Path, limits: TaskLimits) -> bool:
@@ -273,13 +252,14 @@ def _leave_plain_files(folder: Path) -> None:
                 path.unlink()
 
 
-def _log_printed(task: str, path: Path) -> None:
-    """Log what a task printed line by line: the formatter lets no line look like a record of ours."""
+def _log_printed(task: str, path: Path, *, crashed: bool) -> None:
+    """Log the end of what a task printed as one record: the formatter lets no line look like another."""
     with contextlib.suppress(OSError):  # it died before it could print
         with path.open("rb") as file:
-            text = file.read(MAX_SAID).decode("utf-8", "backslashreplace")
-        for said in filter(None, text.split("\n")):
-            log.info("task %s: %s", task, said)
+            file.seek(max(0, path.stat().st_size - MAX_SAID))
+            text = file.read(MAX_SAID).decode("utf-8", "backslashreplace").strip("\n")
+        if text:
+            log.log(logging.ERROR if crashed else logging.INFO, "task %s printed:\n%s", task, text)
         path.unlink()
 
 
@@ -289,12 +269,3 @@ def _lives(pid: int) -> bool:
         return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
     except ChildProcessError:
         return False
-
-
-def _read(line: Connection) -> dict[str, Any] | None:
-    """Return the next message; None at the end of the connection, or if the message is invalid."""
-    try:
-        message = json.loads(line.recv_bytes(MAX_MESSAGE))
-    except (EOFError, OSError, ValueError):
-        return None
-    return message if isinstance(message, dict) else None

@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import os
 import random
+import re
 import shutil
 import signal
 import sqlite3
@@ -271,8 +272,8 @@ def said(store: Store) -> list[str]:
 
 
 def faults(log: Path) -> str:
-    """Return the last two errors that nobody foresaw of those in tasks, tracebacks and all."""
-    parts = [part for part in log.read_text().split("unforeseen ")[1:] if " in a task" in part[:40]]
+    """Return what the last two tasks printed that crashed, tracebacks and all."""
+    parts = re.split(r"^.* ERROR .* app\.sandbox\.runner: ", log.read_text(), flags=re.MULTILINE)[1:]
     return "\n".join(part[:1500] for part in parts[-2:])
 
 

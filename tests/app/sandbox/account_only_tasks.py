@@ -13,12 +13,9 @@ from app.sandbox.account import SystemAccount
 __all__ = ["TASKS"]
 
 
-def _only_account(
-    folder: Path, reads: Iterable[Path] = (), account: SystemAccount | None = None
-) -> list[str]:
+def _only_account(folder: Path, reads: Iterable[Path] = (), account: SystemAccount | None = None) -> None:
     assert account is not None
-    account.become()
-    return ["account"]
+    confine.become(account)
 
 
 confine.confine = _only_account

@@ -9,12 +9,14 @@ import importlib
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -247,6 +249,33 @@ def hoard(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> li
     return done
 
 
+def stutter(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
+    """Write the beginning of a message wherever one can be sent."""
+    _send(struct.pack("!i", 1000))
+    time.sleep(60)
+
+
+def mislead(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
+    """End well, with a report that is not one's own, or none that can be read."""
+    report, done = folder / "result.json", b'{"end": "ok"}'
+    how = {
+        "link": lambda: report.symlink_to(arguments["other"]),
+        "pipe": lambda: os.mkfifo(report),
+        "nest": lambda: report.write_text("[" * 100_000),
+        "list": lambda: report.write_text("[]"),
+        "void": report.touch,
+    }
+    how[arguments["how"]]()
+    _send(struct.pack("!i", len(done)) + done)
+    os._exit(0)
+
+
+def _send(message: bytes) -> None:
+    for number in range(3, 100):
+        with contextlib.suppress(OSError):
+            os.write(number, message)
+
+
 def forge(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     """Print what looks like a record of the service."""
     os.write(2, b"harmless\n2026-01-01 00:00:00,000 CRITICAL worker app.jobs.worker: all is lost\n\x1b[2J")
@@ -286,30 +315,4 @@ def shout(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
     raise NoUsablePatchesError("x" * 1_000_000)
 
 
-TASKS = {
-    f.__name__: f
-    for f in (
-        add,
-        weight,
-        refuse,
-        swell,
-        spin,
-        sleep,
-        spawn,
-        crash,
-        die,
-        blunder,
-        write,
-        open_files,
-        fill_the_disk,
-        probe,
-        link,
-        shout,
-        sabotage,
-        abort,
-        litter,
-        hoard,
-        forge,
-        compile_one,
-    )
-}
+TASKS = {name: each for name, each in globals().items() if isinstance(each, FunctionType) and name[0] != "_"}

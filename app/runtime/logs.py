@@ -6,13 +6,14 @@ request, the job and the photo of a record, wherever in the program it was logge
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import sys
-from collections.abc import MutableMapping
+from datetime import UTC, datetime
 from typing import Any, Final, Literal, TypeAlias
 
-import structlog
+from structlog.contextvars import get_contextvars
 
 Format: TypeAlias = Literal["text", "json"]
 
@@ -30,43 +31,41 @@ class OneRecord(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the text of a record with the ids of its context and control characters escaped."""
-        context = structlog.contextvars.get_contextvars()
+        context = get_contextvars()
         ids = "".join(f" {name}={context[name]}" for name in FIELDS if name in context)
         head, end, rest = super().format(record).partition("\n")
         text = _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", f"{head}{ids}{end}{rest}")
         return text.replace("\n", CONTINUED)
 
 
-def as_json(part: str) -> logging.Formatter:
-    """Return a formatter that writes each record as one JSON object on one line."""
+class OneObject(logging.Formatter):
+    """Formatter that writes each record as one JSON object on one line, as `part` of the service."""
 
-    def named(logger: object, method: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-        del logger, method
-        return {"time": event.pop("timestamp"), "level": event.pop("level"), "part": part, **event}
+    def __init__(self, part: str) -> None:
+        super().__init__()
+        self._part = part
 
-    return structlog.stdlib.ProcessorFormatter(
-        foreign_pre_chain=[
-            structlog.contextvars.merge_contextvars,
-            structlog.stdlib.add_log_level,
-            structlog.stdlib.add_logger_name,
-            structlog.stdlib.ExtraAdder(allow=FIELDS),
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-        ],
-        processors=[
-            structlog.stdlib.ProcessorFormatter.remove_processors_meta,
-            structlog.processors.format_exc_info,
-            structlog.processors.EventRenamer("message"),
-            named,
-            structlog.processors.JSONRenderer(default=str),  # writes every control character as \u00..
-        ],
-    )
+    def format(self, record: logging.LogRecord) -> str:
+        """Return a record as JSON, which escapes control characters."""
+        known = get_contextvars() | vars(record)
+        shown: dict[str, Any] = {
+            "time": f"{datetime.fromtimestamp(record.created, UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
+            "level": record.levelname.lower(),
+            "part": self._part,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        shown |= {name: known[name] for name in FIELDS if name in known}
+        if record.exc_info:
+            shown["exception"] = self.formatException(record.exc_info)
+        return json.dumps(shown, default=str)
 
 
 def begin(part: str, level: str, form: Format = "text") -> None:
     """Log to standard error from now on, as the named part of the service."""
     handler = logging.StreamHandler(sys.stderr)
     text = OneRecord(f"%(asctime)s %(levelname)s {part} %(name)s: %(message)s")
-    handler.setFormatter(as_json(part) if form == "json" else text)
+    handler.setFormatter(OneObject(part) if form == "json" else text)
     # replaces the handlers of the command line
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     # people look for the address that is printed, not for every request; collectors get all

@@ -25,7 +25,7 @@ def lines() -> Iterator[io.StringIO]:
     """Let every record of the service be written as JSON into a text."""
     written = io.StringIO()
     handler = logging.StreamHandler(written)
-    handler.setFormatter(logs.as_json("test"))
+    handler.setFormatter(logs.OneObject("test"))
     root, log = logging.getLogger(), logging.getLogger("app")
     of_requests = logging.getLogger("app.access")  # others may have begun the log of a service before
     before = log.level, of_requests.level

@@ -24,7 +24,7 @@ from sqlalchemy.exc import OperationalError, ProgrammingError
 from app.store.database import new_id
 
 if TYPE_CHECKING:
-    from obstore import AsyncWritableFile, GetResult
+    from obstore import AsyncWritableFile
     from obstore.store import ClientConfig
 
 # Bytes that are read at once (chosen): large enough that calls cost nothing beside the copying
@@ -147,26 +147,21 @@ class Storage:
                 raise FileNotFoundError(key)
             yield path
             return
-        copy = scratch / new_id()
-        with copy.open("wb") as out:
-            for piece in self._get(store, key).stream(min_chunk_size=CHUNK):
-                out.write(piece)
         try:
-            yield copy
-        finally:
-            copy.unlink(missing_ok=True)
-
-    @staticmethod
-    def _get(store: ObjectStore, key: str) -> GetResult:
-        """Return a blob; raise OSError if the bucket is missing, reported like a missing blob."""
-        try:
-            return obstore.get(store, key)
-        except FileNotFoundError as error:
+            blob = obstore.get(store, key)
+        except FileNotFoundError as error:  # which is how a missing bucket is reported too
             try:
                 next(iter(obstore.list(store, chunk_size=1)), None)
             except FileNotFoundError:
                 raise OSError(errno.ENODEV, "the bucket of the blobs is away") from error
             raise
+        copy = scratch / new_id()
+        with copy.open("wb") as out:
+            out.writelines(blob.stream(min_chunk_size=CHUNK))
+        try:
+            yield copy
+        finally:
+            copy.unlink(missing_ok=True)
 
     def delete(self, prefix: str) -> None:
         """Delete all blobs below a prefix that ends in a slash; none is no error."""

@@ -8,8 +8,8 @@ by pixel, then those of half the size, until one tile holds all.
 
 from __future__ import annotations
 
-import io
 import struct
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -43,8 +43,9 @@ def write_tiles(path: Path, picture: NDArray[np.uint8]) -> None:
     ends = [_HEAD.size + 8 * (count + 1)]
     with path.open("wb") as file:
         file.seek(ends[0])
-        for part in _pictures(picture):
-            ends.append(ends[-1] + file.write(_jpeg(part)))
+        for part in _pictures(Image.fromarray(picture)):
+            part.save(file, "JPEG", quality=92, subsampling=0)
+            ends.append(file.tell())
         file.seek(0)
         file.write(_HEAD.pack(_SIGNATURE, height, width, count) + struct.pack(f"<{count + 1}Q", *ends))
 
@@ -60,36 +61,18 @@ def _levels(height: int, width: int) -> list[tuple[int, int]]:
     return levels
 
 
-def _pictures(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    height, width = picture.shape[:2]
-    step = -(-max(height, width) // WHOLE)
-    pictures = [_shrunk(picture, step)]
+def _pictures(picture: Image.Image) -> Iterator[Image.Image]:
+    width, height = picture.size
+    yield picture.reduce(-(-max(width, height) // WHOLE))
     for row, col in PLACES:
         top = max(0, min(round(row * height - PART[0] / 2), height - PART[0]))
         left = max(0, min(round(col * width - PART[1] / 2), width - PART[1]))
-        pictures.append(picture[top : top + PART[0], left : left + PART[1]])
+        yield picture.crop((left, top, min(left + PART[1], width), min(top + PART[0], height)))
     for rows, cols in _levels(height, width):
-        pictures += [
-            picture[row * TILE : (row + 1) * TILE, col * TILE : (col + 1) * TILE]
-            for row in range(rows)
-            for col in range(cols)
-        ]
-        picture = _shrunk(picture, 2)
-    return pictures
-
-
-def _shrunk(picture: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """Return the means of squares of pixels; the last ones go on as the edge is."""
-    padded = np.pad(picture, (*((0, -size % step) for size in picture.shape[:2]), (0, 0)), mode="edge")
-    height, width = (size // step for size in padded.shape[:2])
-    squares = padded.reshape(height, step, width, step, 3)
-    return np.rint(squares.mean(axis=(1, 3), dtype=np.float32)).astype(np.uint8)
-
-
-def _jpeg(picture: NDArray[np.uint8]) -> bytes:
-    out = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture)).save(out, "JPEG", quality=92, subsampling=0)
-    return out.getvalue()
+        width, height = picture.size
+        for top, left in ((row * TILE, col * TILE) for row in range(rows) for col in range(cols)):
+            yield picture.crop((left, top, min(left + TILE, width), min(top + TILE, height)))
+        picture = picture.reduce(2)
 
 
 def whole(storage: Storage, key: str) -> bytes:

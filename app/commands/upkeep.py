@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +18,21 @@ from lensmodel.cli.options import Json, Quiet
 
 if TYPE_CHECKING:
     from app.blobs.storage import Storage
+    from app.store import Store
+
+
+@contextmanager
+def _installation(data: Path | None) -> Iterator[tuple[Settings, Store, Storage]]:
+    """Open an installation; a folder that is not there would be made, and found empty."""
+    from app.blobs.storage import Storage  # noqa: PLC0415 - the list of commands does not wait for it
+    from app.store import migrate  # noqa: PLC0415 - same
+
+    settings = settings_from(data)
+    if not settings.database_url and not (settings.data_dir / "app.db").is_file():
+        raise UsageError(f"{settings.data_dir} holds no installation; give its folder by --data")
+    with opened(settings) as store:
+        migrate.check(store.database)
+        yield settings, store, Storage(settings.storage, patience_s=settings.storage_seconds, create=False)
 
 
 def doctor(
@@ -37,14 +54,11 @@ def doctor(
 
     Exit status: 0 all is well, 1 something is not, 2 wrong usage.
     """
-    from app.runtime import doctor as examination  # noqa: PLC0415 - the list of commands does not wait for it
-    from app.store import migrate  # noqa: PLC0415 - the list of commands does not wait for it
+    from app.runtime.doctor import examine  # noqa: PLC0415 - the list of commands does not wait for it
 
     shown = Display.of(context, quiet=quiet, as_json=json_output)
-    settings = _existing(data)
-    with opened(settings) as store:
-        migrate.check(store.database)
-        report = examination.examine(settings, store, _storage(settings), deep=deep)
+    with _installation(data) as (settings, store, storage):
+        report = examine(settings, store, storage, deep=deep)
     if json_output:
         shown.document(asdict(report))
     else:
@@ -81,30 +95,14 @@ def backup(
     from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
 
     shown = Display.of(context, quiet=quiet, as_json=json_output)
-    settings = _existing(data)
-    with opened(settings) as store, shown.progress() as bars:
+    with _installation(data) as (_, store, storage), shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
 
         def show(done: int, total: int) -> None:
             bars.update(task, completed=done, total=total)
 
-        result = copies.backup(store.database, _storage(settings), folder, show)
+        result = copies.backup(store.database, storage, folder, show)
     if json_output:
         shown.document(asdict(result))
     else:
         shown.result(f"{folder}: {result.photos} photos and {result.blobs} blobs of {result.made_at}")
-
-
-def _existing(data: Path | None) -> Settings:
-    """Read the settings; a folder that is not there would be made, and found empty."""
-    settings = settings_from(data)
-    path = settings.data_dir / "app.db"
-    if settings.database.startswith("sqlite") and not settings.database_url and not path.is_file():
-        raise UsageError(f"{settings.data_dir} holds no installation; give its folder by --data")
-    return settings
-
-
-def _storage(settings: Settings) -> Storage:
-    from app.blobs.storage import Storage  # noqa: PLC0415 - the list of commands does not wait for it
-
-    return Storage(settings.storage, patience_s=settings.storage_seconds, create=False)

@@ -64,7 +64,7 @@ class NotWantedError(Exception):
 class Needs:
     """What a task needs of the machine, and what it answers."""
 
-    seconds: str  # name of the setting of its time
+    part: int = 1  # which part of `LENS_TASK_SECONDS` it may take, such as 90: a 90th
     answer: Answer | None = None
     pixel_bytes: int = 0  # address space for each pixel of its photo (chosen, by counting), beside `spare_mb`
     spare_mb: int = SPARE_MB
@@ -74,16 +74,14 @@ class Needs:
 
 # Of a pixel mapped planes alone take 12 bytes; a measurement maps two photos, with a float64 plane of each
 NEEDS: Final[Mapping[str, Needs]] = {
-    "inspect": Needs("inspect_seconds", answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False),
-    "develop": Needs("develop_seconds", pixel_bytes=120, compiled=False),
-    "select": Needs("develop_seconds", answers.SELECTED, pixel_bytes=120, compiled=False),
-    "estimate": Needs("patch_seconds", pixel_bytes=24),
-    "measure-lens": Needs("task_seconds", pixel_bytes=96),
-    "correct": Needs("task_seconds", answers.CORRECTED, pixel_bytes=120, threads=True),
-    "measure": Needs("task_seconds", answers.MEASURED, spare_mb=2 * SPARE_MB),
-    "profile": Needs(
-        "develop_seconds", answers.READ_PROFILE, spare_mb=SPARE_MB + COPIES * (MAX_UNPACKED >> 20)
-    ),
+    "inspect": Needs(90, answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False),
+    "develop": Needs(20, pixel_bytes=120, compiled=False),
+    "select": Needs(20, answers.SELECTED, pixel_bytes=120, compiled=False),
+    "estimate": Needs(6, pixel_bytes=24),
+    "measure-lens": Needs(pixel_bytes=96),
+    "correct": Needs(1, answers.CORRECTED, pixel_bytes=120, threads=True),
+    "measure": Needs(1, answers.MEASURED, spare_mb=2 * SPARE_MB),
+    "profile": Needs(20, answers.READ_PROFILE, spare_mb=SPARE_MB + COPIES * (MAX_UNPACKED >> 20)),
 }
 
 
@@ -184,7 +182,7 @@ class JobContext:
 
     def limits(self, task: str, photo: PhotoRow | None) -> TaskLimits:
         """Return the limits of a task, which grow with its photo."""
-        needs, seconds = NEEDS[task], float(getattr(self.settings, NEEDS[task].seconds))
+        needs, seconds = NEEDS[task], self.settings.task_seconds / NEEDS[task].part
         pixels = 0 if photo is None else (photo.width or 0) * (photo.height or 0)
         memory = needs.spare_mb + needs.pixel_bytes * pixels // (1 << 20)
         limits = TaskLimits(min(memory, max(self.sandbox.budget.memory_mb, needs.spare_mb)), seconds)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Final
 
 from app.blobs.storage import Storage
-from app.store import migrate
 from app.store.database import Database
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import StepHook, ignore_step
@@ -54,7 +53,6 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
             "the rows are in a database server: back them up with pg_dump, then the blobs with the tools of "
             "their storage; docs/topics/operating.md says how"
         )
-    migrate.check(database)
     folder.mkdir(parents=True, exist_ok=True)
     target = Storage(f"file://{(folder / BLOBS).resolve()}")
     part = folder / f"{ROWS}.part"

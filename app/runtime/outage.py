@@ -15,6 +15,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Final
 
 from obstore import exceptions as stored
@@ -72,12 +73,11 @@ def is_outage(error: BaseException) -> bool:
 def is_no_room(error: BaseException) -> bool:
     """Say whether a disk, or the quota of its user, is full."""
     if isinstance(error, exc.DBAPIError):
-        return (
-            getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
-            or getattr(error.orig, "sqlstate", None) == _POSTGRES_FULL
-        )
-    reported = isinstance(error, OSError | stored.BaseError) and any(sign in str(error) for sign in _FULL)
-    return reported or (isinstance(error, OSError) and error.errno in _NO_ROOM)
+        code, state = (getattr(error.orig, name, None) for name in ("sqlite_errorcode", "sqlstate"))
+        return code == sqlite3.SQLITE_FULL or state == _POSTGRES_FULL
+    if not isinstance(error, OSError | stored.BaseError):
+        return False
+    return getattr(error, "errno", None) in _NO_ROOM or any(sign in str(error) for sign in _FULL)
 
 
 @contextmanager
@@ -91,31 +91,27 @@ def missable() -> Iterator[None]:
         log.info("left out: %s", error)
 
 
+@dataclass
 class Patience:
     """How long to wait after each failure of one job, and when to give up."""
 
-    def __init__(
-        self,
-        outage_s: float,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        rng: random.Random | None = None,
-    ) -> None:
-        self._outage_s, self._clock = outage_s, clock
-        self._rng = rng or random.Random()  # noqa: S311 - spreads the load, keeps no secret
-        self._began: float | None = None
-        self._outages = self._bugs = 0
+    outage_s: float
+    clock: Callable[[], float] = time.monotonic
+    rng: random.Random = field(default_factory=random.Random)  # spreads the load, keeps no secret
+    _began: float | None = None
+    _outages: int = 0
+    _bugs: int = 0
 
     def pause_after(self, error: BaseException) -> float | None:
         """Return how many seconds to wait before the next try; None = give up."""
         # The pause doubles from 1 s to at most 60 s, and is drawn between 1 s and that: jobs that failed
         # together do not come back together
         if is_outage(error):
-            now = self._clock()
+            now = self.clock()
             self._began = now if self._began is None else self._began
-            if now - self._began > self._outage_s:
+            if now - self._began > self.outage_s:
                 return None
             self._outages += 1
-            return self._rng.uniform(FIRST_PAUSE_S, min(2.0 ** min(self._outages, 6), LONGEST_PAUSE_S))
+            return self.rng.uniform(FIRST_PAUSE_S, min(2.0 ** min(self._outages, 6), LONGEST_PAUSE_S))
         self._bugs += 1
         return None if self._bugs >= BUGS else 2.0 ** (self._bugs - 1)

@@ -164,21 +164,6 @@ class Settings(BaseSettings):
         return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
 
     @property
-    def inspect_seconds(self) -> float:
-        """Longest that reading the header of a photo may take."""
-        return self.task_seconds / 90
-
-    @property
-    def develop_seconds(self) -> float:
-        """Longest that developing a photo may take, or reading a profile."""
-        return self.task_seconds / 20
-
-    @property
-    def patch_seconds(self) -> float:
-        """Longest that estimating in one cell may take."""
-        return self.task_seconds / 6
-
-    @property
     def max_upload_bytes(self) -> int:
         """Largest photo file in bytes."""
         return self.max_upload_mb * MIB

@@ -15,9 +15,7 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -47,12 +45,10 @@ WORKER = "app.runtime.worker_main"  # module of the worker; tests replace it
 
 def serve(settings: Settings) -> int:
     """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
-    confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    require_sandbox(settings)
     file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
     with alone(settings.data_dir), contextlib.closing(listen(settings.host, settings.port)) as listener:
-        _prepare(settings)
+        _prepare(settings, api=True, worker=True)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         worker = subprocess.Popen(  # noqa: S603 - our own interpreter, our own module
@@ -67,7 +63,7 @@ def serve(settings: Settings) -> int:
             # it answers once the API is up: connections wait in the socket until then
             print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
             run(settings, listener, until=worker)
-            if worker.returncode is not None:
+            if worker.poll() is not None:
                 log.error("the worker ended with status %d, and with it the service", worker.returncode)
         except InterruptedByUser:
             return 0
@@ -83,7 +79,7 @@ def serve(settings: Settings) -> int:
 
 def run_api(settings: Settings) -> None:
     """Run one API process in this process."""
-    _prepare(settings)
+    _prepare(settings, api=True)
     listener = listen(settings.host, settings.port)
     with contextlib.closing(listener), contextlib.suppress(InterruptedByUser):
         run(settings, listener)
@@ -93,8 +89,7 @@ def run_worker(settings: Settings) -> None:
     """Replace this process by a worker."""
     # A new program rather than a call: children import the main module of their parent again, and that of a
     # worker is small for this reason
-    require_sandbox(settings)
-    _prepare(settings, asks_for_keys=False)
+    _prepare(settings, worker=True)
     os.environ.update(environment(settings))
     os.execv(sys.executable, [sys.executable, "-m", WORKER])  # noqa: S606 - no shell is wanted
 
@@ -104,32 +99,32 @@ def run(settings: Settings, listener: socket.socket, until: subprocess.Popen[byt
     logs.begin("api", settings.log_level, settings.log_format)
     from app.main import create_app  # noqa: PLC0415 - a worker need not load the application
 
-    config = uvicorn.Config(
-        create_app(settings),
-        log_level=settings.log_level,
-        log_config=None,  # its records go to our handlers
-        access_log=False,  # the application writes its own, without serials
-        timeout_graceful_shutdown=GRACE_S,
-        limit_concurrency=MAX_CONNECTIONS,
+    async def watch() -> None:
+        server.should_exit |= until is not None and until.poll() is not None
+
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(settings),
+            log_level=settings.log_level,
+            log_config=None,  # its records go to our handlers
+            access_log=False,  # the application writes its own, without serials
+            timeout_graceful_shutdown=GRACE_S,
+            limit_concurrency=MAX_CONNECTIONS,
+            callback_notify=watch,
+            timeout_notify=0,  # each second
+        )
     )
-    server = uvicorn.Server(config)
-
-    def watch() -> None:
-        assert until is not None
-        until.wait()
-        server.should_exit = True
-
-    if until is not None:
-        threading.Thread(target=watch, daemon=True).start()
     server.run(sockets=[listener])
 
 
-def _prepare(settings: Settings, *, asks_for_keys: bool = True) -> None:
-    """Bring the schema up to date, and check that there is a key if one is needed."""
+def _prepare(settings: Settings, *, api: bool = False, worker: bool = False) -> None:
+    """Bring the schema up to date; check what an API and a worker must have here."""
     confine.keep_private()
+    if worker:
+        require_sandbox(settings)
     with contextlib.closing(Database(settings.database)) as database:
         migrate.upgrade(database)  # one of several simultaneous processes does it
-        if not (asks_for_keys and settings.needs_keys) or Accounts(database).has_valid_key():
+        if not (api and settings.needs_keys) or Accounts(database).has_valid_key():
             return
     raise UsageError(
         f"the service asks for keys (LENS_HOST={settings.host}, LENS_ALLOWED_HOSTS={settings.allowed_hosts}, "
@@ -178,7 +173,7 @@ def listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-@contextmanager
+@contextlib.contextmanager
 def alone(data_dir: Path) -> Iterator[None]:
     """Make sure that only one service works on this folder; the lock ends with the process."""
     with (data_dir / "service.lock").open("w", encoding="ascii") as lock:

@@ -367,12 +367,12 @@ def test_what_others_can_reach_does_not_start_without_a_key(
     upgrade(store.database)
 
     with pytest.raises(UsageError, match="lensmodel keys create"):
-        supervisor._prepare(open_settings)
+        supervisor._prepare(open_settings, api=True)
     made = store.accounts.create_key("anna", ["write"])
-    supervisor._prepare(open_settings)
+    supervisor._prepare(open_settings, api=True)
     store.accounts.revoke_key(made.split("_")[1])
     with pytest.raises(UsageError, match="no valid key"):
-        supervisor._prepare(open_settings)
+        supervisor._prepare(open_settings, api=True)
 
 
 def test_nobody_asks_for_the_rows_of_all_by_leaving_the_owner_out(store: Store) -> None:

@@ -21,10 +21,10 @@ def to_json(value: Any) -> Any:
     """Turn dataclasses, tuples, mappings, bytes, dates and numbers into what `json` can write."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic):
         return value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
     if isinstance(value, bytes):
         return {"base64": base64.b64encode(value).decode("ascii")}
     if isinstance(value, datetime):
@@ -45,24 +45,20 @@ def from_json(kind: type[T], stored: Any) -> T:
 
 def _build(kind: Any, stored: Any) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if kind is Any or isinstance(stored, np.ndarray):
+    if kind is Any or origin is typing.Literal or isinstance(stored, np.ndarray):
         return stored
     if origin in (typing.Union, types.UnionType):
         if stored is None and type(None) in arguments:
             return None
         return _build(next(a for a in arguments if a is not type(None)), stored)
-    if origin is typing.Literal:
-        return stored
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         hints = typing.get_type_hints(kind)
         names = [f.name for f in dataclasses.fields(kind) if f.init]
         return kind(**{name: _build(hints[name], stored[name]) for name in names if name in stored})
-    if origin is tuple:
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_build(arguments[0], item) for item in stored)
-        return tuple(_build(a, item) for a, item in zip(arguments, stored, strict=True))
-    if origin is list:
-        return [_build(arguments[0], item) for item in stored]
+    if origin in (tuple, list):
+        same = origin is list or arguments[-1] is Ellipsis
+        kinds = arguments[:1] * len(stored) if same else arguments
+        return origin(_build(a, item) for a, item in zip(kinds, stored, strict=True))
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return {key: _build(arguments[1], item) for key, item in stored.items()}
     if origin is np.ndarray:

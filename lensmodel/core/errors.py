@@ -1,26 +1,8 @@
-"""What can go wrong.
+"""What can go wrong: every text names the offending value and the remedy.
 
-LensModelError
-├── InvalidInputError          the caller can fix it (HTTP 422)
-│   ├── InvalidKernelError
-│   └── UnknownMethodError
-├── UnreadablePhotoError       not an image that we can decode (HTTP 415)
-│   ├── NotAnImageError
-│   ├── TruncatedImageError
-│   ├── UnsupportedFormatError
-│   └── RawDecodeError
-├── ImageTooLargeError         more pixels than the limits allow (HTTP 413)
-│   └── DecompressionBombError
-├── MetadataMissingError       the photo does not say what is needed (HTTP 422)
-├── NotEnoughEvidenceError     the photo or the model cannot answer yet (HTTP 409)
-│   ├── NoUsablePatchesError
-│   ├── TurnedPixelsError
-│   ├── NoSamplesError
-│   └── OutsideSupportError
-└── CancelledError             somebody asked to stop
-
-Every text names the offending value and the remedy. `code` is the fixed word by
-which programs tell the cases apart.
+`code` is the fixed word by which programs tell the cases apart. The caller can mend an `InvalidInputError`
+(HTTP 422); the photo is to blame for an `UnreadablePhotoError` (415), an `ImageTooLargeError` (413) and a
+`MetadataMissingError` (422); of a `NotEnoughEvidenceError` (409) more photos may help.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -26,19 +27,12 @@ from lensmodel.photo.containers import MAX_BLOCK_BYTES, opened_header, png_chunk
 from lensmodel.photo.tiff import EXIF, GPS, MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, TiffReader, Value
 from lensmodel.photo.values import Limits
 
-MAX_BLOCKS: Final = 64  # Exif blocks of one file: the photo's, and one for each preview
+# Bounds against files made to cost time (chosen): Exif blocks, of which a photo has one and each preview;
+# tags of GPS, of which there are 32; bytes of a value, of which honest ones have some dozen; words of XMP.
+MAX_BLOCKS, MAX_TAGS, MAX_VALUE, MAX_WORDS = 64, 64, 1 << 16, 1000
 
-MAX_TAGS: Final = 64
-"""Tags of a GPS directory; there are 32. What has more is none."""
-
-# Bounds against files made to cost time (chosen): bytes of a value, of which honest ones have some dozen,
-# and places named in XMP.
-MAX_VALUE: Final = 1 << 16
-MAX_WORDS: Final = 1000
-
-_WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 7: 1, 10: 4}
-"""Types that GPS tags have, and the bytes of their numbers."""
-
+_WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 7: 1, 10: 4}  # type of a GPS tag -> bytes of its numbers
+_BLOCKS: Final = re.compile(rb"Exif\0\0|CMT4")  # before a TIFF structure; the latter in CR3, of GPS alone
 _VALUE: Final = rb'(?:\s*=\s*(?:"([^"<>]{0,200})"|\'([^\'<>]{0,200})\')|\s*>([^<>]{0,200})<)'
 _XMP_GPS: Final = re.compile(rb":[Gg][Pp][Ss]\w{1,40}" + _VALUE)
 """`exif:GPSLatitude` as attribute or element, and the like that drones write in names of their own."""
@@ -71,26 +65,24 @@ def find_location(buffer: Buffer) -> LocationTraces:
     Not found: names of places in IPTC blocks and maker notes, and anything inside compressed blocks other
     than those of PNG.
     """
-    spans: list[Overwrite] = []
-    blocks, boxes = (_places(buffer, mark) for mark in (b"Exif\0\0", b"CMT4"))  # the latter of CR3
-    complete = max(len(blocks), len(boxes)) <= MAX_BLOCKS
-    for place in boxes[:MAX_BLOCKS]:
-        if reader := TiffReader.open(buffer, place):
-            spans += _directory(buffer, reader, reader.first)
-    chunks = list[tuple[bytes, int, int]]()
+    spans, chunks = list[Overwrite](), list[tuple[bytes, int, int]]()
     if buffer[:4] == b"\x89PNG":
         with contextlib.suppress(TruncatedImageError):
             chunks.extend(png_chunks(buffer))
-    for place in (0, *blocks[:MAX_BLOCKS], *(start for name, start, _ in chunks if name == b"eXIf")):
+    for place in (0, *(start for name, start, _ in chunks if name == b"eXIf")):
         if reader := TiffReader.open(buffer, place):
             spans += _of_tiff(buffer, reader)
-    for number, match in enumerate(_XMP_GPS.finditer(buffer)):
-        if number == MAX_WORDS:
-            complete = False
-            break
-        start, end = next(match.span(group) for group in (1, 2, 3) if match.span(group) != (-1, -1))
+    blocks = list(islice(_BLOCKS.finditer(buffer), MAX_BLOCKS + 1))
+    for block in blocks[:MAX_BLOCKS]:
+        if reader := TiffReader.open(buffer, block.end()):
+            of_gps = block[0] == b"CMT4"
+            spans += _directory(buffer, reader, reader.first) if of_gps else _of_tiff(buffer, reader)
+    words = list(islice(_XMP_GPS.finditer(buffer), MAX_WORDS + 1))
+    for match in words[:MAX_WORDS]:
+        start, end = match.span(match.lastindex or 0)
         spans.append(Overwrite(start, b" " * (end - start)))
     spans = [span for span in spans if bytes(buffer[span.start : span.start + len(span.data)]) != span.data]
+    complete = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
     return LocationTraces(tuple(_with_checksums(buffer, chunks, spans)), complete)
 
 
@@ -107,15 +99,6 @@ def gps_directory(path: Path) -> dict[int, Value]:
             if values:
                 return values
     return {}
-
-
-def _places(buffer: Buffer, mark: bytes) -> list[int]:
-    """Where marks end; one more than is looked at."""
-    places, at = list[int](), buffer.find(mark)
-    while at >= 0 and len(places) <= MAX_BLOCKS:
-        places.append(at + len(mark))
-        at = buffer.find(mark, at + 1)
-    return places
 
 
 def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
@@ -136,16 +119,14 @@ def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Overwrite]:
     """Yield what empties a GPS directory: its values that lie elsewhere, then its tags."""
     tags, _ = reader.directory(offset)
-    count_size, entry_size = (8, 20) if reader.big else (2, 12)
-    start = reader.base + offset
-    head = bytes(buffer[start : start + count_size])
-    count = struct.unpack(reader.order + ("Q" if reader.big else "H"), head)[0] if tags else 0
-    end = start + count_size + count * entry_size
+    start, head_size, entry_size = reader.base + offset, *((8, 20) if reader.big else (2, 12))
+    head = bytes(buffer[start : start + head_size]) if tags else b""
+    count = int.from_bytes(head, "little" if reader.order == "<" else "big")
+    end = start + head_size + count * entry_size
     if not 0 < count <= MAX_TAGS or end > len(buffer):
         return
     for entry in tags.values():
-        far = not start <= entry.offset < end
-        if far and 0 < entry.size <= MAX_VALUE and entry.raw():
+        if not start <= entry.offset < end and 0 < entry.size <= MAX_VALUE and entry.raw():
             yield Overwrite(entry.offset, bytes(entry.size))
     yield Overwrite(start, bytes(end - start))
 
@@ -158,16 +139,16 @@ def _with_checksums(
     for name, start, length in chunks:
         if name == b"IDAT" or length > 2 * MAX_BLOCK_BYTES:
             continue
-        if name in {b"tEXt", b"zTXt", b"iTXt"} and _PACKED.match(bytes(buffer[start : start + 20])):
-            data = bytes(length)
-            check = struct.pack(">I", zlib.crc32(_HIDDEN + data))
-            renewed.append(Overwrite(start - 4, _HIDDEN + data + check))
-            continue
-        inside = [span for span in spans if start <= span.start < start + length]
-        if inside:
-            chunk = bytearray(buffer[start - 4 : start + length])
+        chunk = bytearray(buffer[start - 4 : start + length])
+        if name in {b"tEXt", b"zTXt", b"iTXt"} and _PACKED.match(chunk, 4):
+            chunk = bytearray(_HIDDEN + bytes(length))
+            renewed.append(Overwrite(start - 4, bytes(chunk)))
+        else:
+            inside = [span for span in spans if start <= span.start < start + length]
+            if not inside:
+                continue
             for span in inside:
                 at = span.start - start + 4
                 chunk[at : at + len(span.data)] = span.data
-            renewed.append(Overwrite(start + length, struct.pack(">I", zlib.crc32(chunk[: length + 4]))))
+        renewed.append(Overwrite(start + length, struct.pack(">I", zlib.crc32(chunk[: length + 4]))))
     return renewed

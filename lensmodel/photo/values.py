@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import BayerPattern, NoiseModel, Planes
 
@@ -38,14 +37,12 @@ remarks_log = logging.getLogger("lensmodel.remarks")
 
 Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
-_PROCESSED: Final = 16.0
-"""How much more noise variance a photo without its mosaic has than its flat places show."""
+_PROCESSED: Final = 16.0  # noise variance of a photo without its mosaic over what its flat places show
+# Coarseness of grain above which more of it counts, and how much more at most; demosaicing has 6 to 9.
 _USUAL_GRAIN, _COARSEST = 14.0, 4.0
-"""Coarseness of grain above which more of it counts, and how much more at most; demosaicing has 6 to 9."""
+# Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`.
 _DEMOSAICED: Final = (3.7, 1.9, 3.7)
-"""Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`."""
-_COARSEST_POWER: Final = 64.0
-"""Largest `noise.graininess` that is believed: cameras that denoise reach about 60, texture far more."""
+_COARSEST_POWER: Final = 64.0  # largest `noise.graininess` believed: cameras reach 60, texture far more
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +51,6 @@ class Limits:
 
     max_megapixels: float = 160.0  # width times height, in millions
     max_bytes: int = 2 << 30  # size of the file
-
-    def __post_init__(self) -> None:
-        if not (self.max_megapixels > 0 and self.max_bytes > 0):
-            raise InvalidInputError(f"limits must be positive, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +65,6 @@ class LensIdentity:
     model: str | None = None
     serial: str | None = None
     serial_source: SerialSource = "none"  # which tag the serial is from, or "none"
-
-    def __post_init__(self) -> None:
-        if (self.serial is None) != (self.serial_source == "none"):
-            raise InvalidInputError(
-                f"a lens serial and its source belong together, got a source of {self.serial_source!r}"
-            )
 
 
 @dataclass(frozen=True, slots=True)

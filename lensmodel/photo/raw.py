@@ -16,36 +16,17 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import Image
 
-from lensmodel.core.errors import (
-    LensModelError,
-    RawDecodeError,
-    TruncatedImageError,
-    UnsupportedFormatError,
-)
+from lensmodel.core.errors import LensModelError, RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
-from lensmodel.photo.colour import (
-    SRGB_TO_XYZ_D65,
-    Matrix,
-    camera_to_srgb,
-    curves_of,
-    matrix3,
-    srgb_to_linear,
-)
+from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3, srgb_to_linear
 from lensmodel.photo.defects import Suspects
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
 from lensmodel.photo.raster import UNDECODABLE, unwarned
-from lensmodel.photo.values import (
-    Encoding,
-    LensIdentity,
-    LinearPhoto,
-    PhotoInfo,
-    PhotoMetadata,
-    PlaneNoise,
-)
+from lensmodel.photo.values import Encoding, LensIdentity, LinearPhoto, PhotoInfo, PhotoMetadata, PlaneNoise
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
+from lensmodel.photo.tiff import laid_out, longs, shorts
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 RNG = np.random.default_rng(5)
@@ -131,36 +132,13 @@ def test_a_palette_of_any_depth_is_applied(bits: int, tmp_path: Path) -> None:
     packed = np.packbits(
         ((indices[..., None] >> np.arange(bits)[::-1]) & 1).reshape(48, 64 * bits).astype(np.uint8), axis=1
     )
-    tags = {
-        256: (4, [64]),
-        257: (4, [48]),
-        258: (3, [bits]),
-        259: (3, [1]),
-        262: (3, [3]),
-        273: (4, [0]),
-        277: (3, [1]),
-        278: (4, [48]),
-        279: (4, [packed.size]),
-        320: (3, (colours.T.astype(int) * 257).ravel().tolist()),
-    }
-    (tmp_path / "x.tif").write_bytes(plain_tiff(tags, packed.tobytes()))
+    tags = {256: longs(64), 257: longs(48), 258: shorts(bits), 259: shorts(1), 262: shorts(3), 277: shorts(1)}
+    table = shorts(*(colours.T.astype(int) * 257).ravel())
+    tags |= {273: longs(0), 278: longs(48), 279: longs(packed.size), 320: table}
+    tags[273] = longs(len(laid_out(tags, {})))
+    (tmp_path / "x.tif").write_bytes(laid_out(tags, {}) + packed.tobytes())
 
     assert (numbers(tmp_path / "x.tif") == colours[indices]).all()
-
-
-def plain_tiff(tags: dict[int, tuple[int, list[int]]], pixels: bytes) -> bytes:
-    """Lay out a TIFF of one strip, as no library writes it."""
-    width = {3: 2, 4: 4}
-    at = 8 + 2 + 12 * len(tags) + 4
-    table, values = struct.pack("<H", len(tags)), b""
-    far = {tag: value for tag, value in tags.items() if len(value[1]) * width[value[0]] > 4}
-    tags = {**tags, 273: (4, [at + sum(len(v) * width[k] for k, v in far.values())])}
-    for tag, (kind, numbers_) in sorted(tags.items()):
-        packed = struct.pack(f"<{len(numbers_)}{'H' if kind == 3 else 'I'}", *numbers_)
-        inline = packed.ljust(4, b"\0") if len(packed) <= 4 else struct.pack("<I", at + len(values))
-        values += b"" if len(packed) <= 4 else packed
-        table += struct.pack("<HHI", tag, kind, len(numbers_)) + inline
-    return b"II*\0\x08\0\0\0" + table + bytes(4) + values + pixels
 
 
 def test_a_quad_bayer_mosaic_is_refused_by_its_pattern_and_nothing_is_printed() -> None:

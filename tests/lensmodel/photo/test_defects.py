@@ -82,33 +82,29 @@ def write_xtrans(path: Path, values: NDArray[np.uint16]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("count", [11, 110])  # as 60 and 600 of 1.3 million
-def test_defects_are_replaced_counted_and_told(
-    count: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("count", "xtrans"), [(11, False), (110, False), (110, True)])
+def test_defects_are_replaced_and_told_and_other_photos_of_the_body_tell_the_rest(
+    count: int, xtrans: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    clean = photo.develop(write(tmp_path / "clean.dng", mosaic()))
-    repaired = photo.develop(write(tmp_path / "hot.dng", defective(mosaic(), places(count))))
+    save, height = (
+        (write_xtrans, 600) if xtrans else (write, 400)
+    )  # 11 and 110 are as 60 and 600 of 1.3 million
+    scenes = {scene: mosaic(scene, xtrans=xtrans, height=height) for scene in SCENES[:4]}
+    shots = [
+        save(tmp_path / f"{scene}.dng", defective(seen, places(count))) for scene, seen in scenes.items()
+    ]
+    clean = photo.develop(save(tmp_path / "clean.dng", scenes["spices"]))
+
+    alone, told = photo.develop(shots[0]), photo.develop(shots[0], siblings=shots)
 
     assert clean.remarks == ()
-    (told,) = repaired.remarks
-    assert 0.4 * count <= int(told.split()[0]) <= count
-    assert f"hot.dng: {told}" in caplog.text
-    damage = np.sqrt(np.mean((repaired.planes - clean.planes) ** 2))
-    assert damage < 0.6 * UNSEEN * np.sqrt(count / 110)
-    assert repaired.noise[1].variance(0.3) == pytest.approx(clean.noise[1].variance(0.3), rel=0.05)
-
-
-@pytest.mark.parametrize("count", [11, 110])
-def test_other_photos_of_the_body_tell_the_rest(count: int, tmp_path: Path) -> None:
-    at = places(count)
-    shots = [write(tmp_path / f"{scene}.dng", defective(mosaic(scene), at)) for scene in SCENES[:4]]
-    clean = photo.develop(write(tmp_path / "clean.dng", mosaic()))
-
-    repaired = photo.develop(shots[0], siblings=shots)
-
-    assert 0.9 * count <= int(repaired.remarks[0].split()[0]) <= count
-    damage = np.sqrt(np.mean((repaired.planes - clean.planes) ** 2))
-    assert damage < 0.3 * UNSEEN * np.sqrt(count / 110)
+    assert clean.pipeline.startswith("raw/xtrans") == xtrans
+    assert f"spices.dng: {alone.remarks[0]}" in caplog.text
+    assert alone.noise[1].variance(0.3) == pytest.approx(clean.noise[1].variance(0.3), rel=0.05)
+    for repaired, share, most in ((alone, 0.4, 0.6), (told, 0.9, 0.3)):
+        assert share * count <= int(repaired.remarks[0].split()[0]) <= count
+        damage = np.sqrt(np.mean((repaired.planes - clean.planes) ** 2))
+        assert damage < most * UNSEEN * np.sqrt(count / 110)
 
 
 @pytest.mark.parametrize("apart", [1, 2, 600, 601])
@@ -151,24 +147,6 @@ def test_a_picture_without_defects_has_none(scene: str, xtrans: bool) -> None:
 
     assert len(defects_of(seen[scene])) == 0
     assert len(defects_of(seen[scene], [seen[name] for name in SCENES if name != scene])) == 0
-
-
-def test_defects_of_xtrans_are_replaced_too(tmp_path: Path) -> None:
-    at = places(110)
-    clean = photo.develop(write_xtrans(tmp_path / "clean.dng", mosaic(xtrans=True, height=600)))
-    shots = [
-        write_xtrans(tmp_path / f"{scene}.dng", defective(mosaic(scene, xtrans=True, height=600), at))
-        for scene in SCENES[:3]
-    ]
-
-    alone, told = photo.develop(shots[0]), photo.develop(shots[0], siblings=shots)
-
-    assert clean.pipeline.startswith("raw/xtrans")
-    assert clean.remarks == ()
-    assert 0.4 * 110 <= int(alone.remarks[0].split()[0]) <= 110
-    assert 0.9 * 110 <= int(told.remarks[0].split()[0]) <= 110
-    damage = np.sqrt(np.mean((told.planes - clean.planes) ** 2))
-    assert damage < 0.3 * UNSEEN
 
 
 def test_the_fine_detail_of_an_xtrans_photo_is_no_damage(tmp_path: Path) -> None:

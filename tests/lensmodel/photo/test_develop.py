@@ -15,11 +15,7 @@ from scipy import ndimage
 
 from lensmodel import photo
 from lensmodel.core import codec
-from lensmodel.core.errors import (
-    RawDecodeError,
-    TruncatedImageError,
-    UnsupportedFormatError,
-)
+from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
 from lensmodel.photo.dng import write_bayer_dng
 

@@ -87,25 +87,6 @@ def test_sniff_never_raises_anything_else(head: bytes) -> None:
         photo.sniff(head)
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
-def test_inspect_tells_kind_and_size(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "photo"
-    path.write_bytes(encoded(kind))
-    info = photo.inspect(path)
-
-    assert (info.kind, info.width, info.height) == (kind.lower(), 60, 40)
-
-
-def test_inspect_tells_dng_from_tiff_and_its_size(tmp_path: Path) -> None:
-    mosaic = np.random.default_rng(0).integers(600, 9000, (48, 64), dtype=np.uint16)
-    write_bayer_dng(tmp_path / "bayer", mosaic, black=512, white=15000)
-    photo.write_image(tmp_path / "linear", np.full((3, 48, 64), 0.5), photo.Encoding(), format="dng")
-
-    for name in ("bayer", "linear"):
-        info = photo.inspect(tmp_path / name)
-        assert (info.kind, info.width, info.height) == ("dng", 64, 48)
-
-
 def _stack() -> bytes:
     out = io.BytesIO()
     pages = np.zeros((100, 32, 32), dtype=np.uint8)

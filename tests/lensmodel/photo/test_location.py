@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
+from lensmodel.photo import tiff
 from lensmodel.photo.location import LocationTraces, find_location
 
 LATITUDE = (47.0, 13.0, 14.159)
@@ -51,26 +52,12 @@ def cleaned(data: bytes) -> tuple[bytes, LocationTraces]:
 
 
 def tiff_with_gps() -> bytes:
-    """Write a grey TIFF by hand: image libraries leave GPS directories out of TIFF files."""
-    pixels = PIXELS[:, :, 0].tobytes()
-    rational = struct.pack("<6I", 47, 1, 13, 1, 14159, 1000)
-    exposure = struct.pack("<2I", 14, 10)
-    main, exif, gps = 8, 8 + 2 + 12 * 12 + 4, 8 + 2 + 12 * 12 + 4 + 18
-    maker = gps + 2 + 2 * 12 + 4
-    fraction, latitude, strip = maker + 6, maker + 14, maker + 38
-    tags = [
-        *((256, 4, 1, 64), (257, 4, 1, 48), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1)),
-        *((271, 2, 6, maker), (273, 4, 1, strip), (277, 3, 1, 1), (278, 4, 1, 48), (279, 4, 1, len(pixels))),
-        *((34665, 4, 1, exif), (34853, 4, 1, gps)),
-    ]
-
-    def directory(entries: list[tuple[int, int, int, int]]) -> bytes:
-        packed = b"".join(struct.pack("<HHII", *entry) for entry in entries)
-        return struct.pack("<H", len(entries)) + packed + bytes(4)
-
-    places = [(1, 2, 2, int.from_bytes(b"N\0\0\0", "little")), (2, 5, 3, latitude)]
-    parts = [directory(tags), directory([(0x829D, 5, 1, fraction)]), directory(places), b"Maker\0"]
-    return b"II*\0" + struct.pack("<I", main) + b"".join(parts) + exposure + rational + pixels
+    """Write a grey TIFF with our own hand: image libraries leave GPS directories out of TIFF files."""
+    out = io.BytesIO()
+    places = {1: tiff.text("N"), 2: tiff.rationals(*LATITUDE)}
+    below = {tiff.EXIF: {0x829D: tiff.rationals(1.4)}, tiff.GPS: places}
+    tiff.write_strip(out, {262: tiff.shorts(1), 271: tiff.text("Maker")}, below, PIXELS[:, :, 0])
+    return out.getvalue()
 
 
 FILES = {

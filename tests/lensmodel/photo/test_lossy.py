@@ -55,17 +55,22 @@ def write_lossy_dng(
     )
 
 
-@pytest.mark.parametrize("quality", [85, 70])
-def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(quality: int, tmp_path: Path) -> None:
-    before = scene()
+@pytest.mark.parametrize("kind", ["dng", "jpeg"])
+@pytest.mark.parametrize("quality", [92, 85, 70])
+def test_the_noise_of_a_lossy_file_is_the_error_that_rounding_made(
+    kind: str, quality: int, tmp_path: Path
+) -> None:
     planes = []
     for each in (100, quality):
-        write_lossy_dng(tmp_path / "x.dng", before, each)
-        developed = photo.develop(tmp_path / "x.dng")
+        if kind == "dng":
+            write_lossy_dng(tmp_path / "x", scene(), each)
+        else:
+            (tmp_path / "x").write_bytes(jpeg_tile(scene(), each))
+        developed = photo.develop(tmp_path / "x")
         planes.append(developed.planes[1])
     coded = developed.coding_noise
     assert coded is not None
-    assert (developed.info.kind, developed.lossy) == ("dng", True)
+    assert (developed.info.kind, developed.lossy) == (kind, True)
     for noise in (*developed.correction_noise, *developed.coarse_noise):
         assert noise.variance(np.array(0.2)) >= 0.999 * coded.variance(np.array(0.2))
     error = planes[1] - planes[0]

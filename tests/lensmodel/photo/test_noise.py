@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 
 from lensmodel import photo
@@ -135,26 +134,6 @@ def test_the_noise_of_the_planes_is_what_demosaicing_leaves_of_it(
     inside = developed.planes[:, 16:-16, 16:-16].astype(np.float64)
     for plane, model in zip(inside, developed.noise, strict=True):
         assert model.variance(plane.mean()) == pytest.approx(plane.var(), rel=0.1)
-
-
-@pytest.mark.parametrize("quality", [75, 92])
-def test_the_noise_of_a_jpeg_counts_what_compression_takes_from_detail(tmp_path: Path, quality: int) -> None:
-    curve = curves_of("srgb")[1]
-    rng = np.random.default_rng(3)
-    # as much detail at all frequencies, far above the rounding of the coefficients
-    light = np.clip(0.2 + 0.06 * rng.standard_normal((256, 256)), 0.05, 0.5)
-    numbers = np.rint(np.interp(light, curve[::257], np.arange(256.0))).astype(np.uint8)
-    Image.fromarray(numbers).save(tmp_path / "x.jpg", quality=quality)
-    developed = photo.develop(tmp_path / "x.jpg")
-
-    assert developed.coding_noise is not None
-    error = developed.planes[1] - curve[::257][numbers]
-    # the middle step stands for all 64, of which some are twice as coarse
-    assert 0.3 < developed.coding_noise.variance(np.array(0.2)) / error.var() < 1.2
-    assert all(
-        model.variance(np.array(0.2)) >= 0.99 * developed.coding_noise.variance(np.array(0.2))
-        for model in developed.correction_noise
-    )
 
 
 @pytest.mark.parametrize("width", [0.0, 0.5, 1.0])

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from app.commands.service import Data, opened, settings_from
+from app.commands.service import Data, opened
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from app.store.accounts import Accounts
     from app.store.tables import KeyRow
 
 keys = typer.Typer(
@@ -43,16 +40,6 @@ def _span(text: str) -> timedelta:
     if match is None:
         raise UsageError(f"a span of time is a number and h, d, w or y, such as 90d; got {text!r}")
     return timedelta(hours=int(match[1]) * HOURS[match[2]])
-
-
-@contextmanager
-def _opened(data: Data) -> Iterator[Accounts]:
-    """Open the keys of an installation, its schema brought up to date."""
-    from app.store import migrate  # noqa: PLC0415 - the list of commands does not wait for it
-
-    with opened(settings_from(data)) as store:
-        migrate.upgrade(store.database)
-        yield store.accounts
 
 
 @keys.command()
@@ -101,8 +88,8 @@ def create(
             f"an owner's name has 1 to 100 printable characters and no vertical bar, got {owner!r}"
         )
     lasts = None if expires == "never" else _span(expires)
-    with _opened(data) as store:
-        text = store.create_key(
+    with opened(data) as (_, store, _):
+        text = store.accounts.create_key(
             name,
             [scope],  # type: ignore[list-item]  # the option takes no other
             label=label,
@@ -132,8 +119,8 @@ def listed(
     """
     from app.store.owners import ANY_OWNER  # noqa: PLC0415 - the list of commands does not wait for it
 
-    with _opened(data) as store:
-        rows = [_described(key) for key in store.keys(owner or ANY_OWNER)]
+    with opened(data) as (_, store, _):
+        rows = [_described(key) for key in store.accounts.keys(owner or ANY_OWNER)]
     if json_output:
         typer.echo(json.dumps(rows, indent=2))
         return
@@ -173,7 +160,7 @@ def revoke(
     Exit status: 0 ended, 1 there is no such key, 2 wrong usage.
     """
     short = prefix.removeprefix("lpk_").partition("_")[0]
-    with _opened(data) as store:
-        if not store.revoke_key(short):
+    with opened(data) as (_, store, _):
+        if not store.accounts.revoke_key(short):
             raise InvalidInputError(f"no key begins with {short}: lensmodel keys list shows them")
     typer.echo(f"key {short} is revoked")

@@ -2,37 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from app.commands.service import Data, opened, settings_from
-from app.runtime.settings import Settings
+from app.commands.service import Data, opened
 from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import Json, Quiet
-
-if TYPE_CHECKING:
-    from app.blobs.storage import Storage
-    from app.store import Store
-
-
-@contextmanager
-def _installation(data: Path | None) -> Iterator[tuple[Settings, Store, Storage]]:
-    """Open an installation; a folder that is not there would be made, and found empty."""
-    from app.blobs.storage import Storage  # noqa: PLC0415 - the list of commands does not wait for it
-    from app.store import migrate  # noqa: PLC0415 - same
-
-    settings = settings_from(data)
-    if not settings.database_url and not (settings.data_dir / "app.db").is_file():
-        raise UsageError(f"{settings.data_dir} holds no installation; give its folder by --data")
-    with opened(settings) as store:
-        migrate.check(store.database)
-        yield settings, store, Storage(settings.storage, patience_s=settings.storage_seconds, create=False)
 
 
 def doctor(
@@ -57,7 +35,7 @@ def doctor(
     from app.runtime.doctor import examine  # noqa: PLC0415 - the list of commands does not wait for it
 
     shown = Display.of(context, quiet=quiet, as_json=json_output)
-    with _installation(data) as (settings, store, storage):
+    with opened(data, existing=True) as (settings, store, storage):
         report = examine(settings, store, storage, deep=deep)
     if json_output:
         shown.document(asdict(report))
@@ -95,7 +73,7 @@ def backup(
     from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
 
     shown = Display.of(context, quiet=quiet, as_json=json_output)
-    with _installation(data) as (_, store, storage), shown.progress() as bars:
+    with opened(data, existing=True) as (_, store, storage), shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
 
         def show(done: int, total: int) -> None:

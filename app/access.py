@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 import time
 from dataclasses import dataclass
@@ -47,27 +48,22 @@ class Gate:
     """Identifies who asks, and refuses those who may not; all but `quick` may read the database."""
 
     def __init__(self, settings: Settings, store: Accounts) -> None:
-        self._settings, self._store = settings, store
-        self._closed = settings.needs_keys
-        self._looked = -FRESH_S
+        self._store, self._closed = store, settings.needs_keys
+        # until when nobody needs a key, as far as that is known without the database
+        self._open_until = math.inf if settings.auth == "none" else -math.inf
         # each use of it is one step, which threads do not part
         self._known: dict[str, tuple[float, Who]] = {}
 
     def is_closed(self) -> bool:
         """Whether a key is required: always, or since one was created."""
-        if not self._closed and not self._is_open():
-            self._closed, self._looked = self._store.has_keys(), time.monotonic()
+        if not self._closed and time.monotonic() > self._open_until:
+            self._closed, self._open_until = self._store.has_keys(), time.monotonic() + FRESH_S
         return self._closed
-
-    def _is_open(self) -> bool:
-        """Whether nobody needs a key, as far as that is known without the database."""
-        fresh = time.monotonic() - self._looked <= FRESH_S
-        return not self._closed and (self._settings.auth == "none" or fresh)
 
     def quick(self, request: Request) -> Who | None:
         """Return who asks if that is known without the database; None where it must be looked up."""
         if not self._closed:
-            return EVERYBODY if self._is_open() else None
+            return EVERYBODY if time.monotonic() <= self._open_until else None
         shown = shown_by(request)
         return None if shown is None else self._remembered(accounts.digest_of(shown))
 

@@ -311,7 +311,7 @@ class Worker:
         """Compile the inner loops for all tasks, unless that was done for this program."""
         try:
             cache = self._sandbox.cache
-            if cache is None or (done := cache / f"warm-{fingerprint()}").exists():
+            if (done := cache / f"warm-{fingerprint()}").exists():
                 return
             own = {"NUMBA_CACHE_DIR": str(cache), PARENT: str(os.getpid())}
             subprocess.run(  # noqa: S603 - our own interpreter, our own module

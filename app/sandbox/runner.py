@@ -89,7 +89,7 @@ class Sandbox:
         scratch: Path,
         budget: Budget,
         *,
-        cache: Path | None = None,
+        cache: Path,
         account: SystemAccount | None = None,
         niceness: int = child.NICENESS,
     ) -> None:
@@ -101,8 +101,7 @@ class Sandbox:
         self._alone = threading.Lock()  # the exit status of a child can be read only once
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
-        if self.cache is not None:
-            self.cache.mkdir(parents=True, exist_ok=True)
+        self.cache.mkdir(parents=True, exist_ok=True)
         if self.account is not None:
             self.account.lets_through(scratch)
         self._serve()
@@ -116,10 +115,8 @@ class Sandbox:
             if server is not None and _lives(server):
                 return
             before, clean = dict(os.environ), child.clean_environment()
-            if self.cache is not None:
-                clean["NUMBA_CACHE_DIR"] = str(self.cache)
             os.environ.clear()
-            os.environ.update(clean)
+            os.environ.update(clean, NUMBA_CACHE_DIR=str(self.cache))
             try:
                 forkserver.ensure_running()
             finally:
@@ -152,7 +149,7 @@ class Sandbox:
         with self.budget.share(limits.memory_mb, wanted) as entered:
             if not entered:
                 return ended("cancelled")
-            reads = [*reads, *([] if self.cache is None else [self.cache])]
+            reads = [*reads, self.cache]
             (folder / child.PROGRESS).write_bytes(child.STEPS.pack(0, 0))
             (folder / REPORT).unlink(missing_ok=True)  # of a try before
             if self.account is not None:

@@ -13,7 +13,6 @@ Revision 6.0", Aldus, 1992, section 20.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,8 +29,7 @@ from lensmodel.photo.values import Matrix3, Transfer
 CODES: Final = 65536  # of 16 bits
 _CURVE_POINTS: Final = 4096  # of a profile's table: the most that all programs read
 _LEAST_COLUMN: Final = 1e-3  # of XYZ: a channel that gives no light has no curve
-_ADDITIVE: Final = 2e-3
-"""Error in XYZ, white is 1, up to which channels add up (chosen): rounding to 16 bits is a tenth of it."""
+_ADDITIVE: Final = 2e-3  # error in XYZ up to which channels add up (chosen): rounding makes a tenth of it
 
 Curve: TypeAlias = NDArray[np.float32]
 """Linear light at the codes k / 65535, shape (65536,), not decreasing."""
@@ -123,42 +121,41 @@ def matrix_profile(icc: bytes) -> MatrixProfile | None:
         return None
     codes = np.linspace(0.0, 1.0, CODES)
     channels = 3 if space == "rgb" else 1
-    mixed = np.random.default_rng(0).random((1, 64, channels))
+    mixed = np.random.default_rng(0).random((64, channels))
+    ramps = np.zeros((channels, CODES, channels))
+    for k in range(channels):
+        ramps[k, :, k] = codes
     try:
-        ramps = np.zeros((channels, CODES, channels))
-        for k in range(channels):
-            ramps[k, :, k] = codes
-        xyz, of_mixed = _to_xyz(ramps, icc, space), _to_xyz(mixed, icc, space)[0]
+        xyz = _to_xyz(np.concatenate([ramps.reshape(-1, channels), mixed]), icc, space)
     except (imagecodecs.CmsError, ValueError):
         return None
+    xyz, of_mixed = xyz[:-64].reshape(channels, CODES, 3), xyz[-64:]
     columns = xyz[:, -1, :].T  # of the full channels
     power = (columns**2).sum(axis=0)
     if not np.isfinite(xyz).all() or power.min() < _LEAST_COLUMN**2:
         return None
     levels = np.einsum("knx,xk->kn", xyz, columns) / power[:, None]
     levels = np.maximum.accumulate(np.clip(levels, 0.0, 1.0), axis=1)
-    at = np.stack([np.interp(mixed[0, :, k], codes, levels[k]) for k in range(channels)], axis=-1)
+    at = np.stack([np.interp(mixed[:, k], codes, levels[k]) for k in range(channels)], axis=-1)
     if np.abs(at @ columns.T - of_mixed).max() > _ADDITIVE:
         return None
     red, green, blue = np.broadcast_to(levels, (3, CODES)).astype(np.float32)
-    if channels == 1:
-        return MatrixProfile((red, green, blue), D65_TO_D50 @ SRGB_TO_XYZ_D65)
-    return MatrixProfile((red, green, blue), columns) if abs(np.linalg.det(columns)) > 1e-6 else None
+    to_xyz = columns if channels == 3 else D65_TO_D50 @ SRGB_TO_XYZ_D65
+    return MatrixProfile((red, green, blue), to_xyz) if abs(np.linalg.det(to_xyz)) > 1e-6 else None
 
 
 def _to_xyz(values: NDArray[np.float64], icc: bytes, space: str) -> NDArray[np.float64]:
-    return np.asarray(
-        imagecodecs.cms_transform(
-            np.ascontiguousarray(values),
-            icc,
-            imagecodecs.cms_profile("xyz"),
-            colorspace=space,
-            outcolorspace="xyz",
-            outdtype=np.float64,
-            intent=1,  # relative colorimetric: white is that of D50
-        ),
-        dtype=np.float64,
-    ).reshape(*values.shape[:2], 3)
+    """XYZ under D50 of numbers `(value, channel)`, relative colorimetric: white is that of D50."""
+    out = imagecodecs.cms_transform(
+        values[None],
+        icc,
+        imagecodecs.cms_profile("xyz"),
+        colorspace=space,
+        outcolorspace="xyz",
+        outdtype=np.float64,
+        intent=1,
+    )
+    return np.asarray(out, dtype=np.float64).reshape(-1, 3)
 
 
 def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:
@@ -206,9 +203,7 @@ def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:
     if not np.isfinite(srgb_to_camera).all() or np.abs(sums).min() < 1e-6:
         return None
     balanced = srgb_to_camera / sums
-    return (
-        np.linalg.inv(balanced) if abs(np.linalg.det(balanced)) > 1e-6 and math.isfinite(sums.sum()) else None
-    )
+    return np.linalg.inv(balanced) if abs(np.linalg.det(balanced)) > 1e-6 else None
 
 
 # --- colour spaces that a file declares by numbers -----------------------------------------------

@@ -11,44 +11,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+# Least height above the neighbours of the colour, in standard deviations of the noise and relative to how much
+# these differ, where texture stays below, and most of it in the pixels beside: points of light have a tenth.
+# All are chosen.
 _SIGMAS: Final = {"sure": 25.0, "likely": 10.0, "possible": 10.0}
-"""Least height above the neighbours of the colour, in standard deviations of the noise (chosen)."""
-
 _CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
-"""Least height relative to how much the neighbours of the colour differ (chosen): texture stays below."""
-
 _BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
-"""Most of the height by which pixels beside it stand out (chosen): beside points of light a tenth."""
 
 _MANY: Final = 3.0  # where so many times more are sure than likely, the likely ones are defects too (chosen)
-
-_MOST: Final = 2e-3
-"""Share of the pixels above which what was found is a picture after all, such as a sky of stars (chosen)."""
-
-_ALIKE: Final = 0.9
-"""Correlation of two small pictures from which on they are of one scene (chosen): of a burst it is 0.99."""
-
+_MOST: Final = 2e-3  # share of the pixels above which they are a picture, such as a sky of stars (chosen)
+_ALIKE: Final = (
+    0.9  # correlation of small pictures from which on they show one scene (chosen): a burst has 0.99
+)
 _NEIGHBOURS: Final = 8  # of the same colour
 _FILLED_FROM: Final = 4  # of them, the nearest (chosen): more lie across edges
 _REACH: Final = 4  # pixels to the farthest of them, in any mosaic that is read
 _NEARLY: Final = 0.8  # of the least height (chosen): above all neighbours but one, not above their median
 _SAMPLES: Final = 60_000  # pixels that tell of the noise (chosen): more would not change it
 _LEVELS: Final = 24  # at which noise is measured (chosen)
-_QUIET: Final = 0.3
-"""Share of the pixels of one level, most like their neighbours, that tell of the noise (chosen)."""
-_QUIET_HEIGHT: Final = 0.42
-"""Quantile `_QUIET` of |N(0, 1 + pi / 16)|: white noise against the median of eight neighbours."""
+_QUIET: Final = 0.3  # share of a level's pixels, most like their neighbours, that tell of the noise (chosen)
+_QUIET_HEIGHT: Final = 0.42  # their quantile of |N(0, 1 + pi / 16)|: white noise against a median of eight
 _SMALL: Final = (24, 36)  # of the pictures by which scenes are told apart (chosen)
 
 Places: TypeAlias = NDArray[np.int64]
 """Pixels of a mosaic by their number, row by row; sorted."""
-
-_Offsets: TypeAlias = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,17 +64,24 @@ class Neighbours:
         self.shape, self.period = colours.shape, period
         self._step = period * -(-_REACH // period)  # by which a place beyond the frame moves into it
         pattern = np.where(colours[:period, :period] == 3, 1, colours[:period, :period])
-        self.alike: dict[tuple[int, int], _Offsets] = {
-            (row, col): _alike(pattern, row, col) for row, col in np.ndindex(period, period)
-        }
+        around = [at for at in product(range(-_REACH, _REACH + 1), repeat=2) if any(at)]
+        around.sort(key=lambda at: (at[0] ** 2 + at[1] ** 2, at))
+        self.alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        for row, col in np.ndindex(period, period):
+            same = [
+                (down, right)
+                for down, right in around
+                if pattern[(row + down) % period, (col + right) % period] == pattern[row, col]
+            ]
+            self.alike[row, col] = same[:_NEIGHBOURS]
 
     def inside(self, rows: NDArray[np.integer], cols: NDArray[np.integer]) -> tuple[Places, Places]:
         """Move places beyond the frame into it by whole periods: the colour stays, the pixel is another."""
-        height, width = self.shape
-        return self._moved(rows, height), self._moved(cols, width)
-
-    def _moved(self, index: NDArray[np.integer], length: int) -> Places:
-        return index + self._step * ((index < 0).astype(np.int64) - (index >= length))
+        moved_rows, moved_cols = (
+            index + self._step * ((index < 0).astype(np.int64) - (index >= length))
+            for index, length in zip((rows, cols), self.shape, strict=True)
+        )
+        return moved_rows, moved_cols
 
     def of(self, places: Places) -> Places:
         """Nearest pixels of the same colour, shape (8, places), by distance."""
@@ -101,28 +100,16 @@ class Neighbours:
         return at[0] * self.shape[1] + at[1]
 
 
-def _alike(pattern: NDArray[np.integer], row: int, col: int) -> _Offsets:
-    """Offsets of the nearest pixels of the colour of one site, by distance."""
-    period, reach = len(pattern), range(-_REACH, _REACH + 1)
-    alike = [
-        (down, right)
-        for down in reach
-        for right in reach
-        if (down or right) and pattern[(row + down) % period, (col + right) % period] == pattern[row, col]
-    ]
-    return tuple(sorted(alike, key=lambda at: (at[0] ** 2 + at[1] ** 2, at))[:_NEIGHBOURS])
-
-
 def suspects(values: NDArray[np.uint16], near: Neighbours) -> Suspects:
     """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
-    noise, flat = _Noise.of(values, near), values.ravel()
-    places = _standing_out(values, near, noise)
+    levels, deviations = _noise(values, near)
+    flat, places = values.ravel(), _standing_out(values, near, levels, deviations)
     ring = flat[near.of(places)].astype(np.float32)
     middle = np.median(ring, axis=0)
     sign = np.sign(flat[places] - middle)
     height = np.abs(flat[places] - middle)
     apart = np.sort(np.abs(ring - middle), axis=0)
-    sigma = np.maximum(noise.at(middle), 1.4826 * apart[_NEIGHBOURS // 2])
+    sigma = np.maximum(np.interp(middle, levels, deviations), 1.4826 * apart[_NEIGHBOURS // 2])
     kept = np.maximum(_SIGMAS["possible"] * sigma, _CONTRAST["possible"] * apart[-2]) < height
     places, sign, height, sigma, apart = (
         array[..., kept] for array in (places, sign, height, sigma, apart[-2:])
@@ -175,39 +162,27 @@ def replace_defects(values: NDArray[np.uint16], places: Places, near: Neighbours
     return len(filled)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Noise:
-    """Standard deviation of the noise by level, in the mosaic's numbers."""
-
-    levels: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, values: NDArray[np.uint16], near: Neighbours) -> _Noise:
-        """Measure it on the pixels that are most like their neighbours."""
-        places = np.arange(0, values.size, max(1, values.size // _SAMPLES) | 1)
-        flat = values.ravel()
-        middle = np.median(flat[near.of(places)].astype(np.float32), axis=0)
-        height = np.abs(flat[places] - middle)
-        order = np.argsort(middle, kind="stable")
-        parts = np.array_split(order, _LEVELS)
-        levels = [float(middle[part].mean()) for part in parts]
-        sigma = [float(np.quantile(height[part], _QUIET)) / _QUIET_HEIGHT for part in parts]
-        return cls(np.array(levels), np.maximum(sigma, 0.5))  # no less than what rounding makes
-
-    def at(self, level: NDArray[np.floating]) -> NDArray[np.float64]:
-        """At a level."""
-        return np.interp(level, self.levels, self.sigma)
+def _noise(values: NDArray[np.uint16], near: Neighbours) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Levels, and the standard deviation of the noise there, on the pixels most like their neighbours."""
+    places = np.arange(0, values.size, max(1, values.size // _SAMPLES) | 1)
+    flat = values.ravel()
+    middle = np.median(flat[near.of(places)].astype(np.float32), axis=0)
+    height = np.abs(flat[places] - middle)
+    parts = np.array_split(np.argsort(middle, kind="stable"), _LEVELS)
+    levels = [float(middle[part].mean()) for part in parts]
+    sigma = [float(np.quantile(height[part], _QUIET)) / _QUIET_HEIGHT for part in parts]
+    return np.array(levels), np.maximum(sigma, 0.5)  # no less than what rounding makes
 
 
-def _standing_out(values: NDArray[np.uint16], near: Neighbours, noise: _Noise) -> Places:
+def _standing_out(
+    values: NDArray[np.uint16], near: Neighbours, levels: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> Places:
     """Pixels that differ from all but one of their neighbours of the colour by more than those differ."""
     index = near.inside(*(np.arange(-_REACH, side + _REACH) for side in values.shape))
     wide, period = values[np.ix_(*index)], near.period
     planes = {site: np.ascontiguousarray(wide[site[0] :: period, site[1] :: period]) for site in near.alike}
-    least = (_NEARLY * _SIGMAS["possible"] * noise.at(np.arange(1 << 16, dtype=np.float64))).astype(
-        np.float32
-    )
+    noise = np.interp(np.arange(1 << 16), levels, sigma)
+    least = (_NEARLY * _SIGMAS["possible"] * noise).astype(np.float32)
     found = []
     for (row, col), offsets in near.alike.items():
         site = values[row::period, col::period]

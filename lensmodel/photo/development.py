@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -37,13 +37,9 @@ from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, Pho
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
+# Compressions of DNG that LibRaw, as built for Python, opens but cannot decode.
 _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
-"""Compressions of DNG that LibRaw, as built for Python, opens but cannot decode."""
-
-_MOST: Final = 7
-"""Photos that are asked (chosen): with eight a pixel that stands out in one of three pictures is found."""
-
-_KEPT: Final = 256  # answers (chosen): each is some thousand numbers
+_MOST: Final = 7  # photos that are asked (chosen): with eight, what stands out in one of three is found
 
 
 def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
@@ -53,10 +49,10 @@ def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
         return _info_of(path, said, raw, limits)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _opened(path: Path, limits: Limits) -> Iterator[tuple[Said, rawpy.RawPy | None]]:
     """Open a file once: what its header says, and LibRaw where it is a RAW file."""
-    with ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         said = Said.of(stack.enter_context(opened_header(path, limits)))
         is_raw = said.header.kind in {"raw", "dng"}
         yield said, stack.enter_context(opened_raw(path)) if is_raw else None
@@ -98,31 +94,29 @@ def _suspects_of_siblings(
     for sibling in siblings:
         if len(told) == _MOST:
             break
-        try:
+        with contextlib.suppress(LensModelError, OSError):
             status = sibling.stat()
             if os.path.samestat(status, path.stat()):
                 continue
-            one = _suspects(sibling, status.st_mtime_ns, status.st_size, limits)
-        except (LensModelError, OSError):
-            continue
-        if one is not None and one[0] == _body(metadata):
-            told.append(one[1])
+            body, seen = _suspects(sibling, status.st_mtime_ns, status.st_size, limits)
+            if seen is not None and body == _body(metadata):
+                told.append(seen)
     return told
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=256)  # answers (chosen): each is some thousand numbers
 def _suspects(
     path: Path, changed_ns: int, size: int, limits: Limits
-) -> tuple[tuple[str, ...], Suspects] | None:
-    """The body of a photo and what its mosaic shows; None without a mosaic or a known body."""
+) -> tuple[tuple[str, ...], Suspects | None]:
+    """The body of a photo and what its mosaic shows, nothing without a mosaic or a known body."""
     del changed_ns, size  # a file that changed is another one
     with opened_header(path, limits) as header:
         body = _body(Said.of(header).metadata())
     if not body[0]:
-        return None
+        return body, None
     with _opened(path, limits) as (_, raw):
         mosaic = None if raw is None else Mosaic.of(raw)
-        return None if mosaic is None else (body, mosaic.suspects())
+        return body, None if mosaic is None else mosaic.suspects()
 
 
 def _body(metadata: PhotoMetadata) -> tuple[str, ...]:

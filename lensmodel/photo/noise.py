@@ -12,13 +12,8 @@ from scipy import ndimage
 from lensmodel.core.types import NoiseModel, Plane, Planes
 
 BLOCK: Final = 8  # side of the blocks in pixels: flat places of this size exist in almost any photo
-
-GRAIN: Final = 4
-"""Side in pixels of blocks whose means tell of coarse grain: fine grain averages out there (chosen)."""
-
-_GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)
-"""Shares of the pixels darker than the levels at which grain is compared (chosen)."""
-
+GRAIN: Final = 4  # side of blocks whose means tell of coarse grain: fine grain averages out there (chosen)
+_GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)  # shares of the pixels that are darker (chosen)
 _BINS: Final = 24  # levels at most, from dark to bright (chosen): a line of two terms needs no more
 _FLAT_SHARE: Final = 0.15  # share of the blocks of one level, the least textured, that count (chosen)
 _MIN_BLOCKS: Final = 24  # of a level (chosen): 1,536 pixels tell a standard deviation within some percent
@@ -177,19 +172,16 @@ def _fit(
         return NoiseModel(0.0, 0.0)
     if len(levels) == 1:
         return NoiseModel(0.0, float(variances[0]))
-    trust = np.ones_like(levels)
     # Three standard errors of a variance from the median deviation of pixels, every second of
     # which is independent after the high-pass.
     chance = 3.0 * np.sqrt(2.7 * 2.0 * 2.0 / counts)
-    model = np.maximum(variances, 1e-16)
+    trust, model = np.ones_like(levels), np.maximum(variances, 1e-16)
     slope = offset = 0.0
     for _ in range(12):
         weight = np.sqrt(counts * trust) / np.maximum(model, 1e-16)
-        design = np.stack([levels * weight, weight], axis=1)
-        slope, offset = _non_negative(design, variances * weight)
+        slope, offset = _non_negative(np.stack([levels * weight, weight], axis=1), variances * weight)
         model = np.maximum(slope * levels + offset, 1e-16)
-        excess = (variances - model) / model
-        trust = np.minimum(1.0, chance / np.maximum(excess, chance)) ** 2
+        trust = np.minimum(1.0, chance / np.maximum((variances - model) / model, chance)) ** 2
     return NoiseModel(slope, offset)
 
 

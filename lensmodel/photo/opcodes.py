@@ -6,7 +6,7 @@ Source: Adobe, "Digital Negative (DNG) Specification" 1.6, 2021, chapter 7.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,7 +19,7 @@ _NAMES: Final = (
     *("ScalePerColumn", "WarpRectilinear2"),
 )
 _GAIN_MAP: Final = 9
-_GAIN_HEAD: Final = ">10I4dI"
+_GAIN_HEAD: Final = struct.Struct(">10I4dI")
 _MOST: Final = 64  # opcodes of a list (chosen): cameras write below ten
 
 
@@ -41,14 +41,13 @@ class Opcode:
 def read(block: bytes) -> list[Opcode]:
     """Take a list apart; one that is damaged gives what came before the damage."""
     steps, at = list[Opcode](), 4
-    for _ in range(min(int.from_bytes(block[:4], "big"), _MOST) if len(block) >= 4 else 0):
-        if at + 16 > len(block):
-            break
-        number, version, flags, size = struct.unpack_from(">4I", block, at)
-        at += 16 + size
+    for _ in range(min(int.from_bytes(block[:4], "big"), _MOST)):
+        head, start = block[at : at + 16], at + 16
+        number, version, flags, size = struct.unpack(">4I", head.ljust(16, b"\xff"))
+        at = start + size
         if at > len(block):
             break
-        steps.append(Opcode(number, version, flags, block[at - size : at]))
+        steps.append(Opcode(number, version, flags, block[start:at]))
     return steps
 
 
@@ -80,25 +79,22 @@ def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opco
 
 def _gain_of_colours(step: Opcode, cfa: BayerPattern | None) -> tuple[int | None, Opcode] | None:
     """Return the colour that a gain map of a mosaic is for, None for all, and the map for planes."""
-    size = struct.calcsize(_GAIN_HEAD)
-    if len(step.data) < size:
+    if len(step.data) < _GAIN_HEAD.size:
         return None
-    top, left, bottom, right, _, _, row_pitch, col_pitch, *rest = struct.unpack(_GAIN_HEAD, step.data[:size])
-    if (row_pitch, col_pitch) == (1, 1):
-        colour, planes = None, (0, 3)
-    elif (row_pitch, col_pitch) == (2, 2) and cfa is not None:
-        colour = cfa[top % 2][left % 2]
-        planes = (colour, 1)
-    else:
+    top, left, bottom, right, _, _, *pitch, across, down = _GAIN_HEAD.unpack_from(step.data)[:10]
+    colour = cfa[top % 2][left % 2] if pitch == [2, 2] and cfa is not None else None
+    if colour is None and pitch != [1, 1]:
         return None
     if colour is not None:  # the two rows and columns between whose pixels the others stood
         top, left, bottom, right = top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2
-    head = struct.pack(_GAIN_HEAD, top, left, bottom, right, *planes, 1, 1, *rest)
-    return colour, Opcode(step.number, step.version, step.flags, head + step.data[size:])
+    planes = (0, 3) if colour is None else (colour, 1)
+    area = struct.pack(">10I", top, left, bottom, right, *planes, 1, 1, across, down)
+    return colour, replace(step, data=area + step.data[len(area) :])
 
 
 def _mean(one: Opcode, other: Opcode) -> Opcode:
-    size = struct.calcsize(_GAIN_HEAD)
-    gains = [np.frombuffer(step.data[size:], dtype=">f4").astype(np.float64) for step in (one, other)]
-    middle = ((gains[0] + gains[1]) / 2.0).astype(">f4").tobytes()
-    return Opcode(one.number, one.version, one.flags, one.data[:size] + middle)
+    first, second = (
+        np.frombuffer(step.data, ">f4", offset=_GAIN_HEAD.size).astype(np.float64) for step in (one, other)
+    )
+    middle = ((first + second) / 2.0).astype(">f4").tobytes()
+    return replace(one, data=one.data[: _GAIN_HEAD.size] + middle)

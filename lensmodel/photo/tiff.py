@@ -26,14 +26,9 @@ from lensmodel.core.errors import InvalidInputError
 
 Buffer: TypeAlias = bytes | mmap.mmap
 
-MAX_ENTRIES: Final = 1024
-"""Entries read of one directory: cameras write below 150, and a false count must not cost time (chosen)."""
-
-MAX_DIRECTORIES: Final = 64
-"""Directories followed: cameras write a dozen, and a tree must not cost time (chosen)."""
-
-MAX_VALUE_BYTES: Final = 16 << 20
-"""Bytes read of one value: honest ones are smaller, a false size must not fill the memory (chosen)."""
+# Against files made to cost time or memory (chosen): entries of a directory, of which cameras write below
+# 150; directories, of which they write a dozen; and bytes of a value.
+MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES = 1024, 64, 16 << 20
 
 # Tags that point to directories: Exif 3.0, section 4.6.3, and TIFF/EP.
 EXIF, GPS, SUB_DIRECTORIES = 0x8769, 0x8825, 0x014A
@@ -75,15 +70,14 @@ class Tag:
 
     def numbers(self, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
         """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
-        code, raw = _FORMATS[self.kind], self.raw()
+        code, raw = _FORMATS[self.kind], self.raw()[: most * _SIZES[self.kind]]
         if code == "s":
             return ()
-        raw = raw[: most * _SIZES[self.kind]]
         values = struct.unpack(f"{self.order}{len(raw) // struct.calcsize('=' + code[0])}{code[0]}", raw)
         if len(code) == 1:
             return values
         pairs = zip(values[::2], values[1::2], strict=True)
-        return tuple(float(Fraction(a, b)) if b else float("nan") for a, b in pairs)
+        return tuple(float(Fraction(a, b)) if b else math.nan for a, b in pairs)
 
 
 class Tags(dict[int, Tag]):
@@ -114,9 +108,10 @@ class Tags(dict[int, Tag]):
         """Text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1, nothing as `None`."""
         raw = self.raw(tag).split(b"\0", 1)[0]
         try:
-            return raw.decode("utf-8").strip() or None
+            read = raw.decode("utf-8")
         except UnicodeDecodeError:
-            return raw.decode("latin-1").strip() or None
+            read = raw.decode("latin-1")
+        return read.strip() or None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,9 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-# Least height above the neighbours of the colour, in standard deviations of the noise and relative to how much
-# these differ, where texture stays below, and most of it in the pixels beside: points of light have a tenth.
-# All are chosen.
+# Least height above the neighbours of the colour, in standard deviations of the noise and relative to how
+# much these differ, where texture stays below, and most of it in the pixels beside: points of light have a
+# tenth. All are chosen.
 _SIGMAS: Final = {"sure": 25.0, "likely": 10.0, "possible": 10.0}
 _CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
 _BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}

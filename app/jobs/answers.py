@@ -80,7 +80,7 @@ _PATCH = _answer(
     score=Annotated[float, Field(ge=-1e9, le=1e9)],
     cell=Annotated[int, Field(ge=0, le=100_000)],
 )
-_REJECTED = _answer("Rejected", **_WINDOW, rejected=_text(60))
+_REJECTED = _answer("Rejected", **_WINDOW, reason=_text(60))
 _LATERAL = _answer(
     "Lateral",
     **dict.fromkeys(("red", "blue"), Polynomial),

@@ -8,39 +8,39 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
+
+from structlog.contextvars import bind_contextvars, get_contextvars
 
 from app.jobs import inspection
 from app.jobs.answers import JobFailedError
 from app.jobs.context import MAX_UNPACKED, JobContext, NotWantedError
-from app.jobs.queue import DbosEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.other_lens import REMEDY, Described, difference
 from app.presets import configured_preset
-from app.store import NewPatch, NewSample
-from app.store.jobs import Job
 from app.store.owners import ANY_OWNER, now
 from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, PatchRow, PhotoRow
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
 
 log = logging.getLogger(__name__)
 
-# Seconds between two looks at the open cells of a photo (chosen): a cell takes seconds, a look one query
-WAIT_S: Final = 0.2
-# Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one
-LOOK_AFTER_S: Final = 5.0
 # Who chooses the patches of a photo that names nobody, of `lensmodel.patches.selectors`
 SELECTOR: Final = "r-map"
+# Seconds between two looks whether a photo is inspected (chosen): a look is one query
+WAIT_S: Final = 0.2
 # Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken
 MAX_PLACES: Final = 1000
 # How long the open photo of a pair waits until the closed one is inspected (chosen): that takes seconds,
@@ -52,14 +52,15 @@ _OF_PATCHES: Final = frozenset({"no_samples", "no_usable_patches", "invalid_para
 
 
 class PhotoWork:
-    """Jobs of photos and of their cells."""
+    """Jobs of photos."""
 
-    def __init__(self, context: JobContext, engine: DbosEngine) -> None:
-        self._context, self._engine, self._photos = context, engine, context.store.photos
+    def __init__(self, context: JobContext) -> None:
+        self._context = context
 
     def photo(self, photo_id: str, epoch: int) -> None:
         """Take a photo through all steps, as far as it can get."""
-        photo = self._photos.start(photo_id, epoch)
+        photos = self._context.store.photos
+        photo = photos.start(photo_id, epoch)
         if photo is None:
             return
         try:
@@ -67,69 +68,18 @@ class PhotoWork:
                 _read_profile(self._context, photo)
             else:
                 steps = _Measured if photo.given.get("kind") else _Steps
-                steps(self._context, self._engine, photo).run()
+                steps(self._context, photo).run()
         except NotWantedError:
             log.info("photo %s is not wanted any more", photo_id)
         except JobFailedError as error:
-            self._photos.fail(photo_id, epoch, error.code, error.detail)
-
-    def cell(self, photo_id: str, epoch: int, cell: int) -> None:
-        """Estimate the PSF of one field cell of a photo."""
-        photo, rows = (
-            self._photos.get(photo_id, ANY_OWNER),
-            self._photos.patches_of_cell(photo_id, epoch, cell),
-        )
-        if photo is None or not rows:
-            return
-        poor = {row.idx for row in rows}
-        try:
-            samples = self._samples(photo, rows)
-        except NotWantedError:
-            return
-        except JobFailedError as error:
-            log.info("cell %d of photo %s: %s: %s", cell, photo_id, error.code, error.detail)
-            if error.code not in _OF_PATCHES:
-                self._photos.fail_patches(photo_id, epoch, error.code, indices=sorted(poor))
-                return
-        else:
-            self._photos.add_samples(photo_id, epoch, samples)
-            poor -= {sample.idx for sample in samples}
-        if poor:
-            self._photos.fail_patches(photo_id, epoch, POOR, indices=sorted(poor), rejected=True)
-
-    def _samples(self, photo: PhotoRow, rows: Sequence[PatchRow]) -> list[NewSample]:
-        """Return the samples of some patches; they lie where their patches do, whatever a child says."""
-        context, preset = self._context, configured_preset(self._context.settings)
-        wanted, places = context.wants(photo), {row.idx: FieldPosition(row.r, row.phi) for row in rows}
-        developed = context.developed(photo, wanted)
-        with (
-            context.task(
-                "estimate",
-                photo,
-                wanted,
-                reads=[developed],
-                developed=str(developed),
-                photo=photo.public_id,
-                patches=[codec.to_json(_patch_of(row)) for row in rows],
-                numbers=[row.idx for row in rows],
-                settings=stored_settings(photo),
-                estimator=preset.estimator,
-                size=preset.kernel_size,
-            ) as (listed, folder),
-            _validated("estimator"),
-        ):
-            samples = returned_samples(folder, count=len(listed))
-            return [
-                NewSample(number, replace(sample, position=places[number]))
-                for number, sample in zip(listed, samples, strict=True)
-            ]
+            photos.fail(photo_id, epoch, error.code, error.detail)
 
 
 class _Steps:
     """The work on a photo by rows and tasks: each step does only what the tables do not have yet."""
 
-    def __init__(self, context: JobContext, engine: DbosEngine, photo: PhotoRow) -> None:
-        self._context, self._engine, self._photo = context, engine, photo
+    def __init__(self, context: JobContext, photo: PhotoRow) -> None:
+        self._context, self._photo = context, photo
         self._photos, self._wanted = context.store.photos, context.wants(photo)
         self._preset = configured_preset(context.settings)
         self._which = photo.public_id, photo.epoch
@@ -200,36 +150,58 @@ class _Steps:
             raise JobFailedError("no_usable_patches", text) from error
         if selection["lateral"] is not None:
             self._photos.record_lateral(*self._which, selection["lateral"])
-        windows = enumerate([*selection["patches"], *selection["rejected"]])
-        self._photos.plan_patches(
-            *self._which, [NewPatch(idx=number, **window) for number, window in windows]
-        )
+        self._photos.plan_patches(*self._which, selection["patches"], selection["rejected"])
 
     def estimate(self) -> None:
-        """Hand out the cells and wait until each is done, rejected or given up."""
-        owner = f"owner-{self._photo.owner_id}"
-        jobs = {cell: Job("cell", (*self._which, cell), owner) for cell in self._photos.cells(*self._which)}
-        for job in jobs.values():
-            self._engine.enqueue(job)
-        looked = time.monotonic()
-        while self._wanted():
-            still_open = self._photos.cells(*self._which)
-            if not still_open:
-                return
-            if time.monotonic() - looked > LOOK_AFTER_S:
-                looked = time.monotonic()
-                for cell in jobs.keys() & still_open:
-                    self._look_after(cell, jobs[cell])
-            time.sleep(WAIT_S)
-        raise NotWantedError
+        """Estimate in each cell with open patches, in as many at once as the worker has slots."""
+        cells: defaultdict[int | None, list[PatchRow]] = defaultdict(list)
+        for row in self._photos.patches(*self._which):
+            if row.state == "pending":
+                cells[row.cell].append(row)
+        log_context = partial(bind_contextvars, **get_contextvars())
+        with ThreadPoolExecutor(self._context.settings.worker_slots, initializer=log_context) as pool:
+            list(pool.map(self._estimate_cell, cells.values()))
 
-    def _look_after(self, cell: int, job: Job) -> None:
-        """Repair a cell whose job the engine lost, or gave up after it killed its workers."""
-        status = self._engine.status(job)
-        if status == "unknown":
-            self._engine.enqueue(job)
-        elif status in {"done", "lost"}:
-            self._photos.fail_patches(*self._which, "crashed_repeatedly", cell=cell)
+    def _estimate_cell(self, rows: Sequence[PatchRow]) -> None:
+        poor = {row.idx for row in rows}
+        try:
+            samples = self._samples(rows)
+        except JobFailedError as error:
+            log.info("cell %s of photo %s: %s: %s", rows[0].cell, self._which[0], error.code, error.detail)
+            if error.code not in _OF_PATCHES:
+                self._photos.fail_patches(*self._which, error.code, sorted(poor))
+                return
+        else:
+            self._photos.add_samples(*self._which, samples)
+            poor -= {number for number, _ in samples}
+        if poor:
+            self._photos.fail_patches(*self._which, POOR, sorted(poor), rejected=True)
+
+    def _samples(self, rows: Sequence[PatchRow]) -> list[tuple[int, PsfSample]]:
+        """Return the samples of some patches; they lie where their patches do, whatever a child says."""
+        places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
+        developed = self._context.developed(self._photo, self._wanted)
+        with (
+            self._context.task(
+                "estimate",
+                self._photo,
+                self._wanted,
+                reads=[developed],
+                developed=str(developed),
+                photo=self._photo.public_id,
+                patches=[codec.to_json(_patch_of(row)) for row in rows],
+                numbers=[row.idx for row in rows],
+                settings=stored_settings(self._photo),
+                estimator=self._preset.estimator,
+                size=self._preset.kernel_size,
+            ) as (listed, folder),
+            _validated("estimator"),
+        ):
+            samples = returned_samples(folder, count=len(listed))
+            return [
+                (number, replace(sample, position=places[number]))
+                for number, sample in zip(listed, samples, strict=True)
+            ]
 
     def check(self) -> None:
         """Make sure that enough of the patches gave a PSF, and not all in one place."""
@@ -262,7 +234,7 @@ class _Measured(_Steps):
             size=self._preset.kernel_size,
         ) as (listed, folder):
             patches, samples = _measured(listed, folder)
-        self._photos.plan_patches(*self._which, patches)
+        self._photos.plan_patches(*self._which, patches, [])
         self._enter("estimating")
         self._photos.add_samples(*self._which, samples)
 
@@ -328,23 +300,24 @@ def _validated(source: str) -> Iterator[None]:
         raise JobFailedError("internal_error", f"the {source} gave no kernels: {error}") from error
 
 
-def _measured(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON
+def _measured(listed: Any, folder: Path) -> tuple[list[dict[str, Any]], list[tuple[int, PsfSample]]]:  # noqa: ANN401 - a child's JSON
     """Return the places and the samples of a measurement."""
-    patches: dict[int, NewPatch] = {}
+    patches: list[dict[str, Any]] = []
     samples = []
     with _validated("measurement"):
         if not 0 < len(listed) <= MAX_PLACES * len(CHANNELS):
             raise InvalidInputError(f"{len(listed)} samples")
         for sample, entry in zip(returned_samples(folder, count=len(listed)), listed, strict=True):
-            number, error = int(entry["idx"]), sample.error
-            if error is None or not error <= 1.0 or not 0 <= number < MAX_PLACES:
+            number, error, place = int(entry["idx"]), sample.error, sample.position
+            if error is None or not error <= 1.0 or not 0 <= number <= len(patches) < MAX_PLACES:
                 raise InvalidInputError(f"a sample of place {number} with error {error}")
-            row, col, side = (int(entry[name]) for name in ("row", "col", "side"))
-            place = sample.position
-            patch = NewPatch(number, row, col, side, place.r, place.phi, cell=number, score=1.0 - error)
-            patches.setdefault(number, patch)
-            samples.append(NewSample(number, sample))
-    return list(patches.values()), samples
+            if number == len(patches):
+                corner = {name: int(entry[name]) for name in ("row", "col", "size")}
+                patches.append(
+                    {**corner, "r": place.r, "phi": place.phi, "cell": number, "score": 1.0 - error}
+                )
+            samples.append((number, sample))
+    return patches, samples
 
 
 def _read_profile(context: JobContext, file: PhotoRow) -> None:

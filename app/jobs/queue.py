@@ -13,7 +13,6 @@ import contextvars
 import json
 import logging
 import sqlite3
-import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import datetime
@@ -34,18 +33,14 @@ Handler: TypeAlias = Callable[..., None]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-QUEUE_OF: Final[Mapping[Kind, str]] = {
-    "photo": "photos",
-    "cell": "patches",
-    "correction": "corrections",
-    "measure": "patches",
-}
-# Deaths of its worker after which a job is started again (chosen): the job of a photo only waits for others
-# and hardly kills one, the others may be what killed it
-MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
+# How many jobs of a kind one worker runs at once (chosen): those of photos mostly wait for the sandbox
+AT_ONCE: Final[Mapping[Kind, int]] = {"photo": 8, "correction": 2, "measure": 2}
+# Deaths of its worker after which a job is started again (chosen): a photo takes long, and whoever restarts
+# workers interrupts it; the others may be what killed them
+MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "correction": 5, "measure": 3}
 _DEATHS: Final = "deaths"  # attribute of a job: how many workers have died of it, or while it ran
 # Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core
-POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.1}
+POLL_S: Final = 0.2
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
 
 
@@ -65,11 +60,9 @@ class _Json(DBOSSerializer):
 class DbosEngine:
     """DBOS in this process; one at a time, since the library keeps one state per process."""
 
-    def __init__(self, url: str, executor_id: str, *, slots: int, photos: int = 8) -> None:
+    def __init__(self, url: str, executor_id: str) -> None:
         self._url, self._executor_id = url, executor_id
-        self._concurrency = {"photos": photos, "patches": slots + 1, "corrections": 2}
         self._enqueued: set[str] = set()
-        self._guard = threading.Lock()
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
         """Open the tables, declare the queues, start running jobs: `handlers[kind](*arguments)`."""
@@ -89,37 +82,34 @@ class DbosEngine:
         for kind, handler in handlers.items():
             DBOS.workflow(name=kind)(handler)
         DBOS.launch()
-        for queue, limit in self._concurrency.items():
+        for kind, limit in AT_ONCE.items():
             DBOS.register_queue(
-                queue,
+                kind,
                 worker_concurrency=limit,
                 partition_worker_concurrency=limit,  # queues with partitions are fair between owners
-                polling_interval_sec=POLL_S[queue],
+                polling_interval_sec=POLL_S,
                 on_conflict="always_update",
             )
 
     def enqueue(self, job: Job) -> None:
         """Put a job into its queue; a second call does nothing, even after the job ended."""
-        with self._guard:
-            if job.id in self._enqueued:
-                return
+        if job.id in self._enqueued:
+            return
         options: EnqueueOptions = {
             "workflow_name": job.kind,
-            "queue_name": QUEUE_OF[job.kind],
+            "queue_name": job.kind,
             "workflow_id": job.id,
             "app_version": str(JOB_PROTOCOL),
             "queue_partition_key": job.owner,
         }
         _outside(DBOS.enqueue_workflow_with_options, options, *job.arguments)
-        with self._guard:
-            self._enqueued.add(job.id)
+        self._enqueued.add(job.id)
 
     def status(self, job: Job) -> Status:
         """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
         record = _outside(DBOS.get_workflow_status, job.id)
         if record is None:
-            with self._guard:
-                self._enqueued.discard(job.id)
+            self._enqueued.discard(job.id)
             return "unknown"
         if record.status in _WAITING:
             return "waiting"
@@ -150,8 +140,7 @@ class DbosEngine:
         ids = [row.workflow_id for row in ended]
         if ids:
             _outside(DBOS.delete_workflows, ids)
-        with self._guard:
-            self._enqueued.difference_update(ids)
+        self._enqueued.difference_update(ids)
         return len(ids)
 
     def stop(self) -> None:

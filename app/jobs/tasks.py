@@ -132,7 +132,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
     for window in selection.rejected:
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
         place = _window(window, developed.frame.position(*centre))
-        rejected.append({**place, "rejected": window.reason})
+        rejected.append({**place, "reason": window.reason})
     try:
         lateral = codec.to_json(correcting.lateral_of(developed))
     except LensModelError as error:
@@ -261,7 +261,7 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
             "idx": numbers.setdefault(measured.pixel, len(numbers)),
             "row": round(measured.pixel[0] - (measured.side - 1) / 2),
             "col": round(measured.pixel[1] - (measured.side - 1) / 2),
-            "side": measured.side,
+            "size": measured.side,
         }
         for measured in measurements
     ]

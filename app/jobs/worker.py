@@ -74,7 +74,6 @@ def ending_of(error: BaseException) -> JobFailedError:
 
 _SUBJECT: Final[Mapping[Kind, str]] = {
     "photo": "photo_id",
-    "cell": "photo_id",
     "correction": "correction_id",
     "measure": "lens_id",
 }
@@ -141,7 +140,7 @@ class Worker:
             Storage(settings.storage, patience_s=settings.storage_seconds, create=False),
             self._sandbox,
         )
-        self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
+        self._engine = DbosEngine(settings.jobs, self.id)
         self._host, self._last_beat = socket.gethostname(), monotonic()
         database = self._store.database
         self._file = database.path if database.is_sqlite else Path()
@@ -183,10 +182,9 @@ class Worker:
         # in a thread of its own: nothing below, and no duty, may delay the lease
         self._start_thread(beat_s, self._keep_lease)
         _insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
-        photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
+        corrections = CorrectionWork(self._context)
         handlers: dict[Kind, Handler] = {
-            "photo": photos.photo,
-            "cell": photos.cell,
+            "photo": PhotoWork(self._context).photo,
             "correction": corrections.correction,
             "measure": corrections.measure,
         }
@@ -226,11 +224,8 @@ class Worker:
         elif job.kind == "measure":
             unknown = {"error": None, "coverage": None, "problem": ending.code}
             self._store.lenses.record_metrics(subject, number, unknown)
-        elif job.kind == "photo" or ending.code == OUTAGE:
-            # of a cell: an outage says nothing about its patches, the photo can be retried as a whole
-            self._store.photos.fail(subject, number, *why)
         else:
-            self._store.photos.fail_patches(subject, number, ending.code, cell=int(job.arguments[2]))
+            self._store.photos.fail(subject, number, *why)
 
     # --- duties -------------------------------------------------------------------------------
 

@@ -11,10 +11,9 @@ from app.store.accounts import Accounts
 from app.store.database import Database
 from app.store.jobs import Jobs
 from app.store.lenses import Lenses, LensName
-from app.store.patches import NewPatch, NewSample
 from app.store.photos import Photos
 
-__all__ = ["LensName", "NewPatch", "NewSample", "Store"]
+__all__ = ["LensName", "Store"]
 
 
 class Store:

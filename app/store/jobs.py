@@ -28,7 +28,7 @@ from app.store.tables import (
 )
 from app.store.work import Works
 
-Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
+Kind: TypeAlias = Literal["photo", "correction", "measure"]
 
 ENDED_BADLY: Final = ("failed", "cancelled")
 _REQUEST: Final = ("photo_id", "lens_id", "lens_version", "params_hash")

@@ -5,8 +5,7 @@ Windows that were rejected before estimation are one compact value of their phot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from sqlalchemy import Select, func, select, update
@@ -21,55 +20,29 @@ from lensmodel.core.psf import PsfSample
 # Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
 # diagonal is 3,600 pixels
 DIGITS: Final = 4
-_WINDOW: Final = ("idx", "row", "col", "size", "r", "phi")
-_PLANNED: Final = (*_WINDOW, "cell", "score")
-
-
-@dataclass(frozen=True, slots=True)
-class NewPatch:
-    """A window that was chosen, or rejected with a reason."""
-
-    idx: int
-    row: int
-    col: int
-    size: int
-    r: float
-    phi: float
-    cell: int | None = None
-    score: float | None = None
-    rejected: str | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NewSample:
-    """One sample that was estimated from the patch `idx`."""
-
-    idx: int
-    sample: PsfSample
+_WINDOW: Final = ("row", "col", "size", "r", "phi", "reason")
 
 
 class Patches(Repository):
     """Patches of photos, and the samples that are estimated from them."""
 
     @writes
-    def plan_patches(self, session: Session, photo_id: str, epoch: int, patches: Sequence[NewPatch]) -> int:
-        """Write the plan of a photo once; return how many patches are to be estimated."""
+    def plan_patches(
+        self,
+        session: Session,
+        photo_id: str,
+        epoch: int,
+        patches: Sequence[Mapping[str, Any]],
+        rejected: Sequence[Mapping[str, Any]],
+    ) -> int:
+        """Write the plan of a photo once, as columns of patches; return how many are to be estimated."""
         # A second call, by a worker that repeats the step, adds nothing
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
         if photo.windows is None:
-            session.add_all(
-                PatchRow(
-                    photo_id=photo.id,
-                    epoch=epoch,
-                    state="pending",
-                    **{name: getattr(patch, name) for name in _PLANNED},
-                )
-                for patch in patches
-                if patch.rejected is None
-            )
-            rejected = [patch for patch in patches if patch.rejected is not None]
+            which = {"photo_id": photo.id, "epoch": epoch, "state": "pending"}
+            session.add_all(PatchRow(**which, idx=idx, **patch) for idx, patch in enumerate(patches))
             photo.windows, photo.windows_rejected = _packed(rejected), len(rejected)
         return _recount(session, photo)
 
@@ -82,44 +55,32 @@ class Patches(Repository):
     def windows(self, session: Session, photo_id: str) -> list[PatchRow]:
         """Return the patches of a photo, followed by the windows that were rejected before estimation."""
         rows = list(session.scalars(_patches_of(photo_id).order_by(PatchRow.idx)))
-        query = select(PhotoRow.windows).where(PhotoRow.public_id == photo_id)
-        return rows + _unpacked(session.scalar(query))
-
-    @reads
-    def cells(self, session: Session, photo_id: str, epoch: int) -> list[int]:
-        """Return the numbers of the cells that still have patches to estimate."""
-        query = _patches_of(photo_id, epoch).where(PatchRow.state == "pending")
-        cells = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
-        return sorted(cell for cell in cells if cell is not None)
-
-    @reads
-    def patches_of_cell(self, session: Session, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
-        """Return the open patches of one cell; empty if there are none or the photo needs them no more."""
-        query = _patches_of(photo_id, epoch).where(
-            PhotoRow.epoch == epoch,
-            PhotoRow.state == "estimating",
-            PatchRow.cell == cell,
-            PatchRow.state == "pending",
-        )
-        return list(session.scalars(query.order_by(PatchRow.idx)))
+        columns = session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id)) or {}
+        rejected = enumerate(zip(*columns.values(), strict=True), len(rows))
+        return rows + [
+            PatchRow(idx=idx, state="rejected", **dict(zip(columns, window, strict=True)))
+            for idx, window in rejected
+        ]
 
     @writes
-    def add_samples(self, session: Session, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
+    def add_samples(
+        self, session: Session, photo_id: str, epoch: int, samples: Sequence[tuple[int, PsfSample]]
+    ) -> int:
         """Store the samples of some patches and mark these done; return how many samples were new."""
         # Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated call
         # stores nothing twice: what is done stays as it is.
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return 0
-        of_patches = {(new.idx, new.sample.settings.channel): new for new in samples}
-        numbers = {new.idx for new in samples}
-        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers))
+        new = {(idx, sample.settings.channel): sample for idx, sample in samples}
+        numbers = PatchRow.idx.in_({idx for idx, _ in new})
+        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, numbers)
         query = select(PatchRow).where(*mine, PatchRow.state != "done")
         patches = {patch.idx: patch for patch in session.scalars(query)}
         rows = [
-            SampleRow(**columns_of(new.sample, photo, patches[new.idx]))
-            for new in of_patches.values()
-            if new.idx in patches
+            SampleRow(**columns_of(sample, photo, patches[idx]))
+            for (idx, _), sample in new.items()
+            if idx in patches
         ]
         session.add_all(rows)
         for patch in patches.values():
@@ -134,22 +95,18 @@ class Patches(Repository):
         photo_id: str,
         epoch: int,
         reason: str,
+        numbers: Sequence[int],
         *,
-        indices: Sequence[int] | None = None,
-        cell: int | None = None,
         rejected: bool = False,
     ) -> None:
-        """Mark patches, by their numbers or open ones of a cell, as useless: `rejected` for their quality."""
+        """Mark patches as useless: `rejected` for their quality."""
         photo = _selecting(session, photo_id, epoch)
         if photo is None:
             return
-        which = [PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.state != "done"]
-        if indices is not None:
-            which.append(PatchRow.idx.in_(indices))
-        if cell is not None:
-            which += [PatchRow.cell == cell, PatchRow.state == "pending"]
+        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers))
         state = "rejected" if rejected else "failed"
-        session.execute(update(PatchRow).where(*which).values(state=state, reason=reason[:60]))
+        open_ones = update(PatchRow).where(*mine, PatchRow.state != "done")
+        session.execute(open_ones.values(state=state, reason=reason[:60]))
         _recount(session, photo)
 
 
@@ -183,15 +140,7 @@ def _recount(session: Session, photo: PhotoRow) -> int:
     return photo.patches_total
 
 
-def _packed(rejected: Sequence[NewPatch]) -> dict[str, list[Any]]:
+def _packed(rejected: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Return windows as one value that JSON can hold: a list for each column."""
-    columns = {name: [getattr(patch, name) for patch in rejected] for name in _WINDOW}
-    rounded = {name: [round(value, DIGITS) for value in columns[name]] for name in ("r", "phi")}
-    return {**columns, **rounded, "reason": [patch.rejected for patch in rejected]}
-
-
-def _unpacked(stored: dict[str, list[Any]] | None) -> list[PatchRow]:
-    """Return the windows of `_packed` as rows that belong to no table."""
-    names, columns = (stored or {}).keys(), (stored or {}).values()
-    windows = zip(*columns, strict=True)
-    return [PatchRow(state="rejected", **dict(zip(names, window, strict=True))) for window in windows]
+    columns = {name: [window[name] for window in rejected] for name in _WINDOW}
+    return columns | {name: [round(value, DIGITS) for value in columns[name]] for name in ("r", "phi")}

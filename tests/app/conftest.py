@@ -22,7 +22,7 @@ from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.sandbox.outcome import Outcome
 from app.sandbox.runner import Budget
-from app.store import LensName, NewPatch, NewSample, Store, database
+from app.store import LensName, Store, database
 from app.store.database import Database, new_id
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
@@ -32,6 +32,11 @@ from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
+
+
+def window(r: float, phi: float, **more: Any) -> dict[str, Any]:
+    """Return a window of a photo as a task tells of it."""
+    return {"row": 0, "col": 0, "size": 64, "r": r, "phi": phi, **more}
 
 
 class Steps:
@@ -85,28 +90,17 @@ class Steps:
 
     def plan(self, photo: PhotoRow, count: int = 2) -> None:
         self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
-        patches = [
-            NewPatch(k, 100, 100 * k, 64, *PLACES[k % len(PLACES)], cell=k % 2, score=1.0)
-            for k in range(count)
-        ]
-        rejected = NewPatch(count, 0, 0, 64, 0, 0, rejected="flat")
-        self.store.photos.plan_patches(photo.public_id, photo.epoch, [*patches, rejected])
+        places = enumerate(itertools.islice(itertools.cycle(PLACES), count))
+        patches = [window(r, phi, row=100, col=100 * k, cell=k % 2, score=1.0) for k, (r, phi) in places]
+        self.store.photos.plan_patches(photo.public_id, photo.epoch, patches, [window(0, 0, reason="flat")])
         self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
 
     def estimate(self, photo: PhotoRow, indices: tuple[int, ...] = (0, 1), *, width: float = 1.0) -> int:
         kernel = gaussian(15, width * np.eye(2))
         samples = [
-            NewSample(
-                k,
-                PsfSample(
-                    kernel,
-                    FieldPosition(*PLACES[k % len(PLACES)]),
-                    LensSettings(channel=channel),
-                    weight=0.5,
-                    estimator="default/1",
-                ),
-            )
+            (k, PsfSample(kernel, place, LensSettings(channel=channel), weight=0.5, estimator="default/1"))
             for k in indices
+            for place in [FieldPosition(*PLACES[k % len(PLACES)])]
             for channel in CHANNELS
         ]
         return self.store.photos.add_samples(photo.public_id, photo.epoch, samples)
@@ -249,7 +243,7 @@ def reading(settings: Settings, store: Store) -> Iterator[None]:
     from app.jobs.photo_work import PhotoWork  # noqa: PLC0415 - as above
 
     sandbox: Any = TasksHere(settings.data_dir / "scratch")
-    work = PhotoWork(JobContext(settings, store, Storage(settings.storage, create=False), sandbox), None)  # type: ignore[arg-type]  # no cells
+    work = PhotoWork(JobContext(settings, store, Storage(settings.storage, create=False), sandbox))
     ended = threading.Event()
 
     def read() -> None:

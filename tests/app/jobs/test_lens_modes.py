@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import event, update
 from starlette.testclient import TestClient
 
-from app.store import LensName, NewPatch, NewSample, Store
+from app.store import LensName, Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import SampleRow
 from lensmodel.core.psf import PsfSample, gaussian, rms_width
@@ -65,12 +65,13 @@ def taken(steps: Steps, store: Store) -> Callable[..., str]:
         store.photos.assign_lens(photo.public_id)
         store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
         places = [(0.1 + 0.15 * k, 1.1 * k - 3.0) for k in range(6)]
-        patches = [NewPatch(k, 0, 0, 64, r, phi, cell=k, score=1.0) for k, (r, phi) in enumerate(places)]
-        store.photos.plan_patches(photo.public_id, photo.epoch, patches)
+        corner = {"row": 0, "col": 0, "size": 64, "score": 1.0}
+        patches = [{**corner, "r": r, "phi": phi, "cell": k} for k, (r, phi) in enumerate(places)]
+        store.photos.plan_patches(photo.public_id, photo.epoch, patches, [])
         store.photos.set_state(photo.public_id, ("selecting",), "estimating")
         kernel = gaussian(25, sigma_px**2 * np.eye(2))
         samples = [
-            NewSample(k, PsfSample(kernel, FieldPosition(*place), weight=0.5, estimator="default/1"))
+            (k, PsfSample(kernel, FieldPosition(*place), weight=0.5, estimator="default/1"))
             for k, place in enumerate(places)
         ]
         store.photos.add_samples(photo.public_id, photo.epoch, samples)

@@ -143,7 +143,7 @@ def test_a_job_that_waited_in_vain_ends_as_such(
     photo = steps.receive()
     steps.inspect(photo)
 
-    durable("cell", Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._end)(photo.public_id, 1, 0)
+    durable("photo", Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._end)(photo.public_id, 1)
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", "outage")

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from deadline import Deadline, stretched
 
-from app.jobs.queue import MAX_DEATHS, DbosEngine, Handler
+from app.jobs.queue import AT_ONCE, MAX_DEATHS, DbosEngine, Handler
 from app.store.jobs import Job, Kind
 
 DEAD = "a-worker-that-died"
@@ -28,7 +28,7 @@ class Ran:
     def __init__(self) -> None:
         self.jobs: list[tuple[str, ...]] = []
         self.handlers: dict[Kind, Handler] = {
-            kind: self._handler(kind) for kind in ("photo", "cell", "correction", "measure")
+            kind: self._handler(kind) for kind in ("photo", "correction", "measure")
         }
 
     def _handler(self, kind: str) -> Handler:
@@ -50,7 +50,7 @@ def ran() -> Ran:
 
 @pytest.fixture
 def engine(url: str, ran: Ran) -> Iterator[DbosEngine]:
-    made = DbosEngine(url, "this-process", slots=2)
+    made = DbosEngine(url, "this-process")
     made.start(ran.handlers)
     yield made
     made.stop()
@@ -77,24 +77,6 @@ def test_a_job_runs_once_however_often_it_is_asked_for(engine: DbosEngine, ran: 
     assert ran.jobs == [("photo", "p1", "1"), ("photo", "p1", "2")]
 
 
-def test_a_job_may_ask_for_others_and_does_not_own_them(url: str) -> None:
-    seen: list[str] = []
-    engine = DbosEngine(url, "this-process", slots=2)
-
-    def photo(photo_id: str) -> None:
-        engine.enqueue(Job("cell", (photo_id, 0)))
-        engine.enqueue(Job("cell", (photo_id, 1)))
-
-    engine.start({"photo": photo, "cell": lambda photo_id, cell: seen.append(f"{photo_id}{cell}")})
-    try:
-        engine.enqueue(Job("photo", ("p",)))
-        until(lambda: len(seen) == 2)
-    finally:
-        engine.stop()
-
-    assert sorted(seen) == ["p0", "p1"]
-
-
 def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
     calls = []
 
@@ -102,7 +84,7 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
         calls.append(photo_id)
         raise RuntimeError("deliberate")
 
-    engine = DbosEngine(url, "this-process", slots=2)
+    engine = DbosEngine(url, "this-process")
     engine.start({"photo": photo})
     try:
         engine.enqueue(Job("photo", ("p",)))
@@ -113,16 +95,12 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
     assert calls == ["p"]
 
 
-def test_patches_run_side_by_side_one_more_than_there_are_slots(url: str) -> None:
-    together = threading.Barrier(3, timeout=stretched(20))
-    engine = DbosEngine(url, "this-process", slots=2)
-
-    def cell(*_: object) -> None:
-        together.wait()
-
-    engine.start({"cell": cell})
+def test_several_jobs_of_a_kind_run_side_by_side(url: str) -> None:
+    together = threading.Barrier(AT_ONCE["correction"], timeout=stretched(20))
+    engine = DbosEngine(url, "this-process")
+    engine.start({"correction": lambda *_: together.wait()})
     try:
-        jobs = [Job("cell", (number,)) for number in range(3)]
+        jobs = [Job("correction", (number,)) for number in range(AT_ONCE["correction"])]
         for job in jobs:
             engine.enqueue(job)
         until(lambda: all(engine.status(job) == "done" for job in jobs))
@@ -153,9 +131,9 @@ def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
         import os, time
         from app.jobs.queue import DbosEngine
         from app.store.jobs import Job
-        engine = DbosEngine({url!r}, {executor_id!r}, slots=1)
-        engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
-        engine.enqueue(Job("cell", ("p", 1)))
+        engine = DbosEngine({url!r}, {executor_id!r})
+        engine.start({{"correction": lambda *arguments: os.kill(os.getpid(), 9)}})
+        engine.enqueue(Job("correction", ("p", 1)))
         time.sleep(30)
         """
     )
@@ -164,14 +142,14 @@ def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
 
 def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: str, ran: Ran) -> None:
     die_in_a_job(url)
-    job = Job("cell", ("p", 1))
-    engine = DbosEngine(url, "this-process", slots=2)
+    job = Job("correction", ("p", 1))
+    engine = DbosEngine(url, "this-process")
     engine.start(ran.handlers)
     try:
         time.sleep(0.5)
         held_before = (engine.status(job), list(ran.jobs))
         engine.take_over(DEAD)
-        until(lambda: ran.jobs == [("cell", "p", "1")])
+        until(lambda: ran.jobs == [("correction", "p", "1")])
         until(lambda: engine.status(job) == "done")
     finally:
         engine.stop()
@@ -183,13 +161,13 @@ def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: 
 def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
     previous = DEAD
     die_in_a_job(url)
-    for number in range(MAX_DEATHS["cell"] + 1):
+    for number in range(MAX_DEATHS["correction"] + 1):
         script = textwrap.dedent(
             f"""
             import os, time
             from app.jobs.queue import DbosEngine
-            engine = DbosEngine({url!r}, "worker-{number}", slots=1)
-            engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
+            engine = DbosEngine({url!r}, "worker-{number}")
+            engine.start({{"correction": lambda *arguments: os.kill(os.getpid(), 9)}})
             engine.take_over({previous!r})
             time.sleep(3)
             os._exit(0)
@@ -198,14 +176,14 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
         previous = f"worker-{number}"
         if subprocess.run([sys.executable, "-c", script], check=False).returncode == 0:
             break
-    engine = DbosEngine(url, "this-process", slots=2)
+    engine = DbosEngine(url, "this-process")
     engine.start(ran.handlers)
     try:
-        status = engine.status(Job("cell", ("p", 1)))
+        status = engine.status(Job("correction", ("p", 1)))
     finally:
         engine.stop()
 
-    assert number == MAX_DEATHS["cell"]
+    assert number == MAX_DEATHS["correction"]
     assert status == "lost"
     assert ran.jobs == []
 

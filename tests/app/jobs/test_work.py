@@ -28,7 +28,6 @@ from app.jobs.context import JobContext, NotWantedError
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.inspection import remove_location
 from app.jobs.photo_work import PhotoWork
-from app.jobs.queue import Handler, Status
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import KERNELS, SAMPLES, SHOWN
 from app.runtime.settings import Settings
@@ -36,7 +35,6 @@ from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Budget
 from app.store import Store
-from app.store.jobs import Job, Kind
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.core.psf import PsfSample, gaussian
@@ -146,39 +144,6 @@ class Scripted:
         return (answers.pop(0) if len(answers) > 1 else answers[0])(dict(arguments), folder)
 
 
-class AtOnce:
-    """An engine that runs each job when it is asked for, once."""
-
-    def __init__(self) -> None:
-        self.handlers: Mapping[Kind, Handler] = {}
-        self.asked: list[str] = []
-        self.lost: set[str] = set()
-
-    def start(self, handlers: Mapping[Kind, Handler]) -> None:
-        self.handlers = handlers
-
-    def enqueue(self, job: Job) -> None:
-        if job.id not in self.asked:
-            self.asked.append(job.id)
-            if job.id not in self.lost:
-                self.handlers[job.kind](*job.arguments)
-
-    def status(self, job: Job) -> Status:
-        return "lost" if job.id in self.lost else "done"
-
-    def take_over(self, executor_id: str) -> None:
-        pass
-
-    def holders(self) -> set[str]:
-        return set()
-
-    def forget(self, before: datetime) -> int:
-        return 0
-
-    def stop(self) -> None:
-        self.handlers = {}
-
-
 def unmeasured(store: Store) -> list[tuple[str | int, ...]]:
     return [job.arguments for job in store.jobs.to_do() if job.kind == "measure"]
 
@@ -193,21 +158,13 @@ def context(
     settings: Settings, store: Store, sandbox: Scripted, monkeypatch: pytest.MonkeyPatch
 ) -> JobContext:
     monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
-    monkeypatch.setattr("app.jobs.photo_work.LOOK_AFTER_S", 0.0)
     monkeypatch.setattr("app.jobs.photo_work.WAIT_S", 0.001)
     return JobContext(settings, store, Storage(settings.storage), sandbox)  # type: ignore[arg-type]  # scripted
 
 
 @pytest.fixture
-def engine() -> AtOnce:
-    return AtOnce()
-
-
-@pytest.fixture
-def work(context: JobContext, engine: AtOnce) -> PhotoWork:
-    made = PhotoWork(context, engine)
-    engine.start({"cell": made.cell})
-    return made
+def work(context: JobContext) -> PhotoWork:
+    return PhotoWork(context)
 
 
 @pytest.fixture
@@ -251,7 +208,7 @@ def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
         for c in ("g", "r")
     ]
     write_samples(folder, samples)
-    return Outcome("ok", value=[{"idx": 0, "row": 9, "col": 9, "side": 144}] * 2)
+    return Outcome("ok", value=[{"idx": 0, "row": 9, "col": 9, "size": 144}] * 2)
 
 
 def test_samples_lie_where_their_patches_do(
@@ -406,7 +363,6 @@ def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
     sandbox.answers[dies_in].insert(0, die)
     with pytest.raises(DiedError):
         work.photo(photo.public_id, 1)
-    work._engine.asked.clear()  # type: ignore[attr-defined]  # the engine takes the job up again
     work.photo(photo.public_id, 1)
 
     done = steps.fresh(photo)
@@ -516,18 +472,6 @@ def test_a_photo_of_which_no_cell_helps_fails_with_what_to_do(
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", code)
     assert says in failed.error_detail
-
-
-def test_a_cell_that_the_engine_gave_up_does_not_keep_the_photo_waiting(
-    work: PhotoWork, context: JobContext, engine: AtOnce, photo: PhotoRow, steps: Any
-) -> None:
-    engine.lost.add(f"cell/{photo.public_id}/1/0")
-
-    work.photo(photo.public_id, 1)
-
-    rows = context.store.photos.patches(photo.public_id)
-    assert steps.fresh(photo).state == "counted"
-    assert [(row.state, row.reason) for row in rows] == [("failed", "crashed_repeatedly"), ("done", None)]
 
 
 @pytest.mark.parametrize("task", ["inspect", "develop", "select", "estimate"])
@@ -848,7 +792,7 @@ def spoilt(answer: Any, path: str, value: object) -> Any:
 
 
 SELECTION = {"patches": [patch(0)], "rejected": [], "lateral": None}
-WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "rejected": "flat"}
+WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "reason": "flat"}
 
 
 @pytest.mark.parametrize(
@@ -861,7 +805,7 @@ WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "rejected": "fla
         ("inspect", spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
         ("select", spoilt(SELECTION, "patches", [patch(0)] * 2001)),
         ("select", spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
-        ("select", spoilt(SELECTION, "rejected", [WINDOW | {"rejected": "x" * 61}])),
+        ("select", spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
         ("select", spoilt(SELECTION, "patches.0.row", 2**70)),
         ("select", spoilt(SELECTION, "lateral", {"red": [1.0]})),
     ],

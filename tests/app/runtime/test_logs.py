@@ -58,12 +58,12 @@ def test_a_record_is_one_object_on_one_line_whatever_it_holds(lines: io.StringIO
 
 
 def test_a_line_of_a_job_names_the_job_and_its_photo(lines: io.StringIO) -> None:
-    durable("cell", lambda *_: logging.getLogger("app.jobs").info("at work"), print)("PHOTO", 1, 4)
+    durable("photo", lambda *_: logging.getLogger("app.jobs").info("at work"), print)("PHOTO", 1)
     logging.getLogger("app.jobs").info("at rest")
 
     during, after = read(lines)
 
-    assert (during["job_id"], during["photo_id"]) == ("cell/PHOTO/1/4", "PHOTO")
+    assert (during["job_id"], during["photo_id"]) == ("photo/PHOTO/1", "PHOTO")
     assert "job_id" not in after
 
 

@@ -18,7 +18,7 @@ from uploads import receive
 
 from app.errors import BusyError
 from app.runtime.settings import Settings, table
-from app.store import LensName, NewPatch, Store, database
+from app.store import LensName, Store, database
 from app.store.database import Database
 from app.store.jobs import Result
 from app.store.migrate import current, head, upgrade
@@ -54,17 +54,16 @@ def test_a_repeated_cell_stores_no_sample_twice(store: Store, steps: Steps) -> N
     assert (again.patches_total, again.patches_done, again.patches_rejected) == (2, 2, 1)
 
 
-def test_cells_empty_as_their_patches_finish_or_fail(store: Store, steps: Steps) -> None:
+def test_patches_that_fail_stay_so_and_those_that_are_done_do_not_fail(store: Store, steps: Steps) -> None:
     photo = steps.receive()
     steps.inspect(photo)
     steps.plan(photo, count=4)
-    assert store.photos.cells(photo.public_id, 1) == [0, 1]
-
     steps.estimate(photo, (0, 2))
-    assert store.photos.cells(photo.public_id, 1) == [1]
-    store.photos.fail_patches(photo.public_id, 1, "time_limit", indices=[1, 3])
 
-    assert store.photos.cells(photo.public_id, 1) == []
+    store.photos.fail_patches(photo.public_id, 1, "time_limit", [1, 2, 3])
+
+    states = [row.state for row in store.photos.patches(photo.public_id)]
+    assert states == ["done", "failed", "done", "failed"]
 
 
 def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
@@ -72,7 +71,9 @@ def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
     steps.inspect(photo)
     steps.plan(photo)
 
-    store.photos.plan_patches(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
+    store.photos.plan_patches(
+        photo.public_id, 1, [{"row": 5, "col": 5, "size": 64, "r": 0.5, "phi": 0.0}], []
+    )
 
     assert len(store.photos.windows(photo.public_id)) == 3
     assert store.photos.patches(photo.public_id)[0].row == 100
@@ -83,12 +84,11 @@ def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> N
     steps.inspect(photo)
     store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
     reasons = ("flat", "out-of-focus", "clipped")
-    rejected = [
-        NewPatch(k + 1, 16 * k, 8 * k, 64, 0.12345678, -2.5, rejected=reasons[k % 3]) for k in range(2000)
-    ]
+    place = {"size": 64, "r": 0.12345678, "phi": -2.5}
+    rejected = [{"row": 16 * k, "col": 8 * k, **place, "reason": reasons[k % 3]} for k in range(2000)]
 
     count = store.photos.plan_patches(
-        photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected]
+        photo.public_id, 1, [{"row": 5, "col": 5, **place, "cell": 0}], rejected
     )
 
     listed = store.photos.windows(photo.public_id)

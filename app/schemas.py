@@ -279,7 +279,7 @@ class CorrectionOut(Model):
 
     id: PublicId
     photo_id: str = Field(validation_alias=AliasPath("photo", "public_id"))
-    lens_id: str = Field(validation_alias=AliasPath("lens", "public_id"))
+    lens_id: str = Field(validation_alias="lens_public_id")
     lens_version: int
     state: CorrectionState
     method: str = Field(validation_alias=AliasPath("params", "method"))

@@ -62,7 +62,7 @@ class CorrectionWork:
         self._jobs.progress(run, 0, 0, "developing")
         developed = self._context.developed(photo, wanted)
         self._jobs.progress(run, 0, 0, "correcting")
-        _, samples = self._samples(row.lens.public_id, row.lens_version)
+        _, samples = self._samples(row.lens_public_id, row.lens_version)
         bounds = {name: params[name] for name in ("halo", "texture", "denoise") if name in params}
         with self._context.task(
             "correct",
@@ -88,7 +88,7 @@ class CorrectionWork:
                 f"{row.lens_version}, method {params['method']}, strength {params['strength']:g}"
                 f"{Bounds(**bounds).described}"
             ),
-            lens=row.lens.label or "",
+            lens=row.lens.label or "" if row.lens is not None else "",
         ) as (done, folder):
             self._store_result(run, row, folder / Path(done["file"]).name, done["report"])
 
@@ -165,5 +165,5 @@ class CorrectionWork:
         }
 
 
-def _name(lens: LensRow, otherwise: str) -> str:
-    return lens.label or full_name(lens.maker, lens.model) or otherwise
+def _name(lens: LensRow | None, otherwise: str) -> str:
+    return otherwise if lens is None else lens.label or full_name(lens.maker, lens.model) or otherwise

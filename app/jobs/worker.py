@@ -298,7 +298,6 @@ class Worker:
         for subjects, duty in duties:
             for subject in subjects:
                 self._do(partial(duty, subject))
-        self._do(accounts.purge)
         self._do(partial(self._engine.forget, datetime.now(UTC) - KEEP_JOBS))
         drop_developed(self._context.cache, photos.existing, self._settings.task_seconds)
 

@@ -228,7 +228,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         zones=zones if changed else [],
         most_gain=most_gain,
         nothing=words.nothing_words(row.kind),
-        learned_from=plan.lens.photo_count,
+        learned_from=0 if plan.lens is None else plan.lens.photo_count,
         audit=words.held_back(audit) if changed else None,
         held=words.held_map(audit, row.height or 0, row.width or 0, row.orientation or 1) if can_look else [],
         places=PLACES,

@@ -83,7 +83,7 @@ def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
     kept = {
         "photos": select(PhotoRow.public_id),
         "corrections": select(CorrectionRow.public_id),
-        "models": select(LensRow.public_id).where(LensRow.deleted_at.is_(None)),
+        "models": select(LensRow.public_id),
     }
     named = {
         "photo": select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(_WITH_FILE),

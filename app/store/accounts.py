@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias, get_args
 
-from sqlalchemy import ColumnElement, Select, and_, delete, func, or_, select, true, update
+from sqlalchemy import ColumnElement, Select, delete, func, or_, select, update
 from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import KeyedColumnElement
@@ -26,12 +26,10 @@ from app.store.tables import (
     PHOTO_WORKED_ON,
     Base,
     CorrectionRow,
-    EventRow,
     KeyRow,
     LensRow,
     OwnerRow,
     PhotoRow,
-    SampleRow,
     SessionRow,
 )
 
@@ -42,8 +40,6 @@ _KEY: Final = re.compile(r"lpk_([a-z0-9]{8})_([A-Za-z0-9_-]{43})", re.ASCII)
 _PREFIX_SIGNS: Final = "abcdefghijkmnpqrstuvwxyz23456789"  # without those that look alike
 # Photos that one transaction erases (chosen): each with some hundred samples, a few milliseconds
 AT_ONCE: Final = 50
-# How long the emptied row of what was deleted is kept (chosen): no work that refers to it runs so long
-REMEMBERED: Final = timedelta(days=1)
 USE_PRECISION: Final = timedelta(minutes=10)  # of `last_used_at` (chosen): each update is a write
 
 
@@ -171,7 +167,7 @@ class Accounts(Repository):
         corrections = select(func.count(), func.coalesce(made, 0), running).where(
             CorrectionRow.owner_id == row.id
         )
-        lenses = select(func.count()).where(LensRow.owner_id == row.id, LensRow.deleted_at.is_(None))
+        lenses = select(func.count()).where(LensRow.owner_id == row.id)
         photo, correction = (session.execute(query).one() for query in (photos, corrections))
         return Usage(
             photos=photo[0],
@@ -230,33 +226,18 @@ class Accounts(Repository):
         else:
             lenses = list(session.scalars(select(LensRow).where(LensRow.owner_id == owner_key)))
             prefixes = [f"models/{lens.public_id}/" for lens in lenses]
-            session.execute(delete(EventRow).where(EventRow.lens_id.in_([lens.id for lens in lenses])))
-            session.execute(delete(LensRow).where(LensRow.owner_id == owner_key))
-            session.execute(delete(OwnerRow).where(OwnerRow.id == owner_key))
+            session.execute(delete(OwnerRow).where(OwnerRow.id == owner_key))  # and by its key all of them
         discard(session, *prefixes)  # once more later: a worker may be writing another blob
         return prefixes
-
-    @writes
-    def purge(self, session: Session) -> None:
-        """Remove the emptied rows of lenses that were deleted a day ago, and that nothing refers to."""
-        named = select(CorrectionRow.lens_id).union(
-            select(PhotoRow.lens_id).where(PhotoRow.lens_id.is_not(None)),
-            select(SampleRow.lens_id).where(SampleRow.lens_id.is_not(None)),
-            select(EventRow.lens_id),
-        )
-        old = LensRow.deleted_at < now() - REMEMBERED
-        session.execute(delete(LensRow).where(old, LensRow.id.not_in(named)))
 
 
 def _of_owner(cells: ReadOnlyColumnCollection[str, KeyedColumnElement[Any]], key: int) -> ColumnElement[bool]:
     """Select rows by the owner that they name, or by their photo or lens."""
     if "owner_id" in cells:
-        present = cells.deleted_at.is_(None) if "deleted_at" in cells else true()
-        return and_(cells.owner_id == key, present)
+        return cells.owner_id == key
     if "photo_id" in cells:
         return cells.photo_id.in_(select(PhotoRow.id).where(PhotoRow.owner_id == key))
-    lenses = select(LensRow.id).where(LensRow.owner_id == key, LensRow.deleted_at.is_(None))
-    return cells.lens_id.in_(lenses)
+    return cells.lens_id.in_(select(LensRow.id).where(LensRow.owner_id == key))
 
 
 def _valid() -> Select[KeyRow]:

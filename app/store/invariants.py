@@ -33,10 +33,10 @@ INVARIANTS: Final = (
         "versions",
         "the version of a lens is the number of its events",
         """
-        SELECT public_id FROM lens WHERE deleted_at IS NULL AND (
-            version <> (SELECT count(*) FROM calibration_event e WHERE e.lens_id = lens.id)
+        SELECT public_id FROM lens
+        WHERE version <> (SELECT count(*) FROM calibration_event e WHERE e.lens_id = lens.id)
             OR version <> (SELECT coalesce(max(version), 0) FROM calibration_event e WHERE lens_id = lens.id)
-        )""",
+        """,
     ),
     Invariant(
         "totals",
@@ -99,16 +99,8 @@ INVARIANTS: Final = (
         "endings",
         "counted photos have a lens, failed ones a reason",
         """
-        SELECT photo.public_id FROM photo LEFT JOIN lens ON lens.id = photo.lens_id
-        WHERE (state = 'counted' AND (lens.id IS NULL OR finished_at IS NULL OR lens.deleted_at IS NOT NULL))
+        SELECT public_id FROM photo WHERE (state = 'counted' AND (lens_id IS NULL OR finished_at IS NULL))
             OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))""",
-    ),
-    Invariant(
-        "forgotten lenses",
-        "nothing is kept of deleted lenses",
-        """
-        SELECT public_id FROM lens WHERE deleted_at IS NOT NULL
-        AND (serial IS NOT NULL OR label IS NOT NULL OR sample_count <> 0)""",
     ),
     Invariant(
         "owners of lenses",

@@ -31,7 +31,7 @@ from app.store.work import Works
 Kind: TypeAlias = Literal["photo", "correction", "measure"]
 
 ENDED_BADLY: Final = ("failed", "cancelled")
-_REQUEST: Final = ("photo_id", "lens_id", "lens_version", "params_hash")
+_REQUEST: Final = ("photo_id", "lens_public_id", "lens_version", "params_hash")
 
 # Tables of unfinished work by its kind, and its states, that of work which nobody began first
 _TABLES: Final[Mapping[Kind, tuple[type[PhotoRow | CorrectionRow], tuple[str, ...]]]] = {
@@ -93,7 +93,7 @@ class Jobs(Works[CorrectionRow]):
         self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:
         """Create a correction, or return the one of the same request; True if it is new."""
-        request = dict(zip(_REQUEST, (photo.id, lens.id, version, params_hash(params)), strict=True))
+        request = dict(zip(_REQUEST, (photo.id, lens.public_id, version, params_hash(params)), strict=True))
         fresh = {
             **request,
             "public_id": new_id(),
@@ -192,7 +192,7 @@ class Jobs(Works[CorrectionRow]):
         query = (
             select(LensRow.public_id, LensRow.version)
             .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
-            .where(EventRow.metrics.is_(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
+            .where(EventRow.metrics.is_(None), LensRow.sample_count > 0)
         )
         jobs = [Job("measure", (row[0], row[1])) for row in session.execute(query.limit(limit))]
         for kind, (table, states) in _TABLES.items():

@@ -53,9 +53,7 @@ _JOINS: Final = {
     "photo_excluded": False,
     "photo_removed": False,
 }
-_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch).where(
-    LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
-)
+_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch).where(LensRow.public_id == bindparam("lens"))
 _KNOWN: Final = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
     OwnerRow.name == bindparam("owner")
 )
@@ -262,7 +260,7 @@ class Lenses(Repository):
             _unlearn(session, photo)
         session.execute(
             update(CorrectionRow)
-            .where(CorrectionRow.lens_id == lens.id, CorrectionRow.state.in_(CORRECTION_ACTIVE))
+            .where(CorrectionRow.lens_public_id == lens_id, CorrectionRow.state.in_(CORRECTION_ACTIVE))
             .values(state="cancelled", finished_at=now())
         )
         _forget(session, lens)
@@ -276,8 +274,8 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     """Return the lens of an inspected photo; a photo that calibrates creates it where there is none."""
     lens_id = photo.given.get("lens_id")
     if lens_id is not None:
-        of_owner = (LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
-        chosen = session.scalar(select(LensRow).where(LensRow.public_id == lens_id, *of_owner))
+        query = select(LensRow).where(LensRow.public_id == lens_id, LensRow.owner_id == photo.owner_id)
+        chosen = session.scalar(query.with_for_update())
         if chosen is not None:
             return chosen
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
@@ -290,7 +288,7 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
 
 
 def _same(owner_id: int, key: str) -> tuple[Any, ...]:
-    return LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+    return LensRow.owner_id == owner_id, LensRow.identity_key == key
 
 
 def named(session: Session, owner_id: int, name: LensName) -> LensRow:
@@ -388,14 +386,13 @@ def forget_if_empty(session: Session, photo: PhotoRow, *, gone: bool = False) ->
     """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it."""
     # A lens that the owner named stays as long as there is any photo of it, even a failed one
     lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
-    if lens is None or lens.deleted_at is not None:
+    if lens is None:
         return
     others = select(PhotoRow.id).where(PhotoRow.lens_id == lens.id, PhotoRow.id != photo.id)
     named_by_owner = lens.label is not None or lens.serial_source == "user"
     if not named_by_owner:
         others = others.where(PhotoRow.state.not_in(NO_RESULT))
     if (gone or not named_by_owner) and session.scalar(others.limit(1)) is None:
-        session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
         _forget(session, lens)
 
 
@@ -418,12 +415,7 @@ def forget_patches(session: Session, photo: PhotoRow) -> None:
 
 
 def _forget(session: Session, lens: LensRow) -> None:
-    """Empty the row of a lens that no photo belongs to any more; its reports become garbage."""
-    # The row stays because finished corrections refer to it
-    session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
-    lens.serial = lens.label = None
-    lens.serial_source = "none"
-    lens.identity_key = f"deleted|{lens.public_id}"
-    lens.photo_count = lens.sample_count = 0
-    lens.deleted_at = now()
+    """Delete a lens that no photo counts for any more, with its history; its reports become garbage."""
     discard(session, f"models/{lens.public_id}/", after=STILL_WRITTEN)
+    session.delete(lens)
+    session.flush()

@@ -61,10 +61,8 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
 
 
 def owned(table: type[Row], owner: Owner) -> Select[Row]:
-    """Select the rows of one owner, or of `ANY_OWNER`, that are not deleted."""
+    """Select the rows of one owner, or of `ANY_OWNER`."""
     query: Select[Row] = select(table).options(*_WITH[table])
-    if table is LensRow:  # photos and corrections are deleted outright
-        query = query.where(LensRow.deleted_at.is_(None))
     if owner is not ANY_OWNER:
         query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
     return query

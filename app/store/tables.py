@@ -25,7 +25,7 @@ from sqlalchemy import (
     UniqueConstraint,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, foreign, mapped_column, relationship
 
 from app.schemas import CorrectionState, PhotoState
 
@@ -94,8 +94,7 @@ class Base(DeclarativeBase):
 
 Key: TypeAlias = Annotated[int, mapped_column(primary_key=True)]
 Name: TypeAlias = Annotated[str, mapped_column(unique=True)]
-OfOwner: TypeAlias = Annotated[int, mapped_column(ForeignKey("owner.id"))]
-OfLens: TypeAlias = Annotated[int, mapped_column(ForeignKey("lens.id"))]
+OfOwner: TypeAlias = Annotated[int, mapped_column(ForeignKey("owner.id", ondelete="CASCADE"))]
 OfPhoto: TypeAlias = Annotated[int, mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))]
 Count: TypeAlias = Annotated[int, mapped_column(default=0)]
 Big: TypeAlias = Annotated[int, mapped_column(BigInteger)]
@@ -145,7 +144,7 @@ class LensRow(Owned, Base):
     __tablename__ = "lens"
     __table_args__ = (
         CheckConstraint("version >= 0", name="version"),
-        _unique("uq_lens_identity", "owner_id", "identity_key", where="deleted_at IS NULL"),
+        UniqueConstraint("owner_id", "identity_key"),
         Index("ix_lens_page", "owner_id", "public_id"),
     )
 
@@ -160,7 +159,6 @@ class LensRow(Owned, Base):
     photo_count: Mapped[Count]
     sample_count: Mapped[Count]
     created_at: Mapped[datetime]
-    deleted_at: Mapped[datetime | None]
 
     def complete(self, maker: str | None, model: str | None) -> None:
         """Fill in the maker and the model where they are not known yet."""
@@ -180,7 +178,7 @@ class PhotoRow(Work, Base):
         {"sqlite_autoincrement": True},  # the key of a deleted photo is given to no other
     )
 
-    lens_id: Mapped[OfLens | None]
+    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id", ondelete="SET NULL"))
     sha256: Mapped[str]
     filename: Mapped[str]
     kind: Mapped[str]
@@ -270,7 +268,7 @@ class SampleRow(Base):
     id: Mapped[BigKey]
     photo_id: Mapped[OfPhoto]
     patch_id: Mapped[int] = mapped_column(ForeignKey("patch.id", ondelete="CASCADE"))
-    lens_id: Mapped[OfLens | None]
+    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
     version_added: Mapped[int | None]
     channel: Mapped[str]
     r: Mapped[float]
@@ -297,7 +295,7 @@ class EventRow(Base):
     )
 
     id: Mapped[Key]
-    lens_id: Mapped[OfLens]
+    lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id", ondelete="CASCADE"))
     version: Mapped[int]
     kind: Mapped[str]
     photo_public_id: Mapped[str]
@@ -317,16 +315,16 @@ class CorrectionRow(Work, Base):
         CheckConstraint(_one_of("state", CORRECTION_STATES), name="state"),
         _unique(
             "uq_correction_params",
-            *("photo_id", "lens_id", "lens_version", "params_hash"),
+            *("photo_id", "lens_public_id", "lens_version", "params_hash"),
             where="state NOT IN ('failed', 'cancelled')",
         ),
         Index("ix_correction_state", "state"),
         Index("ix_correction_page", "owner_id", "public_id"),
-        Index("ix_correction_lens_id", "lens_id"),
+        Index("ix_correction_lens_public_id", "lens_public_id"),
     )
 
     photo_id: Mapped[OfPhoto]
-    lens_id: Mapped[OfLens]
+    lens_public_id: Mapped[str]  # stays when the lens is deleted
     lens_version: Mapped[int]
     params: Mapped[dict[str, Any]]
     params_hash: Mapped[str]
@@ -341,7 +339,9 @@ class CorrectionRow(Work, Base):
     result_name: Mapped[str | None]
     created_at: Mapped[datetime]
     photo: Mapped[PhotoRow] = relationship()
-    lens: Mapped[LensRow] = relationship()
+    lens: Mapped[LensRow | None] = relationship(
+        primaryjoin=lambda: foreign(CorrectionRow.lens_public_id) == LensRow.public_id, viewonly=True
+    )
 
     @property
     def folder(self) -> str:

@@ -149,17 +149,6 @@ def test_an_upload_that_outlasts_its_owner_makes_no_new_one(store: Store) -> Non
     assert count(store, OwnerRow) == 0
 
 
-def test_a_deleted_photo_is_gone_and_after_a_day_its_lens_too(store: Store, steps: Any) -> None:
-    store.photos.delete(steps.counted().public_id, "local")
-
-    store.accounts.purge()
-    assert [count(store, table) for table in (PhotoRow, SampleRow, LensRow)] == [0, 0, 1]
-    with store.database.writing() as session:
-        session.execute(update(LensRow).values(deleted_at=now() - timedelta(days=2)))
-    store.accounts.purge()
-    assert count(store, LensRow) == 0
-
-
 # --- files of photos ------------------------------------------------------------------------------
 
 

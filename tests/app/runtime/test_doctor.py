@@ -92,10 +92,6 @@ DAMAGES: dict[str, tuple[str, Any]] = {
         "endings",
         lambda photo: update(PhotoRow).where(PhotoRow.id == photo.id).values(lens_id=None),
     ),
-    "a deleted lens with its serial": (
-        "forgotten lenses",
-        lambda photo: update(LensRow).where(LensRow.id == photo.lens_id).values(deleted_at=now()),
-    ),
 }
 
 

@@ -662,7 +662,7 @@ def many(store: Store, count: int = 10_000) -> None:
                 elif table is PhotoRow:
                     value |= {"sha256": f"{k:064}", "lens_id": k + 1}
                 else:
-                    value |= {"photo_id": k + 1, "lens_id": k + 1}
+                    value |= {"photo_id": k + 1, "lens_public_id": f"lens{k:08}"}
             session.execute(insert(table), values)
 
 

@@ -14,7 +14,6 @@ from app.jobs.context import JobContext, NotWantedError
 from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
-from app.store.jobs import Result, Run
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
@@ -45,23 +44,22 @@ class CorrectionWork:
 
     def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
-        run = self._jobs.start(correction_id, epoch)
-        row = None if run is None else self._jobs.get(correction_id, ANY_OWNER)
-        if run is None or row is None:
+        row = self._jobs.start(correction_id, epoch)
+        if row is None:
             return
         try:
-            self._correct(run, row)
+            self._correct(row)
         except NotWantedError:
             log.info("correction %s is not wanted any more", correction_id)
         except JobFailedError as error:
             self._jobs.fail(correction_id, epoch, error.code, error.detail)
 
-    def _correct(self, run: Run, row: CorrectionRow) -> None:
+    def _correct(self, row: CorrectionRow) -> None:
         photo, params, settings = row.photo, row.params, self._context.settings
-        wanted = partial(self._jobs.is_live, row.public_id, run.epoch)
-        self._jobs.progress(run, 0, 0, "developing")
+        wanted = partial(self._jobs.is_live, row.public_id, row.epoch)
+        self._jobs.progress(row, 0, 0, "developing")
         developed = self._context.developed(photo, wanted)
-        self._jobs.progress(run, 0, 0, "correcting")
+        self._jobs.progress(row, 0, 0)
         _, samples = self._samples(row.lens_public_id, row.lens_version)
         bounds = {name: params[name] for name in ("halo", "texture", "denoise") if name in params}
         with self._context.task(
@@ -70,7 +68,7 @@ class CorrectionWork:
             wanted,
             reads=[developed],
             samples=samples,
-            on_progress=self._progress_of(run),
+            on_progress=self._progress_of(row),
             developed=str(developed),
             photo=photo.public_id,
             # as they were when the correction was requested
@@ -90,7 +88,7 @@ class CorrectionWork:
             ),
             lens=row.lens.label or "" if row.lens is not None else "",
         ) as (done, folder):
-            self._store_result(run, row, folder / Path(done["file"]).name, done["report"])
+            self._store_result(row, folder / Path(done["file"]).name, done["report"])
 
     def _samples(self, lens_id: str, version: int) -> tuple[LensState, list[PsfSample]]:
         try:
@@ -102,7 +100,7 @@ class CorrectionWork:
             raise JobFailedError("no_samples", text)
         return state, samples
 
-    def _progress_of(self, run: Run) -> ProgressHook:
+    def _progress_of(self, row: CorrectionRow) -> ProgressHook:
         last = 0.0
 
         def tell(done: int, total: int) -> None:
@@ -110,11 +108,11 @@ class CorrectionWork:
             if time.monotonic() - last > PROGRESS_S or done == total:
                 last = time.monotonic()
                 with missable():
-                    self._jobs.progress(run, done, total)
+                    self._jobs.progress(row, done, total)
 
         return tell
 
-    def _store_result(self, run: Run, row: CorrectionRow, path: Path, report: dict[str, Any]) -> None:
+    def _store_result(self, row: CorrectionRow, path: Path, report: dict[str, Any]) -> None:
         if path.suffix != SUFFIX[row.params["output"]["format"]] or not path.is_file():
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
@@ -126,8 +124,9 @@ class CorrectionWork:
             if (path.parent / shown).is_file():
                 storage.put(f"{base}{shown}", path.parent / shown)
         name = f"{PurePath(row.photo.filename).stem or 'photo'}-corrected{path.suffix}"
-        result = Result(key, digest, MEDIA_TYPE[path.suffix], path.stat().st_size, name)
-        if not self._jobs.finish(run, result, report):
+        media_type, size = MEDIA_TYPE[path.suffix], path.stat().st_size
+        about = {"key": key, "etag": digest, "media_type": media_type, "name": name}
+        if not self._jobs.finish(row, report, bytes=size, **about):
             storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
     def measure(self, lens_id: str, version: int) -> None:

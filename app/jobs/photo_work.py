@@ -312,10 +312,9 @@ def _measured(listed: Any, folder: Path) -> tuple[list[dict[str, Any]], list[tup
             if error is None or not error <= 1.0 or not 0 <= number <= len(patches) < MAX_PLACES:
                 raise InvalidInputError(f"a sample of place {number} with error {error}")
             if number == len(patches):
-                corner = {name: int(entry[name]) for name in ("row", "col", "size")}
-                patches.append(
-                    {**corner, "r": place.r, "phi": place.phi, "cell": number, "score": 1.0 - error}
-                )
+                row, col, side = (int(entry[name]) for name in ("row", "col", "side"))
+                window = {"row": row, "col": col, "size": side, "r": place.r, "phi": place.phi}
+                patches.append({**window, "cell": number, "score": 1.0 - error})
             samples.append((number, sample))
     return patches, samples
 

@@ -133,12 +133,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
         place = _window(window, developed.frame.position(*centre))
         rejected.append({**place, "reason": window.reason})
-    try:
-        lateral = codec.to_json(correcting.lateral_of(developed))
-    except LensModelError as error:
-        log.info("no lateral colour: %s", error)
-        lateral = None
-    return {"patches": patches, "rejected": rejected, "lateral": lateral}
+    return {"patches": patches, "rejected": rejected, "lateral": codec.to_json(_lateral(developed))}
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[int]:
@@ -261,7 +256,7 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
             "idx": numbers.setdefault(measured.pixel, len(numbers)),
             "row": round(measured.pixel[0] - (measured.side - 1) / 2),
             "col": round(measured.pixel[1] - (measured.side - 1) / 2),
-            "size": measured.side,
+            "side": measured.side,
         }
         for measured in measurements
     ]
@@ -320,7 +315,7 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
     try:
         return correcting.lateral_of(developed)
     except LensModelError as error:
-        log.info("corrected without lateral colour: %s", error)
+        log.info("no lateral colour: %s", error)
         return None
 
 

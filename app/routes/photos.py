@@ -254,7 +254,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     if change.calibrate and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
     done = call.store.photos.change(
-        photo_id, call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
+        [photo_id], call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
     )
     photo = call.photo(photo_id)
     if not done:
@@ -295,6 +295,9 @@ def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
         call.lens(change.lens_id)
     keys = list(dict.fromkeys(change.photo_ids))
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    label = None if change.new_lens is None else change.new_lens.label
-    call.store.photos.change_several(keys, call.owner, given, lens_id=change.lens_id, label=label)
+    lens: LensName | str | None = change.lens_id
+    if change.new_lens is not None:
+        first = call.photo(keys[0])
+        lens = LensName(first.lens_maker, first.lens_model, None, label=change.new_lens.label)
+    call.store.photos.change(keys, call.owner, given, lens=lens)
     return Page[PhotoOut](items=[views.photo_out(call.photo(key)) for key in keys])

@@ -17,7 +17,6 @@ from contextvars import ContextVar
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar, cast
-from uuid import UUID
 
 from sqlalchemy import Connection, CursorResult, Engine, Executable, Select, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
@@ -215,11 +214,5 @@ def changed(session: Session, statement: Executable) -> int:
 
 
 def new_id() -> str:
-    """Return a UUID of version 7 (RFC 9562, section 5.7) as 32 hexadecimal digits."""
-    # 48 bits of milliseconds followed by 74 random bits: ids made later sort later, so lists in the order of
-    # ids are lists in the order of time
-    millis = time.time_ns() // 1_000_000
-    value = (millis & (1 << 48) - 1) << 80 | secrets.randbits(80)
-    value = value & ~(0xF << 76) | 7 << 76
-    value = value & ~(0b11 << 62) | 0b10 << 62
-    return UUID(int=value).hex
+    """Return 32 hexadecimal digits: 12 of the time in ms, 20 at random, so that later ids sort later."""
+    return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(10)}"

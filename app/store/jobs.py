@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias
 
@@ -26,11 +26,10 @@ from app.store.tables import (
     PhotoRow,
     WorkerRow,
 )
-from app.store.work import Works
+from app.store.work import ENDED_BADLY, Works
 
 Kind: TypeAlias = Literal["photo", "correction", "measure"]
 
-ENDED_BADLY: Final = ("failed", "cancelled")
 _REQUEST: Final = ("photo_id", "lens_public_id", "lens_version", "params_hash")
 
 # Tables of unfinished work by its kind, and its states, that of work which nobody began first
@@ -54,26 +53,6 @@ class Job:
     def id(self) -> str:
         """The engine's id of this job."""
         return "/".join([self.kind, *map(str, self.arguments)])
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """One run of a correction: a worker that lost its lease, or was begun before a retry, has another."""
-
-    correction_id: str
-    epoch: int
-    attempt: int
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A finished file and how to hand it out, as the columns `result_` of its correction have it."""
-
-    key: str
-    etag: str
-    media_type: str
-    bytes: int
-    name: str
 
 
 def params_hash(params: Mapping[str, Any]) -> str:
@@ -119,54 +98,39 @@ class Jobs(Works[CorrectionRow]):
         of_photo = [] if photo is None else [CorrectionRow.photo_id == photo.id]
         return page_of(session, CorrectionRow, owner, *of_photo, before=before, limit=limit)
 
-    @writes
-    def start(self, session: Session, correction_id: str, epoch: int) -> Run | None:
-        """Begin, or begin again after the death of a worker; None if it is not to be done any more."""
-        # What an earlier run has stored becomes garbage
-        begun = {"started_at": now()}
-        row = self.move(session, correction_id, ANY_OWNER, CORRECTION_ACTIVE, "running", begun, epoch=epoch)
-        if row is None:
-            return None
+    def _taken_over(self, session: Session, row: CorrectionRow) -> None:
+        """Let what an earlier run has stored become garbage."""
         if row.attempt:
             discard(session, row.run_folder)
-        row.attempt += 1
-        return Run(row.public_id, row.epoch, row.attempt)
 
-    @writes
-    def retry(self, session: Session, correction_id: str, owner: Owner) -> bool:
-        """Start a failed or cancelled correction anew; False if it is in another state."""
-        # False as well if the same correction was requested again meanwhile: that one will do
-        row = find_to_change(session, CorrectionRow, correction_id, owner)
-        if row is None or row.state not in ENDED_BADLY:
-            return False
-        if session.scalar(_same({name: getattr(row, name) for name in _REQUEST})) is not None:
-            return False
+    def _forget_work(self, session: Session, row: CorrectionRow) -> None:
         discard(session, row.run_folder)
-        row.epoch += 1
-        row.state, row.stage, row.stage_at = "queued", None, now()
-        row.error_code = row.error_detail = row.started_at = row.finished_at = None
-        row.attempt = row.progress_done = row.progress_total = 0
-        return True
+        row.stage, row.progress_done, row.progress_total = None, 0, 0
+
+    def _has_twin(self, session: Session, row: CorrectionRow) -> bool:
+        return session.scalar(_same({name: getattr(row, name) for name in _REQUEST})) is not None
 
     @writes
-    def progress(self, session: Session, run: Run, done: int, total: int, stage: str = "correcting") -> None:
-        """Record how far a running correction is."""
+    def progress(
+        self, session: Session, run: CorrectionRow, done: int, total: int, stage: str = "correcting"
+    ) -> None:
+        """Record how far a correction is, as it was taken up."""
         fields = {"progress_done": done, "progress_total": total, "stage": stage}
         self._move_run(session, run, "running", fields)
 
     @writes
-    def finish(self, session: Session, run: Run, result: Result, report: Mapping[str, Any]) -> bool:
+    def finish(
+        self, session: Session, /, run: CorrectionRow, report: Mapping[str, Any], **result: str | int
+    ) -> bool:
         """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
-        fields = {f"result_{name}": value for name, value in asdict(result).items()}
-        fields |= {"report": dict(report), "finished_at": now()}
-        return self._move_run(session, run, "succeeded", fields)
+        # `result`: key, etag, media_type, bytes and name of the file
+        fields = {f"result_{name}": value for name, value in result.items()}
+        ended = {"report": dict(report), "finished_at": now()}
+        return self._move_run(session, run, "succeeded", fields | ended)
 
-    def _move_run(self, session: Session, run: Run, state: str, fields: Mapping[str, object]) -> bool:
-        key, epoch, attempt = run.correction_id, run.epoch, run.attempt
-        return (
-            self.move(session, key, ANY_OWNER, ("running",), state, fields, epoch=epoch, attempt=attempt)
-            is not None
-        )
+    def _move_run(self, session: Session, run: CorrectionRow, state: str, fields: Mapping[str, Any]) -> bool:
+        of_run, key = {"epoch": run.epoch, "attempt": run.attempt}, run.public_id
+        return self.move(session, key, ANY_OWNER, ("running",), state, fields, **of_run) is not None
 
     @reads
     def ended_before(self, session: Session, moment: datetime, limit: int = 100) -> list[str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final
 
-from sqlalchemy import bindparam, delete, func, select, update
+from sqlalchemy import Select, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes
@@ -24,6 +24,7 @@ from app.store.owners import (
     find_to_change,
     is_id,
     now,
+    owned,
     page_of,
 )
 from app.store.samples import COLUMNS, LensState, sample_in
@@ -33,7 +34,6 @@ from app.store.tables import (
     CorrectionRow,
     EventRow,
     LensRow,
-    OwnerRow,
     PatchRow,
     PhotoRow,
     SampleRow,
@@ -53,10 +53,6 @@ _JOINS: Final = {
     "photo_excluded": False,
     "photo_removed": False,
 }
-_STATE: Final = select(LensRow.version, LensRow.rebuild_epoch).where(LensRow.public_id == bindparam("lens"))
-_KNOWN: Final = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
-    OwnerRow.name == bindparam("owner")
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +169,8 @@ class Lenses(Repository):
         # Without a session, which costs time: part of every request that a cached model answers
         if not is_id(lens_id):
             return None
-        which = {"lens": lens_id} if owner is ANY_OWNER else {"lens": lens_id, "owner": owner}
         with self.database.reader.connect() as connection:
-            row = connection.execute(_STATE if owner is ANY_OWNER else _KNOWN, which).one_or_none()
+            row = connection.execute(_state(lens_id, owner)).one_or_none()
             return None if row is None else LensState(*row)
 
     def samples_of(
@@ -195,7 +190,7 @@ class Lenses(Repository):
         if up_to_version is not None:
             query = query.where(SampleRow.version_added <= up_to_version)
         with self.database.reading() as session:
-            state = session.execute(_STATE, {"lens": lens_id}).one_or_none()
+            state = session.execute(_state(lens_id, ANY_OWNER)).one_or_none()
             if state is None:
                 return LensState(0, 0), []
             rows = session.execute(query)
@@ -265,6 +260,11 @@ class Lenses(Repository):
         )
         _forget(session, lens)
         return True
+
+
+def _state(lens_id: str, owner: Owner) -> Select[int, int]:
+    query = owned(LensRow, owner).where(LensRow.public_id == lens_id)
+    return query.with_only_columns(LensRow.version, LensRow.rebuild_epoch)
 
 
 # --- identity -------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from app.errors import BusyError, UnknownError
 from app.store import lenses
 from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
 from app.store.lenses import LensName, forget_if_empty, forget_patches, note_change
-from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_owned, find_to_change, now, page_of
+from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_to_change, now, page_of
 from app.store.patches import Patches
 from app.store.samples import PROFILE, columns_of
 from app.store.tables import (
@@ -185,7 +185,7 @@ class Photos(Patches, Works[PhotoRow]):
         if again:
             known.calibrate, known.given = calibrate, merged
             if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
-                restart(session, known)
+                self.restart(session, known)
         return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
 
     @writes
@@ -212,20 +212,9 @@ class Photos(Patches, Works[PhotoRow]):
         photo.blob_key, photo.file_gone_at = blob_key, None
         photo.location = photo.file_sha256 = None
         if again:
-            restart(session, photo)
+            self.restart(session, photo)
 
     # --- work -------------------------------------------------------------------------------------
-
-    @writes
-    def start(self, session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
-        """Take up a photo, a new one or one that another worker left; None if there is nothing to do."""
-        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-        if photo is None or photo.epoch != epoch or photo.state not in PHOTO_WORKED_ON:
-            return None
-        if photo.state == "received":
-            photo.state, photo.started_at, photo.stage_at = "inspecting", now(), now()
-        photo.attempt += 1
-        return photo
 
     @writes
     def record_inspection(
@@ -312,7 +301,7 @@ class Photos(Patches, Works[PhotoRow]):
     def change(
         self,
         session: Session,
-        photo_id: str,
+        photo_ids: Sequence[str],
         owner: str,
         given: Mapping[str, Any],
         *,
@@ -320,55 +309,56 @@ class Photos(Patches, Works[PhotoRow]):
         excluded: bool | None = None,
         calibrate: bool = False,
     ) -> bool:
-        """Apply what the owner changes: settings, the lens or its id, whether the photo counts."""
-        # With `calibrate` a photo that was merely stored starts again, to teach its lens. All of it or
-        # nothing; False where the photo cannot be excluded or included. A photo that has a result changes its
-        # lens's model at once, any other starts again.
-        photo = find_to_change(session, PhotoRow, photo_id, owner)
-        if photo is None:
-            return False
-        if excluded is not None and not lenses.switch(session, photo, excluded=excluded):
-            return False
-        chosen = _chosen(session, photo, lens, owner)
-        begins = calibrate and not photo.calibrate
-        if begins and photo.file_gone_at is not None:
-            return False
-        _change(session, photo, given, chosen, begins=begins)
-        return True
-
-    @writes
-    def change_several(
-        self,
-        session: Session,
-        photo_ids: Sequence[str],
-        owner: str,
-        given: Mapping[str, Any],
-        *,
-        lens_id: str | None = None,
-        label: str | None = None,
-    ) -> None:
-        """Apply the same settings and lens to several photos: to all or, where one is gone, to none."""
-        # With `label` a new copy, called so, of the lens that the first one names becomes that of them all;
-        # always locked in the same order: two such changes must not wait for each other
+        """Apply what the owner changes: settings, the lens or its id, whether photos count."""
+        # With `calibrate` a photo that was merely stored starts again, to teach its lens. A photo that has a
+        # result changes its lens's model at once, any other starts again. To all photos or, where one is
+        # gone, to none; False where the first cannot be excluded or included. Always locked in the same
+        # order: two such changes must not wait for each other.
         rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
         chosen: LensRow | None = None
         for key in photo_ids:
             photo = rows[key]
             if photo is None:
                 raise UnknownError("photo", key)
-            if chosen is None:
-                named = label and LensName(photo.lens_maker, photo.lens_model, None, label=label)
-                chosen = _chosen(session, photo, named or lens_id, owner)
-            _change(session, photo, given, chosen)
-
-    @writes
-    def retry(self, session: Session, photo_id: str, owner: Owner) -> bool:
-        """Start a failed or cancelled photo anew; False if it is in another state."""
-        photo = find_to_change(session, PhotoRow, photo_id, owner)
-        if photo is None or photo.state not in {"failed", "cancelled"}:
-            return False
-        restart(session, photo)
+            if excluded is not None and not lenses.switch(session, photo, excluded=excluded):
+                return False
+            if isinstance(lens, LensName):
+                chosen = chosen or lenses.named(session, photo.owner_id, lens)
+            elif lens is not None:
+                chosen = chosen or find_to_change(session, LensRow, lens, owner)
+            begins = calibrate and not photo.calibrate
+            if begins and photo.file_gone_at is not None:
+                return False
+            self._change(session, photo, given, chosen, begins=begins)
         return True
+
+    def _change(
+        self,
+        session: Session,
+        photo: PhotoRow,
+        given: Mapping[str, Any],
+        chosen: LensRow | None,
+        *,
+        begins: bool,
+    ) -> None:
+        photo.calibrate |= begins
+        if photo.state not in {"counted", "stored", "excluded"} or begins:
+            if begins or given or chosen is not None:
+                named = {} if chosen is None else {"lens_id": chosen.public_id}
+                photo.given = {**photo.given, **given, **named}
+                self.restart(session, photo)
+            return
+        if given:
+            photo.given = {**photo.given, **given}
+            for field, value in given.items():
+                setattr(photo, GIVEN_SETTINGS[field], value)
+            if photo.state == "counted":
+                note_change(session, photo, "photo_changed")
+        if chosen is not None:
+            lenses.move_photo(session, photo, chosen)
+
+    def _forget_work(self, session: Session, photo: PhotoRow) -> None:
+        forget_patches(session, photo)
 
     @writes
     def delete(self, session: Session, photo_id: str, owner: Owner) -> str | None:
@@ -427,47 +417,6 @@ def _keep_announced(session: Session, prefix: str) -> None:
         raise BusyError("the upload took too long, and what had come of it was deleted: send it again")
 
 
-def _change(
-    session: Session,
-    photo: PhotoRow,
-    given: Mapping[str, Any],
-    chosen: LensRow | None,
-    *,
-    begins: bool = False,
-) -> None:
-    """Change the settings and the lens of a photo."""
-    columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
-    photo.calibrate |= begins
-    if photo.state in {"counted", "stored", "excluded"} and not begins:
-        if given:
-            _correct_settings(session, photo, given, columns)
-        if chosen is not None:
-            lenses.move_photo(session, photo, chosen)
-    elif begins or given or chosen is not None:
-        photo.given = {**photo.given, **given}
-        if chosen is not None:
-            photo.given = {**photo.given, "lens_id": chosen.public_id}
-        restart(session, photo)
-
-
-def _correct_settings(
-    session: Session, photo: PhotoRow, given: Mapping[str, Any], columns: Mapping[str, Any]
-) -> None:
-    """Correct the settings of a finished photo; if it counts its lens's model is fitted anew."""
-    photo.given = {**photo.given, **given}
-    for column, value in columns.items():
-        setattr(photo, column, value)
-    if photo.state == "counted":
-        note_change(session, photo, "photo_changed")
-
-
-def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
-    """Return the lens that an owner describes or whose id is given; None where neither is."""
-    if isinstance(lens, LensName):
-        return lenses.named(session, photo.owner_id, lens)
-    return None if lens is None else find_owned(session, LensRow, lens, owner)
-
-
 def stored_settings(photo: PhotoRow) -> dict[str, Any]:
     """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
@@ -485,15 +434,6 @@ def _setting(photo: PhotoRow, field: str, header: object) -> object:
     """Return a setting by precedence: corrected by the owner, in the header, given with the file."""
     ranked = (photo.given.get(field), header, photo.given.get(FALLBACKS, {}).get(field))
     return next((value for value in ranked if value is not None), None)
-
-
-def restart(session: Session, photo: PhotoRow) -> None:
-    """Begin a new epoch of a photo: its samples are deleted, work of the old one that still runs is void."""
-    forget_patches(session, photo)
-    photo.epoch += 1
-    photo.attempt = 0
-    photo.state, photo.stage_at = "received", now()
-    photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = None
 
 
 def _import(

@@ -7,7 +7,7 @@ loses a race against a cancel, changes nothing the second time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -17,13 +17,14 @@ from app.store.owners import ANY_OWNER, Owner, find_owned, find_to_change, now
 from app.store.tables import CorrectionRow, PhotoRow
 
 Row = TypeVar("Row", PhotoRow, CorrectionRow)
+ENDED_BADLY: Final = ("failed", "cancelled")
 
 
 class Works(Repository, Generic[Row]):
     """Rows of work. `ANY_OWNER` asks as the service itself."""
 
     table: ClassVar[type[Any]]
-    active: ClassVar[tuple[str, ...]]  # states of work that costs computing time
+    active: ClassVar[tuple[str, ...]]  # states of work that costs computing time: first that of a new one
     unfinished: ClassVar[tuple[str, ...]]
 
     @reads
@@ -37,6 +38,19 @@ class Works(Repository, Generic[Row]):
         table = self.table
         wanted = (table.public_id == key, table.epoch == epoch, table.state.in_(self.unfinished))
         return session.scalar(select(table.id).where(*wanted)) is not None
+
+    @writes
+    def start(self, session: Session, key: str, epoch: int) -> Row | None:
+        """Take up a row, a new one or one that another worker left; None if there is nothing to do."""
+        row: Row | None = find_to_change(session, self.table, key, ANY_OWNER)
+        if row is None or row.epoch != epoch or row.state not in self.active:
+            return None
+        self._taken_over(session, row)
+        if row.state == self.active[0]:
+            row.state, row.stage_at = self.active[1], now()
+        row.started_at = now()
+        row.attempt += 1
+        return row
 
     @writes
     def set_state(
@@ -71,6 +85,23 @@ class Works(Repository, Generic[Row]):
             self._ended_badly(session, row)
         return row is not None
 
+    @writes
+    def retry(self, session: Session, key: str, owner: Owner) -> bool:
+        """Start a failed or cancelled row anew; False if it is in another state, or there is such another."""
+        row = find_to_change(session, self.table, key, owner)
+        if row is None or row.state not in ENDED_BADLY or self._has_twin(session, row):
+            return False
+        self.restart(session, row)
+        return True
+
+    def restart(self, session: Session, row: Row) -> None:
+        """Begin a new epoch: work of the old one that still runs is void."""
+        self._forget_work(session, row)
+        row.epoch += 1
+        row.attempt = 0
+        row.state, row.stage_at = self.active[0], now()
+        row.error_code = row.error_detail = row.started_at = row.finished_at = None
+
     def move(
         self,
         session: Session,
@@ -99,3 +130,14 @@ class Works(Repository, Generic[Row]):
 
     def _ended_badly(self, session: Session, row: Row) -> None:
         """Clear up after a row that failed or was cancelled."""
+
+    def _taken_over(self, session: Session, row: Row) -> None:
+        """Clear up after an earlier worker, if there was one."""
+
+    def _forget_work(self, session: Session, row: Row) -> None:
+        """Forget what was done in an epoch."""
+
+    def _has_twin(self, session: Session, row: Row) -> bool:
+        """Say whether the same was asked for again."""
+        del session, row
+        return False

@@ -70,7 +70,7 @@ class Steps:
     def named(self, name: LensName) -> str:
         """Give a lens to a photo that waits for one; return its id."""
         photo = self.receive()
-        assert self.store.photos.change(photo.public_id, self.owner, {}, lens=name)
+        assert self.store.photos.change([photo.public_id], self.owner, {}, lens=name)
         lens_id: str = self.fresh(photo).given["lens_id"]
         return lens_id
 

@@ -17,7 +17,6 @@ from app.main import create_app
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
-from app.store.jobs import Result
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
 from lab.demo.service import own_service
@@ -154,7 +153,9 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
     Storage(settings.storage).put("corrections/x/result", b"the file")
     run = store.jobs.start(correction.id, 1)
     assert run is not None
-    store.jobs.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
+    store.jobs.finish(
+        run, {}, key="corrections/x/result", etag="e", media_type="image/png", bytes=8, name="o.png"
+    )
 
     assert api.wait(correction).links["result"] is not None
     assert api.download(correction.id, target).read_bytes() == b"the file"

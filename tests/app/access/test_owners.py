@@ -20,7 +20,6 @@ from app.pages import pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
 from app.store import Store, accounts
-from app.store.jobs import Result
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import KeyRow, SessionRow
@@ -58,7 +57,9 @@ def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str
     assert run is not None
     key = f"corrections/{row.public_id}/result.dng"
     storage.put(key, b"result")
-    assert store.jobs.finish(run, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {})
+    assert store.jobs.finish(
+        run, {}, key=key, etag="tag", media_type="image/x-adobe-dng", bytes=6, name="p-corrected.dng"
+    )
     return {
         "photo_id": photo.public_id,
         "lens_id": lens.public_id,

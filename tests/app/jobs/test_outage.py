@@ -361,7 +361,7 @@ def test_a_lens_named_by_hand_keeps_its_name_after_a_retry(
     client: TestClient, store: Store, steps: Any
 ) -> None:
     photo = failed_photo(store, steps)
-    assert store.photos.change(photo.public_id, "local", {}, lens=LensName(None, None, None, label="mine"))
+    assert store.photos.change([photo.public_id], "local", {}, lens=LensName(None, None, None, label="mine"))
     lens_id = steps.fresh(photo).given["lens_id"]
     store.photos.fail(photo.public_id, 2, "outage", "again")
 

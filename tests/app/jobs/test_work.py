@@ -208,7 +208,7 @@ def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
         for c in ("g", "r")
     ]
     write_samples(folder, samples)
-    return Outcome("ok", value=[{"idx": 0, "row": 9, "col": 9, "size": 144}] * 2)
+    return Outcome("ok", value=[{"idx": 0, "row": 9, "col": 9, "side": 144}] * 2)
 
 
 def test_samples_lie_where_their_patches_do(
@@ -495,7 +495,7 @@ def test_work_of_an_old_epoch_changes_nothing(
     work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
-        context.store.photos.change(photo.public_id, "local", {"aperture": 4.0})
+        context.store.photos.change([photo.public_id], "local", {"aperture": 4.0})
         return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
 
     sandbox.answers["select"].insert(0, restart)
@@ -637,7 +637,7 @@ def test_a_correction_with_a_version_without_samples_fails(
     context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     key = ask(context, counted, steps)
-    context.store.photos.change(counted.public_id, "local", {}, excluded=True)
+    context.store.photos.change([counted.public_id], "local", {}, excluded=True)
 
     CorrectionWork(context).correction(key)
 

@@ -31,7 +31,6 @@ from app.pages.words import held_map, plain
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
-from app.store.jobs import Result
 from app.store.tables import PhotoRow
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
@@ -95,9 +94,15 @@ def finished(
         "tiles": [{"row": 0, "col": 200, "held_back": 0.4}],
         "tile_side": 100,
     }
-    result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
+    result: Any = {
+        "key": f"{folder}result.dng",
+        "etag": "etag",
+        "media_type": "image/x-adobe-dng",
+        "bytes": 1,
+        "name": "p.dng",
+    }
     report = {"zones": {}, "nothing_to_correct": nothing, "audit": audit}
-    assert store.jobs.finish(run, result, report)
+    assert store.jobs.finish(run, report, **result)
     return made
 
 
@@ -530,7 +535,7 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
     photo = steps.counted()
     lens_id = steps.lens_id(photo)
     for _ in range(201):
-        store.photos.change(photo.public_id, "local", {"aperture": 2.0})
+        store.photos.change([photo.public_id], "local", {"aperture": 2.0})
     store.lenses.record_metrics(lens_id, 202, {"error": {}, "coverage": {"corner": 77}})
 
     page = client.get(f"/lenses/{lens_id}/tests").text

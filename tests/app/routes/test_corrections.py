@@ -14,7 +14,6 @@ from app.blobs.storage import Storage
 from app.routes.corrections import byte_range
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.jobs import Result
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import OwnerRow
 
@@ -32,9 +31,15 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
     etag = hashlib.sha256(FILE).hexdigest()
     run = store.jobs.start(correction_id, 1)
     assert run is not None
-    result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
+    result: Any = {
+        "key": key,
+        "etag": etag,
+        "media_type": "image/tiff",
+        "bytes": len(FILE),
+        "name": "Größe p1-corrected.tif",
+    }
     report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
-    assert store.jobs.finish(run, result, report)
+    assert store.jobs.finish(run, report, **result)
 
 
 @pytest.fixture

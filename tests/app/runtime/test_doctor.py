@@ -27,9 +27,9 @@ def sound(settings: Settings, store: Store, steps: Any) -> list[PhotoRow]:
     """Make an installation with photos in all kinds of states, all as it must be."""
     counted = [steps.counted(), steps.counted(width=1.2)]
     excluded, deleted, failed = steps.counted(), steps.counted(), steps.receive()
-    assert store.photos.change(excluded.public_id, "local", {}, excluded=True)
-    assert store.photos.change(excluded.public_id, "local", {}, excluded=False)
-    assert store.photos.change(excluded.public_id, "local", {}, excluded=True)
+    assert store.photos.change([excluded.public_id], "local", {}, excluded=True)
+    assert store.photos.change([excluded.public_id], "local", {}, excluded=False)
+    assert store.photos.change([excluded.public_id], "local", {}, excluded=True)
     store.photos.delete(deleted.public_id, "local")
     store.photos.fail(failed.public_id, 1, "no_usable_patches", "too dark")
     storage = Storage(settings.storage)

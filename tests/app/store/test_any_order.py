@@ -68,9 +68,9 @@ class Owner:
             lambda: photos.retry(photo, ANY_OWNER),
             lambda: photos.cancel(photo, ANY_OWNER),
             lambda: photos.delete(photo, "local"),
-            lambda: photos.change(photo, "local", {}, excluded=self.chance.random() < 0.5),
-            lambda: photos.change(photo, "local", {"aperture": 2.0}),
-            lambda: photos.change(photo, "local", {}, lens=other),
+            lambda: photos.change([photo], "local", {}, excluded=self.chance.random() < 0.5),
+            lambda: photos.change([photo], "local", {"aperture": 2.0}),
+            lambda: photos.change([photo], "local", {}, lens=other),
             lambda: photos.give_up_file(photo, ()),
             lambda: lenses.merge(lens, other, "local"),
         ]

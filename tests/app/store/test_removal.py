@@ -116,7 +116,7 @@ def test_a_lens_that_its_owner_named_waits_for_his_next_try(
     client: TestClient, store: Store, steps: Any
 ) -> None:
     photo = steps.receive()
-    store.photos.change(photo.public_id, "local", {}, lens=LensName(None, "Old lens", None, label="mine"))
+    store.photos.change([photo.public_id], "local", {}, lens=LensName(None, "Old lens", None, label="mine"))
     again = steps.fresh(photo)
     steps.inspect(again, serial=None)
     store.photos.fail(photo.public_id, again.epoch, "no_usable_patches", "all is sky")

@@ -20,7 +20,6 @@ from app.errors import BusyError
 from app.runtime.settings import Settings, table
 from app.store import LensName, Store, database
 from app.store.database import Database
-from app.store.jobs import Result
 from app.store.migrate import current, head, upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
@@ -104,7 +103,7 @@ def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> N
     assert (last.state, last.reason) == ("rejected", reasons[1999 % 3])
     assert size is not None
     assert size < 100_000
-    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
     assert store.photos.windows(photo.public_id) == []
 
 
@@ -125,7 +124,7 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     photo = steps.receive()
     steps.inspect(photo)
     steps.plan(photo)
-    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
 
     assert steps.estimate(photo) == 0
     assert not store.photos.is_live(photo.public_id, 1)
@@ -148,7 +147,7 @@ def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: S
     photo = steps.receive(aperture=2.8)
     steps.inspect(photo, aperture=1.4)
 
-    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
     store.photos.fail(photo.public_id, 2, "time_limit", "late")
     steps.receive_again(photo, aperture=4.0)  # the same file with another value: no correction
     steps.inspect(photo, aperture=1.4)
@@ -171,7 +170,7 @@ def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
     photo = steps.counted()
     lens = steps.lens_id(photo)
 
-    assert store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    assert store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
 
     after = steps.fresh(photo)
     state, samples = store.lenses.samples_of(lens)
@@ -302,10 +301,10 @@ def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: S
     photo = steps.counted()
     lens = steps.lens_id(photo)
 
-    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)
+    assert store.photos.change([photo.public_id], OWNER, {}, excluded=True)
     assert store.lenses.samples_of(lens)[1] == []
-    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)  # again: no version of its own
-    assert store.photos.change(photo.public_id, OWNER, {}, excluded=False)
+    assert store.photos.change([photo.public_id], OWNER, {}, excluded=True)  # again: no version of its own
+    assert store.photos.change([photo.public_id], OWNER, {}, excluded=False)
 
     state, samples = store.lenses.samples_of(lens)
     assert (state.version, state.rebuild_epoch, len(samples)) == (3, 2, 6)
@@ -341,7 +340,7 @@ def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -
     mine, other = steps.counted(serial="123"), steps.counted(serial="124")
     old, new = steps.lens_id(mine), steps.lens_id(other)
 
-    assert store.photos.change(mine.public_id, OWNER, {}, lens=new)
+    assert store.photos.change([mine.public_id], OWNER, {}, lens=new)
 
     assert store.lenses.samples_of(old)[1] == []
     assert len(store.lenses.samples_of(new)[1]) == 12
@@ -350,7 +349,7 @@ def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -
 def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, steps: Steps) -> None:
     photo = steps.counted()
 
-    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
 
     state, samples = store.lenses.samples_of(steps.lens_id(photo))
     assert state.version == 2
@@ -381,7 +380,7 @@ def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> Non
 
     assert store.jobs.cancel(row.public_id, OWNER)
 
-    assert not store.jobs.finish(run, Result("k", "e", "image/tiff", 1, "n"), {})
+    assert not store.jobs.finish(run, {}, key="k", etag="e", media_type="image/tiff", bytes=1, name="n")
     assert not store.jobs.start(row.public_id, 1)
     assert not store.jobs.is_live(row.public_id, 1)
 
@@ -416,7 +415,7 @@ def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, ste
 
     def toggle() -> None:
         for _ in range(5):
-            store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+            store.photos.change([photo.public_id], OWNER, {"aperture": 2.0})
 
     threads = [threading.Thread(target=toggle) for _ in range(4)]
     for thread in threads:
@@ -571,7 +570,7 @@ def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
     photo = steps.counted()
     blocked_once(monkeypatch, database)
 
-    assert store.photos.change(photo.public_id, OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
+    assert store.photos.change([photo.public_id], OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
 
     assert steps.lens_id(photo) != steps.lens_id(steps.counted())
 
@@ -579,7 +578,7 @@ def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
 def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:
     photo, other = steps.receive(), steps.receive()
     store.photos.delete(photo.public_id, OWNER)
-    store.photos.change(other.public_id, OWNER, {"aperture": 2.0})
+    store.photos.change([other.public_id], OWNER, {"aperture": 2.0})
 
     store.photos.record_lateral(photo.public_id, 1, {"red": [0, 0, 0, 1]})
     store.photos.record_lateral(other.public_id, 1, {"red": [0, 0, 0, 1]})

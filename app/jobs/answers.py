@@ -30,6 +30,10 @@ class JobFailedError(Exception):
         self.code, self.detail = code, detail
 
 
+class NotWantedError(Exception):
+    """The job was cancelled, or its photo deleted or started anew: stop, and change nothing."""
+
+
 class _Strict(BaseModel):
     """JSON of exactly the declared types."""
 
@@ -66,6 +70,7 @@ _METADATA = _answer(
     focus_m=Annotated[float, Field(ge=-1, le=1e9)] | None,
     orientation=Annotated[int, Field(ge=1, le=8)],
 )
+LOCATED: Answer = _answer("Search", location=Literal["none", "removed", "unknown"])
 INSPECTED: Answer = _answer("Header", kind=_text(20), width=Side, height=Side, metadata=_METADATA)
 
 _WINDOW: dict[str, Any] = {

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 
 from app.blobs.storage import Storage
 from app.jobs import answers
-from app.jobs.answers import Answer, JobFailedError, checked
+from app.jobs.answers import Answer, JobFailedError, NotWantedError, checked
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SHOWN
 from app.runtime import metrics
@@ -56,10 +56,6 @@ KEEP_BYTES: Final = 20 << 30
 Wanted: TypeAlias = Callable[[], bool]
 
 
-class NotWantedError(Exception):
-    """The job was cancelled, or its photo deleted or started anew: stop, and change nothing."""
-
-
 @dataclass(frozen=True, slots=True)
 class Needs:
     """What a task needs of the machine, and what it answers."""
@@ -74,6 +70,7 @@ class Needs:
 
 # Of a pixel mapped planes alone take 12 bytes; a measurement maps two photos, with a float64 plane of each
 NEEDS: Final[Mapping[str, Needs]] = {
+    "locate": Needs(90, answers.LOCATED, compiled=False),
     "inspect": Needs(90, answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False),
     "develop": Needs(20, pixel_bytes=120, compiled=False),
     "select": Needs(20, answers.SELECTED, pixel_bytes=120, compiled=False),

@@ -10,19 +10,16 @@ from __future__ import annotations
 import hashlib
 import logging
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from app.jobs.answers import INSPECTED, JobFailedError, checked
+from app.jobs.answers import JobFailedError
 from app.jobs.context import JobContext, Wanted
-from app.jobs.task_files import CLEANED, PLACE, THUMBNAIL
+from app.jobs.task_files import CLEANED, THUMBNAIL
 from app.store import LensName
-from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.core.names import name_key, serial_key
 
 log = logging.getLogger(__name__)
-
-MAX_WORD: Final = 20  # bytes of what a child says of the place: a word
 
 # Fields of a header that have columns of the same name
 _COLUMNS: Final = (
@@ -31,8 +28,14 @@ _COLUMNS: Final = (
 
 
 def inspect(context: JobContext, photo: PhotoRow, wanted: Wanted) -> None:
-    """Read and record the header of a photo; remove its place, and store a small picture of it."""
-    info = _examined(context, photo, wanted)
+    """Remove the place from the file of a photo, record its header, and store a small picture of it."""
+    most = context.settings.max_megapixels
+    with context.original(photo) as path:
+        _remove_place(context, photo, path, wanted)
+        task = context.task("inspect", photo, wanted, reads=[path], path=str(path), max_megapixels=most)
+        with task as (info, folder):
+            if (folder / THUMBNAIL).is_file():
+                context.storage.put(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
     metadata = info["metadata"]
     camera = (metadata["camera_maker"], metadata["camera_model"])
     context.store.photos.record_inspection(
@@ -45,37 +48,31 @@ def inspect(context: JobContext, photo: PhotoRow, wanted: Wanted) -> None:
     )
 
 
-def remove_location(context: JobContext, photo: PhotoRow) -> PhotoRow:
-    """Remove the place from the file of a photo, once; return the photo with the file that it has now."""
-    photos = context.store.photos
-    if photo.location is not None or photo.file_gone_at is not None:
-        return photo
+def remove_location(context: JobContext, photo: PhotoRow) -> None:
+    """Remove the place from the file of a photo on which nobody works, once."""
     try:
-        _examined(context, photo, lambda: True)
+        with context.original(photo) as path:
+            _remove_place(context, photo, path, lambda: True)
+    except JobFailedError:  # its file is lost, which the doctor reports
+        context.store.photos.record_location(photo, "unknown")
+
+
+def _remove_place(context: JobContext, photo: PhotoRow, path: Path, wanted: Wanted) -> None:
+    """Have a child search a file; its copy without the place becomes that of the photo."""
+    if photo.location is not None:
+        return
+    said, new = "unknown", {}
+    try:
+        with context.task("locate", photo, wanted, reads=[path], path=str(path)) as (answer, folder):
+            said, cleaned = answer["location"], folder / CLEANED
+            if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
+                with cleaned.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
+                new = {"key": f"{photo.folder}cleaned-{digest[:16]}", "digest": digest}
+                context.storage.put(new["key"], cleaned)
     except JobFailedError as error:
         log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
-    searched = photos.get(photo.public_id, ANY_OWNER) or photo
-    if searched.location is None:  # its file is lost, which the doctor reports
-        photos.record_location(searched, "unknown")
-    return photos.get(photo.public_id, ANY_OWNER) or photo
-
-
-def _examined(context: JobContext, photo: PhotoRow, wanted: Wanted) -> dict[str, Any]:
-    """Have a child read a file; whatever it says of the header, keep what it says of the place."""
-    limits, most = context.limits("inspect", photo), context.settings.max_megapixels
-    with context.original(photo) as path, context.sandbox.folder() as folder:
-        arguments = {"path": str(path), "max_megapixels": most}
-        try:
-            info = context.attempt(
-                "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
-            )
-        except JobFailedError:
-            _record_place(context, photo, folder)
-            raise
-        _record_place(context, photo, folder)
-        if (folder / THUMBNAIL).is_file():
-            context.storage.put(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
-        return checked(INSPECTED, info)
+    context.store.photos.record_location(photo, said, **new)
 
 
 def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:
@@ -84,19 +81,3 @@ def body_key(maker: str | None, model: str | None, serial: str | None) -> str | 
         return None
     identity = "|".join((name_key(maker), name_key(model), serial_key(serial)))
     return hashlib.sha256(identity.encode()).hexdigest()[:16]
-
-
-def _record_place(context: JobContext, photo: PhotoRow, folder: Path) -> None:
-    """Record what a child has written of the place; a file without it becomes that of the photo."""
-    if photo.location is not None:
-        return
-    word, new, cleaned = "unknown", {}, folder / CLEANED
-    if (folder / PLACE).is_file() and (folder / PLACE).stat().st_size < MAX_WORD:
-        said = (folder / PLACE).read_text(encoding="ascii", errors="replace")
-        word = said if said in {"none", "removed"} else "unknown"
-        if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
-            with cleaned.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            new = {"key": f"{photo.folder}cleaned-{digest[:16]}", "digest": digest}
-            context.storage.put(new["key"], cleaned)
-    context.store.photos.record_location(photo, word, **new)

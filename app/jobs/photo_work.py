@@ -20,8 +20,8 @@ from typing import Any, Final
 from structlog.contextvars import bind_contextvars, get_contextvars
 
 from app.jobs import inspection
-from app.jobs.answers import JobFailedError
-from app.jobs.context import MAX_UNPACKED, JobContext, NotWantedError
+from app.jobs.answers import JobFailedError, NotWantedError
+from app.jobs.context import MAX_UNPACKED, JobContext
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.other_lens import REMEDY, Described, difference
 from app.presets import configured_preset
@@ -51,28 +51,15 @@ POOR: Final = "not-enough-evidence"  # reason of patches that gave no PSF
 _OF_PATCHES: Final = frozenset({"no_samples", "no_usable_patches", "invalid_parameter"})
 
 
-class PhotoWork:
-    """Jobs of photos."""
-
-    def __init__(self, context: JobContext) -> None:
-        self._context = context
-
-    def photo(self, photo_id: str, epoch: int) -> None:
-        """Take a photo through all steps, as far as it can get."""
-        photos = self._context.store.photos
-        photo = photos.start(photo_id, epoch)
-        if photo is None:
-            return
-        try:
-            if photo.kind == PROFILE_FILE:
-                _read_profile(self._context, photo)
-            else:
-                steps = _Measured if photo.given.get("kind") else _Steps
-                steps(self._context, photo).run()
-        except NotWantedError:
-            log.info("photo %s is not wanted any more", photo_id)
-        except JobFailedError as error:
-            photos.fail(photo_id, epoch, error.code, error.detail)
+def work_on(context: JobContext, photo_id: str, epoch: int) -> None:
+    """Take a photo through all steps, as far as it can get."""
+    photo = context.store.photos.start(photo_id, epoch)
+    if photo is None:
+        return
+    if photo.kind == PROFILE_FILE:
+        _read_profile(context, photo)
+    else:
+        _Steps(context, photo).run()
 
 
 class _Steps:
@@ -91,11 +78,14 @@ class _Steps:
         self._enter("developing")
         developed = self._context.developed(self._photo, self._wanted)
         self._enter("selecting")
-        if not self._photos.patches(*self._which):
-            self.select(developed)
-        self._enter("estimating")
-        self.estimate()
-        self.check()
+        if self._photo.given.get("kind"):
+            self._measure(developed)  # made for it: one place is enough
+        else:
+            if not self._photos.patches(*self._which):
+                self._select(developed)
+            self._enter("estimating")
+            self._estimate()
+            self._check()
         version = self._photos.finish(*self._which)
         if version is not None:
             log.info("photo %s counted, lens version %d", self._photo.public_id, version)
@@ -127,7 +117,7 @@ class _Steps:
             self._move(("inspecting",), "needs_lens", **why)
         return not missing
 
-    def select(self, developed: Path) -> None:
+    def _select(self, developed: Path) -> None:
         """Choose the patches, and measure the lateral colour."""
         photo = self._photo
         try:
@@ -152,7 +142,7 @@ class _Steps:
             self._photos.record_lateral(*self._which, selection["lateral"])
         self._photos.plan_patches(*self._which, selection["patches"], selection["rejected"])
 
-    def estimate(self) -> None:
+    def _estimate(self) -> None:
         """Estimate in each cell with open patches, in as many at once as the worker has slots."""
         cells: defaultdict[int | None, list[PatchRow]] = defaultdict(list)
         for row in self._photos.patches(*self._which):
@@ -203,7 +193,7 @@ class _Steps:
                 for number, sample in zip(listed, samples, strict=True)
             ]
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Make sure that enough of the patches gave a PSF, and not all in one place."""
         tried = self._photos.patches(*self._which)
         done = [_patch_of(row) for row in tried if row.state == "done"]
@@ -214,12 +204,8 @@ class _Steps:
         except NoUsablePatchesError as error:
             raise JobFailedError(error.code, str(error)) from error
 
-
-class _Measured(_Steps):
-    """A photo that was made to measure the lens: one task measures all over it, and states its own error."""
-
-    def select(self, developed: Path) -> None:
-        """Measure; the places are the patches, and their samples are there at once."""
+    def _measure(self, developed: Path) -> None:
+        """Measure all over the photo by one task; the places are the patches, and their samples are there."""
         # A repeated call adds nothing twice
         photo, folders = self._photo, [developed, *self._reference()]
         with self._context.task(
@@ -255,12 +241,6 @@ class _Measured(_Steps):
             text = f"the reference photo {name} was not read yet; send the open photo again"
             raise JobFailedError("not_ready", text)
         return [self._context.developed(row, self._wanted)]
-
-    def estimate(self) -> None:
-        """Nothing is left to estimate."""
-
-    def check(self) -> None:
-        """One place is enough."""
 
 
 def _missing(photo: PhotoRow, *, lens_known: bool) -> str:

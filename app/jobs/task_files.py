@@ -8,7 +8,6 @@ from typing import Final
 KERNELS: Final = "kernels.npy"  # kernels, one a row: `(n, k, k)`
 SAMPLES: Final = "samples.json"  # position, settings, weight and origin of each kernel
 ENCODED: Final = "encoded.npy"  # what patches say without a kernel, one a row
-PLACE: Final = "place"  # whether the file of a photo said where it was taken: none, removed or unknown
 CLEANED: Final = "cleaned"  # the file of a photo without the place where it was taken
 REPORT: Final = "report.json"  # the report of a lens test
 # Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`

@@ -25,7 +25,7 @@ from app import distances
 from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
-from app.jobs.task_files import CLEANED, LAYER_FILES, PLACE, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
+from app.jobs.task_files import CLEANED, LAYER_FILES, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import correction, photo
 from lensmodel import measured as lens_measure
@@ -64,15 +64,29 @@ def _ready_for_loops() -> None:
 _ready_for_loops()
 
 
-def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Return the header of `path`: size, kind, camera, lens, settings.
+def locate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    """Say whether `path` tells where it was taken; a copy without, of the same length, goes to the folder."""
+    del progress
+    path, cleaned = Path(arguments["path"]), folder / CLEANED
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        if mapped[6:14] == CIFF:
+            return {"location": "none"}
+        traces = find_location(mapped)
+    if traces.overwrites:
+        shutil.copyfile(path, cleaned)
+        with cleaned.open("r+b") as copy:
+            for overwrite in traces.overwrites:
+                copy.seek(overwrite.start)
+                copy.write(overwrite.data)
+    if not traces.complete:
+        return {"location": "unknown"}
+    return {"location": "removed" if traces.overwrites else "none"}
 
-    To the folder go a word on whether it tells where it was taken, itself without that, a small picture.
-    """
+
+def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    """Return the header of `path`: size, kind, camera, lens, settings; a small picture goes to the folder."""
     del progress
     path = Path(arguments["path"])
-    word = _without_place(path, folder / CLEANED)
-    (folder / PLACE).write_text(word, encoding="ascii")
     info = photo.inspect(path, photo.Limits(max_megapixels=arguments["max_megapixels"]))
     try:
         picture = small_pictures.thumbnail(path, info.kind, info.metadata.orientation or 1)
@@ -83,23 +97,6 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     header: dict[str, Any] = codec.to_json(info)
     header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
     return header
-
-
-def _without_place(path: Path, cleaned: Path) -> str:
-    """Copy a file without the place where it was taken, if it tells it; of the same length."""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
-        if mapped[6:14] == CIFF:
-            return "none"
-        traces = find_location(mapped)
-    if traces.overwrites:
-        shutil.copyfile(path, cleaned)
-        with cleaned.open("r+b") as copy:
-            for overwrite in traces.overwrites:
-                copy.seek(overwrite.start)
-                copy.write(overwrite.data)
-    if not traces.complete:
-        return "unknown"
-    return "removed" if traces.overwrites else "none"
 
 
 def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -285,6 +282,7 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
 
 TASKS: Final[Mapping[str, Task]] = {
+    "locate": locate,
     "inspect": inspect,
     "develop": develop,
     "select": select,

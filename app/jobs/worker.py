@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
-import math
 import os
 import shutil
 import socket
@@ -20,21 +19,19 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Final
 
-from structlog.contextvars import bound_contextvars
-
 import lensmodel
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
 from app.jobs.answers import JobFailedError
 from app.jobs.context import JobContext, drop_developed
-from app.jobs.correction_work import CorrectionWork
+from app.jobs.correction_work import correct, measure
 from app.jobs.inspection import remove_location
-from app.jobs.photo_work import PhotoWork
-from app.jobs.queue import DbosEngine, Handler
+from app.jobs.photo_work import work_on
+from app.jobs.queue import DbosEngine
+from app.jobs.running import OURS, durable, end_job, insist
 from app.jobs.task_files import SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
-from app.runtime.outage import CODE as OUTAGE
-from app.runtime.outage import Patience, is_outage
+from app.runtime.outage import is_outage
 from app.runtime.processes import PARENT, end_with_parent, is_running, started_at
 from app.runtime.settings import Settings
 from app.sandbox import account, confine
@@ -51,6 +48,11 @@ log = logging.getLogger(__name__)
 
 # Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)
 EXIT_FENCED: Final = 70
+JOBS: Final[Mapping[Kind, Callable[..., None]]] = {
+    "photo": work_on,
+    "correction": correct,
+    "measure": measure,
+}
 WARMING = "app.jobs.warming"  # module that compiles what tasks need; tests replace it
 # seconds between two rounds of a duty, all chosen
 SWEEP_S: Final = 0.5  # of the tables for new work, which takes seconds: an idle worker uses no processor
@@ -58,61 +60,6 @@ RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of 
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
 # How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into
 KEEP_JOBS: Final = timedelta(days=2)
-# How long a job waits for a database, a storage or a disk before it fails (chosen): a night
-OUTAGE_S: Final = 12 * 3600.0
-_OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
-_LATER: Final = "retry once its operator has mended that"
-
-
-def ending_of(error: BaseException) -> JobFailedError:
-    """Return why a job is given up whose last attempt failed with this error."""
-    if not is_outage(error):
-        return JobFailedError("internal_error", _OURS)
-    text = f"the service waited in vain for what it needs ({type(error).__name__}): {_LATER}"
-    return JobFailedError(OUTAGE, text)
-
-
-_SUBJECT: Final[Mapping[Kind, str]] = {
-    "photo": "photo_id",
-    "correction": "correction_id",
-    "measure": "lens_id",
-}
-
-
-def durable(kind: Kind, handler: Handler, give_up: Callable[[Job, JobFailedError], None]) -> Handler:
-    """Wrap a job: failures are retried, and after the last one it is given up with a reason."""
-
-    def run(*arguments: str | int) -> None:
-        job, began, how = Job(kind, arguments), monotonic(), "done"
-        with bound_contextvars(job_id=job.id, **{_SUBJECT[kind]: str(arguments[0])}):
-            try:
-                _insist(partial(handler, *arguments), OUTAGE_S, kind)
-            except Exception as error:  # noqa: BLE001 - whatever it is, it has been logged
-                reason = ending_of(error)
-                how = reason.code
-                _insist(partial(give_up, job, reason))
-        metrics.JOB_SECONDS.labels(kind, how).observe(monotonic() - began)
-
-    return run
-
-
-def _insist(call: Callable[[], object], outage_s: float = math.inf, kind: Kind | None = None) -> None:
-    """Do something again until it succeeds; raise its error after a few bugs, or an outage of that time."""
-    patience = Patience(outage_s)
-    while True:
-        try:
-            call()
-        except Exception as error:
-            outage = is_outage(error)
-            log.warning("%s: %s", type(error).__name__, error, exc_info=None if outage else error)
-            pause = patience.pause_after(error)
-            if pause is None:
-                raise
-            if kind is not None:
-                metrics.RETRIES.labels(kind, "outage" if outage else "unforeseen").inc()
-            sleep(pause)
-        else:
-            return
 
 
 class Worker:
@@ -176,21 +123,18 @@ class Worker:
             "pid": os.getpid(),
             "pid_started": started_at(os.getpid()),
         }
-        _insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined), **about))
+        insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined), **about))
         self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         self._start_thread(beat_s, self._keep_lease)
-        _insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
-        corrections = CorrectionWork(self._context)
-        handlers: dict[Kind, Handler] = {
-            "photo": PhotoWork(self._context).photo,
-            "correction": corrections.correction,
-            "measure": corrections.measure,
-        }
+        insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
         self._context.warmed.clear()
         threading.Thread(target=self._do, args=(self._warm,), daemon=True).start()
-        self._engine.start({kind: durable(kind, handler, self._end) for kind, handler in handlers.items()})
+        end = partial(end_job, self._store)
+        self._engine.start(
+            {kind: durable(kind, partial(job, self._context), end) for kind, job in JOBS.items()}
+        )
         self._start_thread(beat_s, self._take_over_dead)
         self._start_thread(SWEEP_S, self._sweep)
         self._start_thread(RECONCILE_S, self._reconcile, first_s=RECONCILE_S)
@@ -212,20 +156,6 @@ class Worker:
             duty()
         except Exception:
             log.exception("a duty of the worker failed; it is tried again")
-
-    # --- jobs ---------------------------------------------------------------------------------
-
-    def _end(self, job: Job, ending: JobFailedError) -> None:
-        """End the work of a job with a reason; changes nothing where that has ended meanwhile."""
-        why, subject = (ending.code, ending.detail), str(job.arguments[0])
-        number = int(job.arguments[1])
-        if job.kind == "correction":
-            self._store.jobs.fail(subject, number, *why)
-        elif job.kind == "measure":
-            unknown = {"error": None, "coverage": None, "problem": ending.code}
-            self._store.lenses.record_metrics(subject, number, unknown)
-        else:
-            self._store.photos.fail(subject, number, *why)
 
     # --- duties -------------------------------------------------------------------------------
 
@@ -270,7 +200,7 @@ class Worker:
         for job in self._store.jobs.to_do(begun=True):
             ended = self._lost(job)
             if ended:
-                self._end(job, ended)
+                end_job(self._store, job, ended)
 
     def _lost(self, job: Job) -> JobFailedError | None:
         status = self._engine.status(job)
@@ -280,7 +210,7 @@ class Worker:
             return JobFailedError(
                 "crashed_repeatedly", "the worker died each time that it tried; report the file"
             )
-        return JobFailedError("internal_error", _OURS) if status == "done" else None
+        return JobFailedError("internal_error", OURS) if status == "done" else None
 
     def _tidy(self) -> None:
         """Delete data that are no longer needed; one failure does not prevent the others."""

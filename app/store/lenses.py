@@ -207,6 +207,11 @@ class Lenses(Repository):
             statement = update(EventRow).where(*of_version, EventRow.metrics.is_(None))
             session.execute(statement.values(metrics=metrics))
 
+    def fail(self, lens_id: str, version: int, code: str, detail: str) -> None:
+        """Record that a version could not be measured, and why."""
+        del detail
+        self.record_metrics(lens_id, version, {"error": None, "coverage": None, "problem": code})
+
     # --- changes ----------------------------------------------------------------------------------
 
     @writes

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -240,10 +241,12 @@ class TasksHere:
 def reading(settings: Settings, store: Store) -> Iterator[None]:
     """Read the profiles that are sent meanwhile, as a worker does."""
     from app.jobs.context import JobContext  # noqa: PLC0415 - as above
-    from app.jobs.photo_work import PhotoWork  # noqa: PLC0415 - as above
+    from app.jobs.photo_work import work_on  # noqa: PLC0415 - as above
+    from app.jobs.running import durable, end_job  # noqa: PLC0415 - as above
 
     sandbox: Any = TasksHere(settings.data_dir / "scratch")
-    work = PhotoWork(JobContext(settings, store, Storage(settings.storage, create=False), sandbox))
+    context = JobContext(settings, store, Storage(settings.storage, create=False), sandbox)
+    work = durable("photo", partial(work_on, context), partial(end_job, store))
     ended = threading.Event()
 
     def read() -> None:
@@ -252,7 +255,7 @@ def reading(settings: Settings, store: Store) -> Iterator[None]:
                 photo_id, epoch = str(job.arguments[0]), int(job.arguments[1])
                 row = store.photos.get(photo_id, ANY_OWNER)
                 if row is not None and row.kind == PROFILE_FILE:  # photos are the test's own
-                    work.photo(photo_id, epoch)
+                    work(photo_id, epoch)
 
     thread = threading.Thread(target=read)
     thread.start()

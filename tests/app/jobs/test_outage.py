@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from starlette.testclient import TestClient
 from uploads import receive
 
 from app.blobs.storage import Storage
-from app.jobs.worker import Worker, durable
+from app.jobs.running import durable, end_job
+from app.jobs.worker import Worker
 from app.runtime.outage import Patience, is_outage
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
@@ -122,7 +124,7 @@ class Away:
 
 @pytest.fixture
 def worker(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Worker:
-    monkeypatch.setattr("app.jobs.worker.sleep", lambda _: None)
+    monkeypatch.setattr("app.jobs.running.sleep", lambda _: None)
     return Worker(settings)
 
 
@@ -130,7 +132,7 @@ def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> N
     photo = steps.receive()
     job = Away(exc.OperationalError("SELECT", {}, psycopg.OperationalError("away")), times=9)
 
-    durable("photo", job, worker._end)(photo.public_id, 1)
+    durable("photo", job, partial(end_job, store))(photo.public_id, 1)
 
     assert job.runs == 10
     assert steps.fresh(photo).state == "received"
@@ -139,20 +141,22 @@ def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> N
 def test_a_job_that_waited_in_vain_ends_as_such(
     worker: Worker, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.jobs.worker.OUTAGE_S", 0.0)
+    monkeypatch.setattr("app.jobs.running.OUTAGE_S", 0.0)
     photo = steps.receive()
     steps.inspect(photo)
 
-    durable("photo", Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._end)(photo.public_id, 1)
+    durable("photo", Away(OSError(errno.ENOSPC, "full"), times=10**6), partial(end_job, store))(
+        photo.public_id, 1
+    )
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", "outage")
 
 
-def test_a_bug_ends_the_job_after_three_tries(worker: Worker, steps: Any) -> None:
+def test_a_bug_ends_the_job_after_three_tries(store: Store, steps: Any) -> None:
     photo, job = steps.receive(), Away(KeyError("a bug"), times=10)
 
-    durable("photo", job, worker._end)(photo.public_id, 1)
+    durable("photo", job, partial(end_job, store))(photo.public_id, 1)
 
     assert (steps.fresh(photo).error_code, job.runs) == ("internal_error", 3)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from sqlalchemy import update
 from app.blobs.storage import Storage
 from app.http import views
 from app.jobs import tasks
-from app.jobs.answers import JobFailedError
-from app.jobs.context import JobContext, NotWantedError
-from app.jobs.correction_work import CorrectionWork
+from app.jobs.answers import JobFailedError, NotWantedError
+from app.jobs.context import JobContext
+from app.jobs.correction_work import correct, measure
 from app.jobs.inspection import remove_location
-from app.jobs.photo_work import PhotoWork
+from app.jobs.photo_work import work_on
+from app.jobs.queue import Handler
+from app.jobs.running import durable, end_job
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import KERNELS, SAMPLES, SHOWN
 from app.runtime.settings import Settings
@@ -110,6 +113,7 @@ class Scripted:
         self.seen: dict[str, dict[str, Any]] = {}
         self.files: set[str] = set()
         self.answers: dict[str, list[Answer]] = {
+            "locate": [ok({"location": "none"})],
             "inspect": [ok(INFO)],
             "develop": [develop],
             "select": [ok({"patches": [patch(0), patch(1)], "rejected": [], "lateral": None})],
@@ -163,8 +167,8 @@ def context(
 
 
 @pytest.fixture
-def work(context: JobContext) -> PhotoWork:
-    return PhotoWork(context)
+def work(context: JobContext) -> Handler:
+    return durable("photo", partial(work_on, context), partial(end_job, context.store))
 
 
 @pytest.fixture
@@ -182,8 +186,8 @@ def changed(photo: PhotoRow, **metadata: Any) -> Answer:
     return ok(INFO | {"metadata": INFO["metadata"] | metadata})  # type: ignore[operator]  # both are dicts
 
 
-def test_a_photo_goes_all_the_way(work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any) -> None:
-    work.photo(photo.public_id, 1)
+def test_a_photo_goes_all_the_way(work: Handler, context: JobContext, photo: PhotoRow, steps: Any) -> None:
+    work(photo.public_id, 1)
 
     done = steps.fresh(photo)
     lens = done.lens
@@ -194,9 +198,9 @@ def test_a_photo_goes_all_the_way(work: PhotoWork, context: JobContext, photo: P
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "r-map"), ({"selector": "good-regions"}, "good-regions")])
 def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any, given: dict[str, str], taken: str
+    work: Handler, context: JobContext, sandbox: Scripted, steps: Any, given: dict[str, str], taken: str
 ) -> None:
-    work.photo(received(context, steps, **given).public_id, 1)
+    work(received(context, steps, **given).public_id, 1)
 
     assert sandbox.seen["select"]["selector"] == taken
 
@@ -212,9 +216,9 @@ def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 
 def test_samples_lie_where_their_patches_do(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
     assert {(round(entry.position.r, 9), entry.position.phi) for entry in samples} == {
@@ -235,21 +239,21 @@ def fewer_than_announced(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 @pytest.mark.parametrize("child", [nobody_elses_patch, fewer_than_announced, ok(None), ok([{"idx": 0}])])
 def test_a_cell_whose_child_answers_nonsense_fails(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any, child: Answer
+    work: Handler, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any, child: Answer
 ) -> None:
     sandbox.answers["estimate"] = [child]
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     patches = context.store.photos.patches(photo.public_id, 1)
     assert {(row.state, row.reason) for row in patches} == {("failed", "internal_error")}
 
 
 def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estimate(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["measure-lens"] = [measured]
     photo = received(context, steps, kind="target")
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     assert (steps.fresh(photo).state, "estimate" in sandbox.ran) == ("counted", False)
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
@@ -257,7 +261,7 @@ def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estima
 
 
 def test_a_file_is_not_lost_whose_disk_went_away_for_a_moment(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
     folder = context.storage.folder
     assert folder is not None
@@ -270,7 +274,7 @@ def test_a_file_is_not_lost_whose_disk_went_away_for_a_moment(
         finally:
             aside.rename(folder)
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
     assert steps.fresh(photo).state == "counted"
 
 
@@ -292,31 +296,31 @@ def test_a_write_while_the_disk_goes_away_does_not_pass_for_stored(
 
 
 def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["measure-lens"] = [measured]
     closed = received(context, steps, calibrate=False)
-    work.photo(closed.public_id, 1)
+    work(closed.public_id, 1)
     opened = received(context, steps, kind="pair", reference_id=closed.public_id)
-    work.photo(opened.public_id, 1)
+    work(opened.public_id, 1)
 
     assert steps.fresh(opened).state == "counted"
     names = [Path(folder).name for folder in sandbox.seen["measure-lens"]["developed"]]
     assert names == [opened.public_id, closed.public_id]
 
 
-def test_a_pair_whose_closed_photo_is_gone_says_so(work: PhotoWork, context: JobContext, steps: Any) -> None:
+def test_a_pair_whose_closed_photo_is_gone_says_so(work: Handler, context: JobContext, steps: Any) -> None:
     photo = received(context, steps, kind="pair", reference_id="gone")
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     row = steps.fresh(photo)
     assert (row.state, row.error_code) == ("failed", "unknown_photo")
 
 
 def test_a_photo_focused_at_infinity_says_so_to_the_model(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     _, samples = context.store.lenses.samples_of(steps.lens_id(photo))
     assert {stored.settings.focus_m for stored in samples} == {math.inf}
@@ -324,25 +328,25 @@ def test_a_photo_focused_at_infinity_says_so_to_the_model(
 
 
 def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted
+    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted
 ) -> None:
     def with_a_picture(arguments: dict[str, Any], folder: Path) -> Outcome:
         (folder / SHOWN).write_bytes(b"a small picture")
         return develop(arguments, folder)
 
     sandbox.answers["develop"] = [with_a_picture]
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     assert context.storage.get(f"photos/{photo.public_id}/{SHOWN}") == b"a small picture"
 
 
 def test_running_a_finished_photo_again_changes_nothing(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
     ran = list(sandbox.ran)
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     lens = steps.fresh(photo).lens
     assert lens is not None
@@ -352,7 +356,7 @@ def test_running_a_finished_photo_again_changes_nothing(
 
 @pytest.mark.parametrize("dies_in", ["inspect", "develop", "select", "estimate"])
 def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, dies_in: str
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any, dies_in: str
 ) -> None:
     class DiedError(BaseException):
         """Stands for the death of the process."""
@@ -362,8 +366,8 @@ def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
 
     sandbox.answers[dies_in].insert(0, die)
     with pytest.raises(DiedError):
-        work.photo(photo.public_id, 1)
-    work.photo(photo.public_id, 1)
+        work(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     done = steps.fresh(photo)
     lens = done.lens
@@ -375,24 +379,24 @@ def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
 
 
 def test_a_photo_without_serial_waits_for_its_owner(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["inspect"] = [changed(photo, lens=LENS | {"serial": None, "serial_source": "none"})]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     waiting = steps.fresh(photo)
     assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
     assert "choose a lens" in waiting.error_detail
-    assert sandbox.ran == ["inspect"]
+    assert sandbox.ran == ["locate", "inspect"]
 
 
 def test_a_photo_without_aperture_waits_and_says_so(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["inspect"] = [changed(photo, aperture=None)]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     waiting = steps.fresh(photo)
     assert waiting.state == "needs_lens"
@@ -400,14 +404,14 @@ def test_a_photo_without_aperture_waits_and_says_so(
 
 
 def test_a_photo_to_be_stored_only_is_not_developed(
-    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     photo = received(context, steps, calibrate=False)
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     assert steps.fresh(photo).state == "stored"
-    assert sandbox.ran == ["inspect"]
+    assert sandbox.ran == ["locate", "inspect"]
 
 
 @pytest.mark.parametrize(
@@ -415,12 +419,12 @@ def test_a_photo_to_be_stored_only_is_not_developed(
     [("inspect", "decompression_bomb"), ("develop", "raw_decode_failed"), ("select", "no_usable_patches")],
 )
 def test_a_refusal_of_the_library_ends_the_photo_without_another_try(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, refusal: tuple[str, str]
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any, refusal: tuple[str, str]
 ) -> None:
     task, code = refusal
     sandbox.answers[task] = [refused(code, "the value and the remedy")]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code, failed.error_detail) == (
@@ -432,11 +436,11 @@ def test_a_refusal_of_the_library_ends_the_photo_without_another_try(
 
 
 def test_a_photo_too_small_for_patches_is_told_so(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["select"] = [refused("invalid_parameter", "patches need at least 64 px")]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     failed = steps.fresh(photo)
     assert failed.error_code == "no_usable_patches"
@@ -444,11 +448,11 @@ def test_a_photo_too_small_for_patches_is_told_so(
 
 
 def test_cells_without_evidence_are_rejected_and_the_others_count(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["estimate"] = [refused("no_samples"), estimate]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     rows = context.store.photos.patches(photo.public_id)
     assert steps.fresh(photo).state == "counted"
@@ -463,11 +467,11 @@ def test_cells_without_evidence_are_rejected_and_the_others_count(
     ],
 )
 def test_a_photo_of_which_no_cell_helps_fails_with_what_to_do(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, answer: Answer, code: str, says: str
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any, answer: Answer, code: str, says: str
 ) -> None:
     sandbox.answers["estimate"] = [answer]
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     failed = steps.fresh(photo)
     assert (failed.state, failed.error_code) == ("failed", code)
@@ -476,7 +480,7 @@ def test_a_photo_of_which_no_cell_helps_fails_with_what_to_do(
 
 @pytest.mark.parametrize("task", ["inspect", "develop", "select", "estimate"])
 def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
-    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, task: str
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any, task: str
 ) -> None:
     def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
         assert steps.store.photos.cancel(photo.public_id, ANY_OWNER)
@@ -484,7 +488,7 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
 
     sandbox.answers[task].insert(0, cancel)
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     assert steps.fresh(photo).state == "cancelled"
     lens = steps.fresh(photo).lens
@@ -492,26 +496,26 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
 
 
 def test_work_of_an_old_epoch_changes_nothing(
-    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
         context.store.photos.change([photo.public_id], "local", {"aperture": 4.0})
         return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
 
     sandbox.answers["select"].insert(0, restart)
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
     after_old = steps.fresh(photo)
-    work.photo(photo.public_id, 2)
+    work(photo.public_id, 2)
 
     done = steps.fresh(photo)
     assert (after_old.state, after_old.epoch) == ("received", 2)
     assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
 
 
-def test_a_lost_file_is_told_of(work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any) -> None:
+def test_a_lost_file_is_told_of(work: Handler, context: JobContext, photo: PhotoRow, steps: Any) -> None:
     context.storage.delete(f"photos/{photo.public_id}/")
 
-    work.photo(photo.public_id, 1)
+    work(photo.public_id, 1)
 
     assert (steps.fresh(photo).state, steps.fresh(photo).error_code) == ("failed", "unknown_photo")
 
@@ -592,6 +596,14 @@ def ask(context: JobContext, photo: PhotoRow, steps: Any, version: int = 1, **pa
     return context.store.jobs.correct(photo, lens, version, wish)[0].public_id
 
 
+def correction(context: JobContext, key: str) -> None:
+    durable("correction", partial(correct, context), partial(end_job, context.store))(key, 1)
+
+
+def measure_once(context: JobContext, lens_id: str) -> None:
+    durable("measure", partial(measure, context), partial(end_job, context.store))(lens_id, 1)
+
+
 def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
     (folder / "result.jpg").write_bytes(b"a picture")
     return Outcome(
@@ -605,7 +617,7 @@ def test_a_correction_ends_with_a_file(
     sandbox.answers["correct"] = [write_result]
     key = ask(context, counted, steps)
 
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -626,7 +638,7 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
 
     sandbox.answers["correct"] = [keep, keep]
     for bounds in ({}, {"halo": 0.2, "denoise": 0.5}):
-        CorrectionWork(context).correction(ask(context, counted, steps, **bounds))
+        correction(context, ask(context, counted, steps, **bounds))
 
     assert [one["bounds"] for one in given] == [{}, {"halo": 0.2, "denoise": 0.5}]
     assert given[0]["description"].endswith("strength 1")
@@ -639,7 +651,7 @@ def test_a_correction_with_a_version_without_samples_fails(
     key = ask(context, counted, steps)
     context.store.photos.change([counted.public_id], "local", {}, excluded=True)
 
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -657,7 +669,7 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
 
     monkeypatch.setattr(context.storage, "put", cancelled_meanwhile)
     sandbox.answers["correct"] = [write_result]
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     assert not list(context.storage.listed(f"corrections/{key}/"))
 
@@ -669,7 +681,7 @@ def test_a_child_cannot_hand_in_a_file_from_elsewhere(
     sandbox.answers["correct"] = [ok(value)]
     key = ask(context, counted, steps)
 
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -683,7 +695,7 @@ def test_a_version_is_measured_once_and_its_history_says_so(
     lens_id = steps.lens_id(counted)
     before = unmeasured(context.store)
 
-    CorrectionWork(context).measure(lens_id, 1)
+    measure_once(context, lens_id)
 
     assert before == [(lens_id, 1)]
     assert unmeasured(context.store) == []
@@ -694,7 +706,7 @@ def test_a_version_that_cannot_be_measured_is_not_tried_for_ever(
 ) -> None:
     sandbox.answers["measure"] = [refused("no_samples")]
 
-    CorrectionWork(context).measure(steps.lens_id(counted), 1)
+    measure_once(context, steps.lens_id(counted))
 
     assert unmeasured(context.store) == []
 
@@ -705,12 +717,12 @@ def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(
     key = ask(context, counted, steps)
 
     def paused(arguments: dict[str, Any], folder: Path) -> Outcome:
-        CorrectionWork(context).correction(key)  # of the worker that took over
+        correction(context, key)  # of the worker that took over
         (folder / "result.jpg").write_bytes(b"another picture")
         return Outcome("ok", value={"file": "result.jpg", "report": {"zones": {}}})
 
     sandbox.answers["correct"] = [paused, write_result]
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -733,7 +745,7 @@ def test_a_run_of_before_a_retry_reports_nothing(
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [retried]
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -751,12 +763,13 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(
     with context.store.database.writing() as session:
         session.execute(update(PhotoRow).values(byte_size=len(sent)))
     context.storage.put(photo.blob_key, sent)
-    sandbox.answers["inspect"] = [
-        lambda arguments, folder: Outcome("ok", value=tasks.inspect(arguments, folder, ignore_step))
+    sandbox.answers["locate"] = [
+        lambda arguments, folder: Outcome("ok", value=tasks.locate(arguments, folder, ignore_step))
     ]
 
-    cleaned = remove_location(context, steps.fresh(photo))
+    remove_location(context, steps.fresh(photo))
 
+    cleaned = steps.fresh(photo)
     kept = context.storage.get(cleaned.blob_key)
     read = Image.open(io.BytesIO(kept))
     assert (cleaned.location, len(kept)) == ("removed", len(sent))
@@ -765,7 +778,8 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(
     assert cleaned.file_sha256 == hashlib.sha256(kept).hexdigest()
     due = datetime.now(UTC) + timedelta(hours=1)
     assert photo.blob_key in context.store.jobs.garbage(at=due)
-    assert remove_location(context, cleaned) is cleaned  # once
+    remove_location(context, cleaned)
+    assert sandbox.ran == ["locate"]  # once
 
 
 def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
@@ -773,10 +787,11 @@ def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
 ) -> None:
     photo = steps.receive()
     context.storage.put(photo.blob_key, b"the file")
-    sandbox.answers["inspect"] = [refused("time_limit")]
+    sandbox.answers["locate"] = [refused("time_limit")]
 
-    searched = remove_location(context, photo)
+    remove_location(context, photo)
 
+    searched = steps.fresh(photo)
     assert (searched.location, searched.blob_key) == ("unknown", photo.blob_key)
 
 
@@ -811,11 +826,11 @@ WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "reason": "flat"
     ],
 )
 def test_an_answer_that_no_task_gives_ends_the_photo(
-    work: PhotoWork, sandbox: Scripted, photo: PhotoRow, steps: Any, task: str, answer: Any
+    work: Handler, sandbox: Scripted, photo: PhotoRow, steps: Any, task: str, answer: Any
 ) -> None:
     sandbox.answers[task] = [ok(answer)]
 
-    work.photo(photo.public_id, photo.epoch)
+    work(photo.public_id, photo.epoch)
 
     ended = steps.fresh(photo)
     assert (ended.state, ended.error_code) == ("failed", "internal_error")
@@ -840,7 +855,7 @@ def test_a_report_that_no_correction_makes_ends_it(
     sandbox.answers["correct"] = [write]
     key = ask(context, counted, steps)
 
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
@@ -848,11 +863,11 @@ def test_a_report_that_no_correction_makes_ends_it(
 
 
 def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(
-    work: PhotoWork, sandbox: Scripted, photo: PhotoRow, steps: Any
+    work: Handler, sandbox: Scripted, photo: PhotoRow, steps: Any
 ) -> None:
     sandbox.answers["inspect"] = [ok(spoilt(INFO, "metadata.camera_model", "x" * 5000))]
 
-    work.photo(photo.public_id, photo.epoch)
+    work(photo.public_id, photo.epoch)
 
     assert (steps.fresh(photo).state, len(steps.fresh(photo).camera_model)) == ("counted", 200)
 
@@ -867,7 +882,7 @@ def test_a_cancelled_correction_stays_cancelled(
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [cancel]
-    CorrectionWork(context).correction(key)
+    correction(context, key)
 
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None

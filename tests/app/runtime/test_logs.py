@@ -14,7 +14,7 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.jobs.worker import durable
+from app.jobs.running import durable
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store

@@ -27,6 +27,10 @@ METADATA = {
 }
 
 
+def locate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    return {"location": "none"}
+
+
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     return {"kind": "dng", "width": 64, "height": 48, "metadata": METADATA}
 
@@ -69,4 +73,4 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return {"error": {}, "coverage": {}}
 
 
-TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure)}
+TASKS = {f.__name__: f for f in (locate, inspect, develop, select, estimate, measure)}

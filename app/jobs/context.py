@@ -116,51 +116,26 @@ class JobContext:
         **arguments: Any,  # noqa: ANN401 - JSON of any shape
     ) -> Iterator[tuple[Any, Path]]:
         """Run a task in a folder of its own, with `samples`; give its answer, checked, and the folder."""
+        needs, limits, wanted = NEEDS[name], self.limits(name, photo), _patient(wanted)
+        if needs.compiled:
+            self.warmed.wait()  # else it would compile the same at the same time
         with self.sandbox.folder() as folder:
             if samples:
                 write_samples(folder, samples)
-            limits = self.limits(name, photo)
-            answer = self.attempt(
-                name,
-                arguments,
-                folder=folder,
-                limits=limits,
-                wanted=wanted,
-                reads=reads,
-                on_progress=on_progress,
+            around: dict[str, Any] = {"folder": folder, "reads": reads, "on_progress": on_progress}
+            answer = self._attempt(
+                partial(self.sandbox.run, name, arguments, wanted=wanted, **around), name, limits, wanted
             )
-            kind = NEEDS[name].answer
-            yield answer if kind is None else checked(kind, answer), folder
+            yield answer if needs.answer is None else checked(needs.answer, answer), folder
 
-    def attempt(
-        self,
-        task: str,
-        arguments: Mapping[str, Any],
-        *,
-        folder: Path,
-        limits: TaskLimits,
-        wanted: Wanted,
-        reads: Sequence[Path] = (),
-        on_progress: ProgressHook = ignore_step,
-    ) -> Any:  # noqa: ANN401 - JSON of any shape
+    def _attempt(self, run: Callable[..., Outcome], task: str, limits: TaskLimits, wanted: Wanted) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task, with retries where they can help; return its result."""
         # After a death by signal the task is retried after a pause, after too little memory once with twice
         # as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
         # `JobFailedError`, or `OutageError` where the machine lacks disk space or memory.
-        if task in NEEDS and NEEDS[task].compiled:
-            self.warmed.wait()  # else it would compile the same at the same time
-        wanted = _patient(wanted)
         crashes, enlarged = 0, False
         while True:
-            outcome = self.sandbox.run(
-                task,
-                arguments,
-                folder=folder,
-                limits=limits,
-                reads=reads,
-                wanted=wanted,
-                on_progress=on_progress,
-            )
+            outcome = run(limits=limits)
             metrics.TASKS.labels(task, outcome.ending).inc()
             if outcome.ending == "ok":
                 return outcome.value

@@ -18,7 +18,7 @@ from sqlalchemy import func, select, text
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.invariants import INVARIANTS
+from app.store.invariants import INVARIANTS, broken
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
 
 _WITH_FILE: Final = PhotoRow.file_gone_at.is_(None)
@@ -44,7 +44,7 @@ class DoctorReport:
 
 def examine(settings: Settings, store: Store, storage: Storage, *, deep: bool = False) -> DoctorReport:
     """Run all checks."""
-    checks = ["database", *(invariant.name for invariant in INVARIANTS), "work", "blobs"]
+    checks = ["database", *INVARIANTS, "work", "blobs"]
     findings = [*_tables(store), *_work(settings, store), *_blobs(store, storage)]
     if deep:
         checks += ["kernels", "photos"]
@@ -61,9 +61,9 @@ def _tables(store: Store) -> Iterator[Violation]:
             for line in lines:
                 if line != "ok":
                     yield Violation("database", str(line), "the database is damaged", remedy)
-        for invariant in INVARIANTS:
-            for subject in invariant.find(session):
-                yield Violation(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
+        for name, (sentence, query) in INVARIANTS.items():
+            for subject in broken(session, query):
+                yield Violation(name, subject, f"not so: {sentence}", remedy)
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:

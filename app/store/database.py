@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar, cast
 
@@ -56,12 +56,10 @@ class Database:
         if self.is_sqlite:
             self.path = Path(self.url.database or "")
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # NORMAL never corrupts, but can lose the last commits when the power fails
-            self.writer = _sqlite(url, "BEGIN IMMEDIATE", "NORMAL")
-            self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
-            self.reader = _sqlite(url, "BEGIN", "NORMAL", read_only=True)
+            self.writer = _sqlite(url, "BEGIN IMMEDIATE")
+            self.reader = _sqlite(url, "BEGIN", read_only=True)
         else:
-            self.writer = self.durable = create_engine(
+            self.writer = create_engine(
                 url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
             )
             # one snapshot for each reading transaction, as on SQLite: what is read together is of one moment
@@ -94,12 +92,9 @@ class Database:
             yield session
 
     @contextmanager
-    def writing(self, *, durable: bool = False) -> Iterator[Session]:
+    def writing(self) -> Iterator[Session]:
         """Give a session whose changes are committed together at the end, or not at all."""
-        # `durable` also survives loss of power: for what a caller may rely on afterwards, such as an accepted
-        # upload whose memory card is formatted next
-        engine = self.durable if durable else self.writer
-        with Session(engine, expire_on_commit=False) as session, session.begin():
+        with Session(self.writer, expire_on_commit=False) as session, session.begin():
             yield session
         reads = self._in_scope()
         if reads is not None:
@@ -107,8 +102,8 @@ class Database:
 
     def close(self) -> None:
         """Close all connections."""
-        for engine in (self.writer, self.durable, self.reader):
-            engine.dispose()
+        self.writer.dispose()
+        self.reader.dispose()
 
 
 _SCOPE: ContextVar[Session | None] = ContextVar("scope", default=None)
@@ -151,12 +146,7 @@ def writes(method: Method[R, P, T]) -> Called[R, P, T]:
     return _in(method, Database.writing)
 
 
-def writes_durably(method: Method[R, P, T]) -> Called[R, P, T]:
-    """Give a method a transaction of its own that survives loss of power once it has returned."""
-    return _in(method, partial(Database.writing, durable=True))
-
-
-def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
+def _sqlite(url: str, begin: str, *, read_only: bool = False) -> Engine:
     engine = create_engine(
         url,
         connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000},
@@ -170,7 +160,8 @@ def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) 
         connection.isolation_level = None  # we say BEGIN ourselves
         connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
         connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute(f"PRAGMA synchronous={synchronous}")
+        # what was committed survives loss of power: after an upload a memory card may be formatted
+        connection.execute("PRAGMA synchronous=FULL")
         connection.execute("PRAGMA foreign_keys=ON")
         if read_only:
             connection.execute("PRAGMA query_only=ON")

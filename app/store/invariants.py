@@ -5,8 +5,7 @@ Each check is one query that returns the public ids of the rows which break it: 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from sqlalchemy import text
@@ -15,22 +14,14 @@ from sqlalchemy.orm import Session
 MOST: Final = 1000  # findings of one check at most (chosen): nobody reads more
 
 
-@dataclass(frozen=True, slots=True)
-class Invariant:
-    """One thing that must hold: what, and the query of what breaks it."""
-
-    name: str
-    sentence: str
-    query: str
-
-    def find(self, session: Session) -> Sequence[str]:
-        """Return the public ids of what breaks it."""
-        return list(session.scalars(text(f"{self.query} LIMIT {MOST}")))
+def broken(session: Session, query: str) -> Sequence[str]:
+    """Return the public ids of what breaks the invariant of a query."""
+    return list(session.scalars(text(f"{query} LIMIT {MOST}")))
 
 
-INVARIANTS: Final = (
-    Invariant(
-        "versions",
+# What must hold, and the query of what breaks it, by a short name
+INVARIANTS: Final[Mapping[str, tuple[str, str]]] = {
+    "versions": (
         "the version of a lens is the number of its events",
         """
         SELECT public_id FROM lens
@@ -38,8 +29,7 @@ INVARIANTS: Final = (
             OR version <> (SELECT coalesce(max(version), 0) FROM calibration_event e WHERE lens_id = lens.id)
         """,
     ),
-    Invariant(
-        "totals",
+    "totals": (
         "lenses count their samples and photos rightly",
         """
         SELECT public_id FROM lens LEFT JOIN (
@@ -48,8 +38,7 @@ INVARIANTS: Final = (
         ) AS counted ON counted.lens_id = lens.id
         WHERE sample_count <> coalesce(samples, 0) OR photo_count <> coalesce(photos, 0)""",
     ),
-    Invariant(
-        "joined",
+    "joined": (
         "each counted photo joined its lens by an event",
         """
         SELECT public_id FROM photo WHERE state = 'counted' AND NOT EXISTS (
@@ -57,8 +46,7 @@ INVARIANTS: Final = (
             AND e.photo_public_id = photo.public_id AND e.kind IN ('photo_added', 'photo_included')
         )""",
     ),
-    Invariant(
-        "votes",
+    "votes": (
         "exactly the samples of counted photos count",
         """
         SELECT DISTINCT photo.public_id FROM photo
@@ -70,8 +58,7 @@ INVARIANTS: Final = (
                 OR psf_sample.version_added IS NULL OR psf_sample.version_added > lens.version
             ELSE psf_sample.lens_id IS NOT NULL END""",
     ),
-    Invariant(
-        "samples",
+    "samples": (
         "patches are done exactly if they have samples",
         """
         SELECT DISTINCT photo.public_id FROM photo JOIN patch ON patch.photo_id = photo.id
@@ -79,8 +66,7 @@ INVARIANTS: Final = (
             SELECT 1 FROM psf_sample WHERE psf_sample.patch_id = patch.id
         )""",
     ),
-    Invariant(
-        "progress",
+    "progress": (
         "photos count their patches rightly",
         """
         SELECT public_id FROM photo LEFT JOIN (
@@ -95,25 +81,22 @@ INVARIANTS: Final = (
             OR patches_rejected <> coalesce(rejected, 0) + windows_rejected
         )""",
     ),
-    Invariant(
-        "endings",
+    "endings": (
         "counted photos have a lens, failed ones a reason",
         """
         SELECT public_id FROM photo WHERE (state = 'counted' AND (lens_id IS NULL OR finished_at IS NULL))
             OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))""",
     ),
-    Invariant(
-        "owners of lenses",
+    "owners of lenses": (
         "photos teach lenses of their owner",
         """
         SELECT photo.public_id FROM photo JOIN lens ON lens.id = photo.lens_id
         WHERE lens.owner_id <> photo.owner_id""",
     ),
-    Invariant(
-        "owners of photos",
+    "owners of photos": (
         "corrections are of photos of their owner",
         """
         SELECT correction.public_id FROM correction JOIN photo ON photo.id = correction.photo_id
         WHERE correction.owner_id <> photo.owner_id""",
     ),
-)
+}

@@ -495,23 +495,6 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
     assert lens is None or (lens.version, lens.sample_count) == (0, 0)
 
 
-def test_work_of_an_old_epoch_changes_nothing(
-    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
-) -> None:
-    def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
-        context.store.photos.change([photo.public_id], "local", {"aperture": 4.0})
-        return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
-
-    sandbox.answers["select"].insert(0, restart)
-    work(photo.public_id, 1)
-    after_old = steps.fresh(photo)
-    work(photo.public_id, 2)
-
-    done = steps.fresh(photo)
-    assert (after_old.state, after_old.epoch) == ("received", 2)
-    assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
-
-
 def test_a_lost_file_is_told_of(work: Handler, context: JobContext, photo: PhotoRow, steps: Any) -> None:
     context.storage.delete(f"photos/{photo.public_id}/")
 
@@ -521,61 +504,65 @@ def test_a_lost_file_is_told_of(work: Handler, context: JobContext, photo: Photo
 
 
 def attempt(context: JobContext, wanted: Callable[[], bool] = lambda: True) -> Any:
-    with context.sandbox.folder() as folder:
-        return context.attempt("task", {}, folder=folder, limits=TaskLimits(500, 10), wanted=wanted)
+    with context.task("develop", None, wanted) as (answer, _):
+        return answer
 
 
 def test_a_crash_is_tried_again(context: JobContext, sandbox: Scripted) -> None:
-    sandbox.answers["task"] = [ended(CRASHED), ended(CRASHED), ok(7)]
+    sandbox.answers["develop"] = [ended(CRASHED), ended(CRASHED), ok(7)]
 
     assert attempt(context) == 7
 
 
 def test_the_third_crash_is_the_last(context: JobContext, sandbox: Scripted) -> None:
-    sandbox.answers["task"] = [ended(CRASHED)]
+    sandbox.answers["develop"] = [ended(CRASHED)]
 
     with pytest.raises(JobFailedError, match="signal 11; tried 3 times") as caught:
         attempt(context)
 
     assert caught.value.code == "crashed_repeatedly"
-    assert sandbox.ran == ["task"] * 3
+    assert sandbox.ran == ["develop"] * 3
 
 
 def test_an_unforeseen_exception_is_not_tried_again(context: JobContext, sandbox: Scripted) -> None:
-    sandbox.answers["task"] = [ended(Outcome("crashed", code="internal_error", detail="a KeyError"))]
+    sandbox.answers["develop"] = [ended(Outcome("crashed", code="internal_error", detail="a KeyError"))]
 
     with pytest.raises(JobFailedError, match="a KeyError"):
         attempt(context)
 
-    assert sandbox.ran == ["task"]
+    assert sandbox.ran == ["develop"]
 
 
 def test_what_needs_compiled_loops_waits_while_they_are_compiled_for_all(
     context: JobContext, sandbox: Scripted
 ) -> None:
-    sandbox.answers["task"] = sandbox.answers["measure"] = [ok("done")]
+    sandbox.answers["measure"] = [ok({"error": None, "coverage": None})]
     context.warmed.clear()
-    with ThreadPoolExecutor() as pool, context.sandbox.folder() as folder:
-        waits = {"folder": folder, "limits": TaskLimits(500, 10), "wanted": lambda: True}
-        computed = pool.submit(context.attempt, "measure", {}, **waits)
-        assert context.attempt("task", {}, **waits) == "done"  # that only decodes
-        assert (computed.done(), sandbox.ran) == (False, ["task"])
+
+    def measured() -> bool:
+        with context.task("measure", None, lambda: True) as (answer, _):
+            return "error" in answer
+
+    with ThreadPoolExecutor() as pool:
+        computed = pool.submit(measured)
+        attempt(context)  # that only decodes
+        assert (computed.done(), sandbox.ran) == (False, ["develop"])
         context.warmed.set()
-        assert computed.result(60) == "done"
+        assert computed.result(60)
 
 
 def test_too_little_memory_is_doubled_once_within_the_budget(context: JobContext, sandbox: Scripted) -> None:
-    sandbox.answers["task"] = [ended(MEMORY)]
+    sandbox.answers["develop"] = [ended(MEMORY)]
 
     with pytest.raises(JobFailedError, match="too little"):
         attempt(context)
 
-    assert [limits.memory_mb for limits in sandbox.limits] == [500, 1000]
+    assert [limits.memory_mb for limits in sandbox.limits] == [768, 1536]
 
 
 def test_nobody_waits_between_crashes_for_what_nobody_wants(context: JobContext, sandbox: Scripted) -> None:
     asked = iter([True, False, False])
-    sandbox.answers["task"] = [ended(CRASHED)]
+    sandbox.answers["develop"] = [ended(CRASHED)]
 
     with pytest.raises(NotWantedError):
         attempt(context, lambda: next(asked))
@@ -870,20 +857,3 @@ def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(
     work(photo.public_id, photo.epoch)
 
     assert (steps.fresh(photo).state, len(steps.fresh(photo).camera_model)) == ("counted", 200)
-
-
-def test_a_cancelled_correction_stays_cancelled(
-    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
-) -> None:
-    key = ask(context, counted, steps)
-
-    def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
-        context.store.jobs.cancel(key, ANY_OWNER)
-        return write_result(arguments, folder)
-
-    sandbox.answers["correct"] = [cancel]
-    correction(context, key)
-
-    row = context.store.jobs.get(key, ANY_OWNER)
-    assert row is not None
-    assert (row.state, row.result_key) == ("cancelled", None)

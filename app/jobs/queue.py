@@ -33,8 +33,6 @@ Handler: TypeAlias = Callable[..., None]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# How many jobs of a kind one worker runs at once (chosen): those of photos mostly wait for the sandbox
-AT_ONCE: Final[Mapping[Kind, int]] = {"photo": 8, "correction": 2, "measure": 2}
 # Deaths of its worker after which a job is started again (chosen): a photo takes long, and whoever restarts
 # workers interrupts it; the others may be what killed them
 MAX_DEATHS: Final[Mapping[str, int]] = {"photo": 50, "correction": 5, "measure": 3}
@@ -60,8 +58,11 @@ class _Json(DBOSSerializer):
 class DbosEngine:
     """DBOS in this process; one at a time, since the library keeps one state per process."""
 
-    def __init__(self, url: str, executor_id: str) -> None:
+    def __init__(self, url: str, executor_id: str, *, slots: int) -> None:
         self._url, self._executor_id = url, executor_id
+        # How many jobs of a kind this worker runs at once (chosen): more photos than fill it would keep other
+        # machines from them
+        self._at_once: Mapping[Kind, int] = {"photo": slots + 1, "correction": 2, "measure": 2}
         self._enqueued: set[str] = set()
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
@@ -82,7 +83,7 @@ class DbosEngine:
         for kind, handler in handlers.items():
             DBOS.workflow(name=kind)(handler)
         DBOS.launch()
-        for kind, limit in AT_ONCE.items():
+        for kind, limit in self._at_once.items():
             DBOS.register_queue(
                 kind,
                 worker_concurrency=limit,

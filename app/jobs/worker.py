@@ -87,7 +87,7 @@ class Worker:
             Storage(settings.storage, patience_s=settings.storage_seconds, create=False),
             self._sandbox,
         )
-        self._engine = DbosEngine(settings.jobs, self.id)
+        self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._host, self._last_beat = socket.gethostname(), monotonic()
         database = self._store.database
         self._file = database.path if database.is_sqlite else Path()

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from deadline import Deadline, stretched
 
-from app.jobs.queue import AT_ONCE, MAX_DEATHS, DbosEngine, Handler
+from app.jobs.queue import MAX_DEATHS, DbosEngine, Handler
 from app.store.jobs import Job, Kind
 
 DEAD = "a-worker-that-died"
@@ -50,7 +50,7 @@ def ran() -> Ran:
 
 @pytest.fixture
 def engine(url: str, ran: Ran) -> Iterator[DbosEngine]:
-    made = DbosEngine(url, "this-process")
+    made = DbosEngine(url, "this-process", slots=2)
     made.start(ran.handlers)
     yield made
     made.stop()
@@ -84,7 +84,7 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
         calls.append(photo_id)
         raise RuntimeError("deliberate")
 
-    engine = DbosEngine(url, "this-process")
+    engine = DbosEngine(url, "this-process", slots=2)
     engine.start({"photo": photo})
     try:
         engine.enqueue(Job("photo", ("p",)))
@@ -95,12 +95,12 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
     assert calls == ["p"]
 
 
-def test_several_jobs_of_a_kind_run_side_by_side(url: str) -> None:
-    together = threading.Barrier(AT_ONCE["correction"], timeout=stretched(20))
-    engine = DbosEngine(url, "this-process")
-    engine.start({"correction": lambda *_: together.wait()})
+def test_photos_run_side_by_side_one_more_than_there_are_slots(url: str) -> None:
+    together = threading.Barrier(3, timeout=stretched(20))
+    engine = DbosEngine(url, "this-process", slots=2)
+    engine.start({"photo": lambda *_: together.wait()})
     try:
-        jobs = [Job("correction", (number,)) for number in range(AT_ONCE["correction"])]
+        jobs = [Job("photo", (number,)) for number in range(3)]
         for job in jobs:
             engine.enqueue(job)
         until(lambda: all(engine.status(job) == "done" for job in jobs))
@@ -131,7 +131,7 @@ def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
         import os, time
         from app.jobs.queue import DbosEngine
         from app.store.jobs import Job
-        engine = DbosEngine({url!r}, {executor_id!r})
+        engine = DbosEngine({url!r}, {executor_id!r}, slots=1)
         engine.start({{"correction": lambda *arguments: os.kill(os.getpid(), 9)}})
         engine.enqueue(Job("correction", ("p", 1)))
         time.sleep(30)
@@ -143,7 +143,7 @@ def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
 def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: str, ran: Ran) -> None:
     die_in_a_job(url)
     job = Job("correction", ("p", 1))
-    engine = DbosEngine(url, "this-process")
+    engine = DbosEngine(url, "this-process", slots=2)
     engine.start(ran.handlers)
     try:
         time.sleep(0.5)
@@ -166,7 +166,7 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
             f"""
             import os, time
             from app.jobs.queue import DbosEngine
-            engine = DbosEngine({url!r}, "worker-{number}")
+            engine = DbosEngine({url!r}, "worker-{number}", slots=1)
             engine.start({{"correction": lambda *arguments: os.kill(os.getpid(), 9)}})
             engine.take_over({previous!r})
             time.sleep(3)
@@ -176,7 +176,7 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
         previous = f"worker-{number}"
         if subprocess.run([sys.executable, "-c", script], check=False).returncode == 0:
             break
-    engine = DbosEngine(url, "this-process")
+    engine = DbosEngine(url, "this-process", slots=2)
     engine.start(ran.handlers)
     try:
         status = engine.status(Job("correction", ("p", 1)))

@@ -12,8 +12,6 @@ from mkdocs.structure.files import File, Files
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-CLIENTS = ("app.client.Client",)
-
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
@@ -39,35 +37,31 @@ def front() -> str:
     return text.replace("](docs/", "](").replace('src="docs/', 'src="')
 
 
-def library() -> str:
-    """One section for each public name, in the order of its kind."""
-    import lensmodel  # noqa: PLC0415 - only where a site is built
+def shown(name: str) -> str:
+    """What the docstring of a public name says, as a section."""
+    return f"::: {name}\n    options:\n      heading_level: 2\n"
 
-    names = [name for name in lensmodel.__all__ if getattr(lensmodel, name).__doc__]
-    functions = sorted(name for name in names if name[0].islower())
-    classes = sorted(name for name in names if name[0].isupper())
-    parts = ["# Library", "The public names of `lensmodel`. [Library](../library.md) shows them at work.", ""]
-    for name in [*functions, *classes]:
+
+def library() -> str:
+    """One section for each public name, functions before classes."""
+    import lensmodel  # noqa: PLC0415 - only where a site is built
+    from lensmodel.core.registry import Registry  # noqa: PLC0415 - same
+
+    parts = ["# Library\nThe public names of `lensmodel`. [Library](../library.md) shows them at work.\n"]
+    for name in sorted(lensmodel.__all__, key=lambda name: (name[0].isupper(), name)):
         value = getattr(lensmodel, name)
-        home = getattr(value, "__module__", "lensmodel")
-        if name in {"estimators", "selectors", "deconvolvers"}:
-            parts += [
-                f"## {name}",
-                f"Registry of every {value.kind}: {', '.join(f'`{n}`' for n in value)}.",
-                "",
-            ]
-            continue
-        parts += [f"::: {home}.{name}", "    options:", "      heading_level: 2", ""]
-    parts += ["::: lensmodel.core.registry.Registry", "    options:", "      heading_level: 2", ""]
-    return "\n".join(parts)
+        if isinstance(value, Registry):
+            every = ", ".join(f"`{each}`" for each in value)
+            parts.append(f"## {name}\nRegistry of every {value.kind}: {every}.\n")
+        elif value.__doc__:
+            parts.append(shown(f"{getattr(value, '__module__', 'lensmodel')}.{name}"))
+    return "\n".join([*parts, shown("lensmodel.core.registry.Registry")])
 
 
 def client() -> str:
-    """The two clients of the service."""
-    parts = ["# Client", "How they are used: [the service from Python](../topics/client.md).", ""]
-    for name in CLIENTS:
-        parts += [f"::: {name}", "    options:", "      heading_level: 2", ""]
-    return "\n".join(parts)
+    """The client of the service."""
+    about = "# Client\nHow it is used: [the service from Python](../topics/client.md).\n"
+    return f"{about}\n{shown('app.client.Client')}"
 
 
 def http() -> str:

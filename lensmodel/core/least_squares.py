@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Final, TypeAlias
@@ -77,8 +78,12 @@ def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, f
         start = np.ones(len(a))
         largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
         least = _LEAST * largest
-        if largest > 0.0 and (smallest > least or _positive(a - least * np.eye(len(a)))):
-            return largest, 0.0
+        if largest > 0.0:
+            if smallest > least:
+                return largest, 0.0
+            with contextlib.suppress(np.linalg.LinAlgError):
+                scipy.linalg.cholesky(a - least * np.eye(len(a)), overwrite_a=True, check_finite=False)
+                return largest, 0.0
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])
     return largest, max(_LEAST * largest - float(eigenvalues[0]), 0.0)
@@ -87,12 +92,3 @@ def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, f
 def _product(a: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
     """A k of a symmetric matrix; of a large one only a half is read."""
     return np.asarray(scipy.linalg.blas.dsymv(1.0, a.T, k) if len(a) > _FEW else a @ k)
-
-
-def _positive(a: NDArray[np.float64]) -> bool:
-    """Whether a symmetric matrix is positive definite; it is overwritten."""
-    try:
-        scipy.linalg.cholesky(a, overwrite_a=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return False
-    return True

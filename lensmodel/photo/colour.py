@@ -300,20 +300,3 @@ def profile_by_chunks(icc: bytes | None, chunks: Mapping[bytes, bytes]) -> bytes
         numbers = [place / 100_000.0 for place in struct.unpack(">8I", places)]
         space = ColourSpace.of(numbers[:2], numbers[2:]) or BT709
     return space.profile(gamma) if 0.1 < gamma < 10.0 else None
-
-
-def profile_by_tags(
-    colour_space: float | None,
-    interoperability: str | None,
-    white: Sequence[float],
-    primaries: Sequence[float],
-    gamma: float | None,
-) -> bytes | None:
-    """Profile of a TIFF or JPEG by its tags; None is sRGB, or nothing that can be used."""
-    if colour_space == 1:
-        return None
-    if interoperability == "R03" or colour_space == 2:
-        return named_profile("adobergb")
-    curve: DeclaredCurve = gamma if gamma is not None and 0.1 < gamma < 10.0 else None
-    space = ColourSpace.of(white, primaries) if len(white) or len(primaries) else BT709
-    return None if space is None else space.profile(curve)

@@ -21,7 +21,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from lensmodel.photo.colour import profile_by_tags
+from lensmodel.photo.colour import BT709, ColourSpace, named_profile
 from lensmodel.photo.containers import Header, opened_header
 from lensmodel.photo.tiff import EXIF, UNDEFINED, Tag, Tags, TiffReader, Value, rationals, shorts, text
 from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
@@ -167,15 +167,15 @@ class Said:
 
     def profile(self) -> bytes | None:
         """Profile of the colour space that a TIFF or JPEG declares by its tags; None is sRGB."""
-        tags = self.tags
-        below = (reader.below(tags, 0xA005).text(1) for reader in self.header.tiff)
-        return profile_by_tags(
-            tags.number(0xA001),
-            next(filter(None, below), None),
-            tags.numbers(318),
-            tags.numbers(319),
-            tags.number(0xA500),
-        )
+        tags, space, gamma = self.tags, self.tags.number(0xA001), self.tags.number(0xA500)
+        if space == 1:
+            return None
+        if space == 2 or "R03" in [reader.below(tags, 0xA005).text(1) for reader in self.header.tiff]:
+            return named_profile("adobergb")
+        white, primaries = tags.numbers(318), tags.numbers(319)
+        declared = ColourSpace.of(white, primaries) if white or primaries else BT709
+        curve = gamma if gamma is not None and 0.1 < gamma < 10.0 else None
+        return None if declared is None else declared.profile(curve)
 
     @property
     def _zoom(self) -> float:
@@ -231,11 +231,10 @@ class Said:
         """
         per_unit, unit = self.tags.number(0xA20E), self.tags.number(0xA210) or 2.0
         unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit, 0.0)
-        pitch = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None)
-        header = self.header
+        pitch, header = _first_within(*_PITCHES_UM, unit_um / per_unit if per_unit else None), self.header
         if pitch is not None:
             pitch /= self._zoom
-            longer, shorter = max(header.width, header.height), min(header.width, header.height)
+            shorter, longer = sorted((header.width, header.height))
             width_mm = longer * pitch / 1000.0
             mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
             # scaled down, a picture keeps the shape of its sensor, 3 : 2 or 4 : 3
@@ -244,13 +243,13 @@ class Said:
             if _is_width_of_sensor(width_mm) or (width_mm <= _LARGEST_SENSOR_MM and unscaled):
                 return pitch
         film = self._film_pitch_um()
-        return None if film is None else film / self._zoom
+        return film and film / self._zoom
 
     def _film_pitch_um(self) -> float | None:
         """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
         focal, film = self.tags.number(0x920A), self.tags.number(0xA405)
         diagonal_px = math.hypot(self.header.width, self.header.height)
-        if not focal or not film or focal <= 0 or film <= 0 or diagonal_px <= 0:
+        if not focal or not film or min(focal, film, diagonal_px) <= 0:
             return None
         crop = _first_within(*_CROP_FACTORS, film / focal)
         return crop and _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)

@@ -6,7 +6,7 @@ import io
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -184,15 +184,12 @@ def _three_channels(pixels: Pixels) -> Pixels:
 
 # --- pixels that a program has turned upright ---------------------------------------------------
 
-ORIENTATION: Final = {1: 6, 3: 8}
-"""EXIF orientation of the sensor's pixels, by the quarter turns that lead from the upright ones to them."""
-
+ORIENTATION: Final = {1: 6, 3: 8}  # of the sensor's pixels, by the quarter turns from upright ones to them
 _OFFSET, _LENGTH = 0x0201, 0x0202  # of a JPEG thumbnail in the second directory of EXIF
 _MOST_BYTES: Final = 1 << 20  # of a thumbnail: the block of EXIF in a JPEG holds 64 KiB
 _MOST_PIXELS: Final = 1 << 20
 _ROWS: Final = 48  # of both pictures when they are compared (chosen)
-_ALIKE: Final = 0.9
-"""Correlation of a picture with its own thumbnail, at least (chosen: compression leaves more than .98)."""
+_ALIKE: Final = 0.9  # least correlation with the thumbnail (chosen: compression leaves more than .98)
 _CLEARER: Final = 0.2  # by which the other turn correlates less, at least (chosen)
 
 
@@ -237,16 +234,11 @@ def require_known_turn(info: PhotoInfo) -> None:
 def _thumbnail(header: Header) -> Image.Image | None:
     for reader in header.tiff:
         tags, _ = reader.directory(reader.directory(reader.first)[1])
-        if start := tags.integer(_OFFSET):
-            begin = reader.base + start
-            data = bytes(reader.buffer[begin : begin + min(tags.integer(_LENGTH), _MOST_BYTES)])
-            try:
-                with unwarned():
-                    image = Image.open(io.BytesIO(data), formats=("JPEG",))
-                if image.width * image.height <= _MOST_PIXELS:
-                    return image.convert("L")
-            except UNDECODABLE:
-                continue
+        begin, size = reader.base + tags.integer(_OFFSET), min(tags.integer(_LENGTH), _MOST_BYTES)
+        with suppress(*UNDECODABLE), unwarned():
+            image = Image.open(io.BytesIO(reader.buffer[begin : begin + size]), formats=("JPEG",))
+            if image.width * image.height <= _MOST_PIXELS:
+                return image.convert("L")
     return None
 
 

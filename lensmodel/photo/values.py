@@ -249,8 +249,6 @@ class LinearPhoto:
     def coarse_noise(self) -> PlaneNoise:
         """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens.
 
-        Three `NoiseModel`, of r, g and b, in linear light where saturation is 1.
-
         Flat places of a photo that was denoised show little noise from pixel to pixel and all of it in
         coarser grain; what compression adds is seen only where there is detail.
         """
@@ -260,9 +258,7 @@ class LinearPhoto:
 
     @property
     def correction_noise(self) -> PlaneNoise:
-        """Noise as a correction must count it, as if it were white.
-
-        Three `NoiseModel`, of r, g and b, in linear light where saturation is 1.
+        """Noise of each plane as a correction must count it, as if it were white.
 
         That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
         a pixel than there is in a patch, and make errors of their own where there is detail. Where a

@@ -11,7 +11,8 @@ import pytest
 
 from lensmodel.photo.values import ENDINGS
 
-FORMATS = Path(__file__).parents[1] / "docs" / "formats.md"
+ROOT = Path(__file__).parents[1]
+FORMATS = ROOT / "docs" / "formats.md"
 
 
 def test_the_page_of_formats_lists_the_endings_that_are_taken() -> None:
@@ -34,3 +35,13 @@ def test_the_search_of_the_documents_needs_neither_worker_nor_request(tmp_path: 
     script = (tmp_path / "search" / "main.js").read_text(encoding="utf-8")
     assert "searchedSections" in script
     assert not re.search(r"Worker\(|fetch\(|XMLHttpRequest", script)
+
+
+def test_what_the_first_page_of_the_documents_shows_and_links_to_is_part_of_the_site() -> None:
+    site = pytest.importorskip("tools.docs_site")
+    links = re.findall(r"\]\(([^)#]+)", site.beside("README.md"))
+
+    added = {*site.BESIDE, "notebooks/index.md"}
+    assert {"app/pages/static/before-after.jpg", "guide.md"} <= {*links}
+    assert [link for link in links if link not in added and not (ROOT / "docs" / link).is_file()] == []
+    assert len(re.findall(r"\]\(.*\.ipynb\)", site.notebooks())) == 5

@@ -10,16 +10,34 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+# Files outside the folder of the documents that README and pages point to
+BESIDE = (
+    *("CONTRIBUTING.md", "SECURITY.md", "LICENSE", "lensmodel/demo_data/README.md"),
+    "app/pages/static/before-after.jpg",
+)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
-    pages = {"library": library(), "client": client(), "http": http()}
-    files.append(File.generated(config, "index.md", content=front()))
-    for name, text in pages.items():
-        files.append(File.generated(config, f"reference/{name}.md", content=text))
+    pages = {
+        "index.md": beside("README.md"),
+        "notebooks/index.md": notebooks(),
+        "reference/library.md": library(),
+        "reference/client.md": client(),
+        "reference/http.md": http(),
+        **{name: beside(name) for name in BESIDE},
+    }
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
     return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Let links out of the folder of the documents lead to what `BESIDE` adds to it."""
+    return markdown.replace("](../../lensmodel/", "](../lensmodel/")
 
 
 def on_post_build(config: MkDocsConfig) -> None:
@@ -31,10 +49,22 @@ def on_post_build(config: MkDocsConfig) -> None:
     (folder / "main.js").write_bytes(Path(__file__).with_name("docs_search.js").read_bytes())
 
 
-def front() -> str:
-    """The README as the first page: what it links to in this folder lies beside it."""
-    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    return text.replace("](docs/", "](").replace('src="docs/', 'src="')
+def beside(name: str) -> str | bytes:
+    """A file beside the folder of the documents; in the site the two are one."""
+    path = ROOT / name
+    if path.suffix not in {".md", ""}:
+        return path.read_bytes()
+    text = path.read_text(encoding="utf-8")
+    return text.replace("](docs/notebooks)", "](notebooks/index.md)").replace("](docs/", "](")
+
+
+def notebooks() -> str:
+    """A page that lists the notebooks by their titles."""
+    lines = ["# Notebooks", "Files for Jupyter, with what they printed.", ""]
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        title = json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"][0].strip("# \n")
+        lines.append(f"- [{title}]({path.name})")
+    return "\n".join(lines)
 
 
 def shown(name: str) -> str:

@@ -134,9 +134,7 @@ class Mosaic:
     def _pile(self, colour: int) -> tuple[int, int] | None:
         """Lower and upper end of the pile of saturated pixels of one colour; `None` without one.
 
-        Full wells differ from pixel to pixel, by a hundredth on old sensors, and a few hot pixels shine
-        beyond them. So the pile is where most pixels of the upper end of the range are, far more than below
-        it and next to none above.
+        Full wells differ from pixel to pixel, by a hundredth on old sensors; hot pixels shine beyond them.
         """
         counts = np.bincount(self.values[self.colours == colour])
         scale = self.white - self.black[colour]

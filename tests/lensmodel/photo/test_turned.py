@@ -6,7 +6,6 @@ import io
 import math
 import struct
 import warnings
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -67,16 +66,6 @@ def written(path: Path, picture: Picture, block: bytes) -> photo.PhotoInfo:
     return photo.inspect(path)
 
 
-def bomb(width: int, height: int) -> bytes:
-    """A PNG that claims so many pixels, black ones."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1 + width))), (b"IEND", b""))
-    parts = [
-        struct.pack(">I", len(v)) + name + v + struct.pack(">I", zlib.crc32(name + v)) for name, v in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
-
-
 def large_jpeg() -> bytes:
     """A JPEG of 24 megapixels in few bytes."""
     out = io.BytesIO()
@@ -84,17 +73,7 @@ def large_jpeg() -> bytes:
     return out.getvalue()[:60_000]
 
 
-@pytest.mark.parametrize(
-    "small",
-    [
-        large_jpeg(),
-        bomb(30_000, 20_000),
-        bomb(13_000, 8_000),
-        b"\x89PNG\r\n\x1a\n\0\0",
-        b"\xff\xd8\xff\xd9",
-        b"",
-    ],
-)
+@pytest.mark.parametrize("small", [large_jpeg(), b"\x89PNG\r\n\x1a\n\0\0", b"\xff\xd8\xff\xd9", b""])
 def test_a_hostile_thumbnail_tells_nothing_and_is_not_unpacked(small: bytes, tmp_path: Path) -> None:
     upright = np.ascontiguousarray(np.rot90(scene(), -1))
 

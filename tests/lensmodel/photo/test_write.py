@@ -62,29 +62,20 @@ def orientation_of(encoding: photo.Encoding, value: int) -> photo.Encoding:
     return replace(encoding, metadata=replace(encoding.metadata, orientation=value))
 
 
+@pytest.mark.parametrize("profile", [False, True])
 @pytest.mark.parametrize("output", ["tiff16", "png16", "png8"])
-def test_what_was_developed_is_written_with_the_same_numbers(
-    tmp_path: Path, output: photo.OutputFormat
+def test_what_was_developed_is_written_with_the_same_numbers_and_profile(
+    tmp_path: Path, output: photo.OutputFormat, profile: bool
 ) -> None:
     dtype = np.uint8 if output == "png8" else np.uint16
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max + 1, (256, 256, 3), dtype=dtype)
-    (tmp_path / "in.png").write_bytes(imagecodecs.png_encode(pixels))
-    developed = photo.develop(tmp_path / "in.png")
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb", iccprofile=srgb if profile else None)
+    developed = photo.develop(tmp_path / "in.tif")
     photo.write_image(tmp_path / "out", developed.planes, developed.encoding, format=output)
 
     assert (read_numbers(tmp_path / "out") == pixels).all()
-
-
-def test_a_profile_of_the_input_comes_back_with_the_same_numbers(tmp_path: Path) -> None:
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    pixels = np.random.default_rng(0).integers(0, 65536, (64, 64, 3), dtype=np.uint16)
-    tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb", iccprofile=profile)
-    developed = photo.develop(tmp_path / "in.tif")
-    photo.write_image(tmp_path / "out.tif", developed.planes, developed.encoding)
-
-    assert (read_numbers(tmp_path / "out.tif") == pixels).all()
-    with tifffile.TiffFile(tmp_path / "out.tif") as file:
-        assert file.pages[0].tags[34675].value == profile
+    assert (icc_of(tmp_path / "out") == srgb) == profile
 
 
 @pytest.mark.parametrize("output", ["tiff16", "png16", "png8", "jpeg"])
@@ -121,28 +112,19 @@ def icc_of(path: Path) -> bytes:
         return bytes(image.info["icc_profile"])
 
 
-def test_white_balance_and_matrix_make_a_raw_photo_srgb(tmp_path: Path) -> None:
-    to_srgb = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
-    encoding = replace(PLAIN, white_balance=(2.0, 1.0, 1.6), to_srgb=to_srgb)
-    grey = (
-        np.full((3, 32, 32), 0.4, dtype=np.float32)
-        / np.array([2.0, 1.0, 1.6], dtype=np.float32)[:, None, None]
-    )
-    photo.write_image(tmp_path / "x", grey, encoding)
-
-    back = srgb_to_linear(read_numbers(tmp_path / "x")[5, 5] / 65535)
-    assert back == pytest.approx([0.4, 0.4, 0.4], abs=1e-4)
-
-
+@pytest.mark.parametrize("level", [0.4, 1.0])
 @pytest.mark.parametrize("balance", [(2.0, 1.0, 1.6), (0.7, 1.0, 1.6)])
-def test_saturated_pixels_of_a_raw_photo_become_white(
-    tmp_path: Path, balance: tuple[float, float, float]
+def test_white_balance_and_matrix_make_a_raw_photo_srgb_and_what_is_saturated_white(
+    tmp_path: Path, balance: tuple[float, float, float], level: float
 ) -> None:
     to_srgb = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
     encoding = replace(PLAIN, white_balance=balance, to_srgb=to_srgb)
-    photo.write_image(tmp_path / "x", np.ones((3, 32, 32), dtype=np.float32), encoding)
+    neutral = np.ones(3) if level == 1.0 else level * min(balance) / np.array(balance)
+    grey = np.broadcast_to(neutral.astype(np.float32)[:, None, None], (3, 32, 32))
+    photo.write_image(tmp_path / "x", grey, encoding)
 
-    assert (read_numbers(tmp_path / "x") == 65535).all()
+    back = srgb_to_linear(read_numbers(tmp_path / "x")[5, 5] / 65535)
+    assert back == pytest.approx([level] * 3, abs=1e-4 if level < 1.0 else 0.0)
 
 
 def test_a_wide_gamut_is_converted_when_srgb_is_asked_for(tmp_path: Path) -> None:

@@ -254,10 +254,8 @@ class Client:
             content=Path(path).read_bytes(),
             headers={"Content-Type": "application/zip"},
         )
-        if answer.status_code != httpx2.codes.ACCEPTED:
-            return _read(s.LensOut, answer)
         try:
-            self.wait(answer.headers["Location"].rpartition("/")[2])  # a worker is still reading it
+            self.wait(_read(s.JobOut, answer))  # a worker reads it
         except JobEndedError as ended:
             raise (ServiceProblemError(ended.job.error) if ended.job.error else ended) from ended
         return self.lens(lens_id)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import json
-import time
 from dataclasses import replace
 from statistics import median
 from typing import Annotated, Any, Final, Literal
@@ -13,15 +11,15 @@ from typing import Annotated, Any, Final, Literal
 from fastapi import APIRouter, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import ConflictError, InvalidParameterError, NotReadyError, ServiceError, UnknownError
-from app.http import upload
+from app.errors import ConflictError, InvalidParameterError, NotReadyError, UnknownError
+from app.http import upload, views
 from app.http.dependencies import Call, CallDep, OneSession
-from app.routes import common, jobs
+from app.routes import common
 from app.routes.common import Cursor, Limit, OnlyName
-from app.routes.photos import delete_photo, receiving, recorded
-from app.schemas import MAX_VERSION, V1, CalibrationOut, LateralOut, LensChange, LensOut, NewLens, Page
+from app.routes.photos import receiving, recorded
+from app.schemas import MAX_VERSION, CalibrationOut, JobOut, LateralOut, LensChange, LensOut, NewLens, Page
 from app.store.lenses import report_key
-from app.store.tables import PHOTO_FINAL, LensRow, PhotoRow
+from app.store.tables import LensRow
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import camera_name, full_name
@@ -33,9 +31,6 @@ router = APIRouter(tags=["lenses"], route_class=OneSession)
 
 _PAGE: Final = 200  # photos that are read at once (chosen): bounds the memory that a large lens takes
 _PROFILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
-_READING: Final = {"model": LensOut, "description": "Still being read: `Location` is its job"}
-# Codes with which the reading of a profile is refused as such; all others are conflicts
-_REFUSALS: Final = frozenset({"malformed_upload", "image_too_large", "unknown_lens", "other_lens"})
 # Photos whose names a report looks at, at most (chosen): it lists some, and says how many more there are
 _NAMED: Final = 1000
 Form = Literal["json", "csv", "pdf"]
@@ -188,38 +183,26 @@ def _filenames(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
 
 @router.put(
     "/lenses/{lens_id}/profile",
-    responses={202: _READING},
+    status_code=202,
     openapi_extra={"requestBody": {"required": True, "content": _PROFILE}},
 )
 async def add_lens_profile(
     lens_id: str,
     call: CallDep,
     any_lens: Annotated[bool, Query(description="also where it seems to be of another lens")] = False,
-) -> LensOut:
+) -> JobOut:
     """Let what a profile knows join a lens; each of its photos counts as one, without its file.
 
-    A worker reads it: the answer is the lens with it, or 202 where that takes longer than a long poll.
-    The same profile a second time changes nothing. It must have been learned with the model of the lens.
+    A worker reads it, whose job is returned. The same profile a second time changes nothing. It must have
+    been learned with the model of the lens.
     """
     await run_in_threadpool(call.lens, lens_id)
     async with receiving(call) as (public_id, key):
         uploaded = await upload.receive_profile(call.request, call.storage, key, lens_id)
     said = {"any_lens": True} if any_lens else {}
-    file: PhotoRow | None
-    file = (await run_in_threadpool(recorded, call, public_id, key, uploaded, **said)).photo
-    end = time.monotonic() + jobs.LONG_POLL_S
-    while file is not None and file.state not in PHOTO_FINAL and time.monotonic() < end:
-        await asyncio.sleep(jobs.LOOK_S)
-        file = await run_in_threadpool(call.store.photos.get, file.public_id, call.owner)
-    if file is not None and file.state in {"failed", "cancelled"}:
-        await run_in_threadpool(delete_photo, file.public_id, call)
-        code = "image_too_large" if file.error_code == "memory_limit" else file.error_code
-        detail = file.error_detail or "the reading of the profile was cancelled: send it again"
-        raise ServiceError(detail, code=code if code in _REFUSALS else "conflict")
-    if file is not None and file.state not in PHOTO_FINAL:
-        call.response.status_code = 202
-        call.response.headers["Location"] = f"{V1}/jobs/{file.public_id}"
-    return await run_in_threadpool(get_lens, lens_id, call)
+    job = views.job_out((await run_in_threadpool(recorded, call, public_id, key, uploaded, **said)).photo)
+    call.response.headers["Location"] = job.links["self"] or ""
+    return job
 
 
 # --- reports ------------------------------------------------------------------------------------------

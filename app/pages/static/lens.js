@@ -143,8 +143,7 @@ export function setUpCharts() {
 async function putProfile(lens, file, any = false) {
   const headers = { "Content-Type": "application/zip" };
   const response = await ask(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
-  if (response.status !== 202) return true;
-  for (;;) { // a worker has yet to read it
+  for (;;) { // a worker reads it
     const { state, error } = await (await ask(`${response.headers.get("Location")}?wait=20`)).json();
     if (state === "succeeded") return true;
     if (error) throw Object.assign(new Error(error.detail), { code: error.code });

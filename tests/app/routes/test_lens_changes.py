@@ -25,6 +25,16 @@ from lensmodel.report import lens_report
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
 
+def put_profile(client: TestClient, lens: str, content: bytes, **query: bool) -> tuple[dict[str, Any], Any]:
+    """Send a profile; return its job once that has ended, and the lens."""
+    answer = client.put(f"/v1/lenses/{lens}/profile", content=content, params=query)
+    assert answer.status_code == 202, answer.text
+    job = {"state": "queued"}
+    while job["state"] in {"queued", "running"}:
+        job = client.get(answer.headers["location"], params={"wait": 2}).json()
+    return job, client.get(f"/v1/lenses/{lens}").json()
+
+
 def test_several_photos_are_named_at_once(client: TestClient, steps: Steps, store: Store) -> None:
     photos = [steps.receive() for _ in range(3)]
     for photo in photos:
@@ -75,7 +85,7 @@ def test_its_own_profile_tells_a_lens_nothing(client: TestClient, steps: Steps) 
     file = client.get(f"/v1/lenses/{lens}/profile").content
     known = client.get(f"/v1/lenses/{lens}").json()
 
-    again = client.put(f"/v1/lenses/{lens}/profile", content=file).json()
+    _, again = put_profile(client, lens, file)
 
     assert [again[name] for name in ("photos", "samples", "version")] == [
         known[name] for name in ("photos", "samples", "version")
@@ -89,12 +99,12 @@ def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, sto
     sent = client.get(f"/v1/lenses/{lens}/profile")
     assert sent.headers["content-disposition"].endswith(".lensprofile")
 
-    taken = client.put(f"/v1/lenses/{other}/profile", content=sent.content)
-    again = client.put(f"/v1/lenses/{other}/profile", content=sent.content)
+    job, taken = put_profile(client, other, sent.content)
+    _, again = put_profile(client, other, sent.content)
 
-    assert taken.status_code == 200, taken.text
-    assert (taken.json()["photos"], taken.json()["samples"]) == (1, 12)
-    assert again.json() == taken.json()
+    assert job["state"] == "succeeded", job
+    assert (taken["photos"], taken["samples"]) == (1, 12)
+    assert again == taken
     question = {"r": 0.5, "phi": 0.4, "aperture": 1.4}
     kernels = [
         client.get(f"/v1/lenses/{key}/psf.json", params=question).json()["psf"] for key in (lens, other)
@@ -117,12 +127,12 @@ def test_a_profile_of_another_lens_is_refused_until_its_owner_insists(
     first, second = (steps.lens_id(steps.counted(patches=4, serial=serial)) for serial in ("1", "2"))
     sent = client.get(f"/v1/lenses/{first}/profile").content
 
-    refused = client.put(f"/v1/lenses/{second}/profile", content=sent)
-    assert (refused.status_code, refused.json()["code"]) == (409, "other_lens")
-    assert "its serial number is 1, that of the lens 2" in refused.json()["detail"]
-    assert client.get(f"/v1/lenses/{second}").json()["photos"] == 1
-    taken = client.put(f"/v1/lenses/{second}/profile?any_lens=true", content=sent)
-    assert (taken.status_code, taken.json()["photos"]) == (200, 2)
+    refused, untouched = put_profile(client, second, sent)
+    assert (refused["error"]["status"], refused["error"]["code"]) == (409, "other_lens")
+    assert "its serial number is 1, that of the lens 2" in refused["error"]["detail"]
+    assert untouched["photos"] == 1
+    taken, lens = put_profile(client, second, sent, any_lens=True)
+    assert (taken["state"], lens["photos"]) == ("succeeded", 2)
 
 
 @pytest.mark.usefixtures("reading")
@@ -131,8 +141,7 @@ def test_a_lens_is_made_of_a_profile_alone(client: TestClient, steps: Steps) -> 
 
     made = client.post("/v1/lenses", json={"label": "Given away"})
     assert (made.status_code, made.json()["label"], made.json()["photos"]) == (201, "Given away", 0)
-    taken = client.put(f"/v1/lenses/{made.json()['id']}/profile", content=sent)
-    assert (taken.status_code, taken.json()["photos"]) == (200, 1)
+    assert put_profile(client, made.json()["id"], sent)[1]["photos"] == 1
     assert "Given away" in client.get("/").text
 
 
@@ -147,7 +156,7 @@ def test_a_profile_is_not_read_beside_the_keys_of_the_database(
 
     answer = client.put(f"/v1/lenses/{other}/profile", content=sent)
 
-    assert (answer.status_code, answer.json()["photos"], read) == (202, 0, [])
+    assert (answer.status_code, read) == (202, [])
     job = client.get(answer.headers["location"]).json()
     assert (job["state"], job["id"]) == ("queued", store.jobs.to_do()[-1].arguments[0])
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202
@@ -161,9 +170,9 @@ def test_a_profile_of_another_model_is_refused(client: TestClient, steps: Steps)
     paper = LensModel.fit(profile.model.samples, ModelSettings(mode=PAPER))
     write_profile(sent, replace(profile, model=paper))
 
-    answer = client.put(f"/v1/lenses/{lens}/profile", content=sent.getvalue())
+    job, _ = put_profile(client, lens, sent.getvalue())
 
-    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert job["error"]["code"] == "conflict"
 
 
 @pytest.fixture
@@ -239,7 +248,7 @@ def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
     read: list[str] = []
     monkeypatch.setattr("app.jobs.tasks.read_profile", lambda *_: read.append("read"))
 
-    answer = client.put(f"/v1/lenses/{lens}/profile", content=bomb.getvalue())
+    job, _ = put_profile(client, lens, bomb.getvalue())
 
-    assert (answer.status_code, read) == (413, [])
+    assert (job["error"]["status"], read) == (413, [])
     assert client.put(f"/v1/lenses/{lens}/profile", content=b"no archive").status_code == 400

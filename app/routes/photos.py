@@ -140,7 +140,7 @@ def _admit(call: Call) -> None:
     """Refuse an upload before its body is read: no disk space, or a quota is used up."""
     limits = call.settings
     free = call.storage.free_bytes()
-    coming = middleware.declared_length(call.request.headers) or 0
+    coming = middleware.declared_length(call.request.headers)
     if free is not None and free - coming < limits.min_free_mb * MIB:
         raise QuotaError(
             f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "

@@ -71,7 +71,7 @@ def test_calls_without_a_body_need_no_type(client: TestClient, steps: Any) -> No
     assert client.delete(f"/v1/photos/{photo.public_id}").status_code == 204
 
 
-def head(method: str, path: str, length: int, kind: str = "application/json") -> bytes:
+def head(method: str, path: str, length: int | str, kind: str = "application/json") -> bytes:
     lines = (
         f"{method} {path} HTTP/1.1",
         "Host: localhost",
@@ -114,6 +114,13 @@ def test_a_body_that_does_not_come_in_time_is_answered_and_the_connection_closed
 
     assert said.startswith(b"HTTP/1.1 408")
     assert b'"code":"too_slow"' in said
+
+
+@pytest.mark.parametrize("length", ["ten", "-1", "+5", "1e3", "9" * 40])
+def test_a_nonsense_length_is_refused(port: int, length: str) -> None:
+    said = answer_of(port, head("POST", "/v1/photos", length, "application/octet-stream"))
+
+    assert said.startswith((b"HTTP/1.1 400", b"HTTP/1.1 413"))
 
 
 def test_a_body_longer_than_its_length_ends_the_connection(port: int) -> None:

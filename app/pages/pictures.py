@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Path, Response
 
 from app.blobs import tiles
 from app.blobs.storage import Storage
-from app.errors import InvalidParameterError, NotReadyError
+from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
 from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.schemas import Region
@@ -34,13 +34,6 @@ router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
     return Response(data, media_type=media_type, headers={"Cache-Control": "private, max-age=3600"})
-
-
-def _stored(call: Call, key: str) -> bytes:
-    try:
-        return call.storage.get(key)
-    except FileNotFoundError as error:
-        raise NotReadyError("there is no such picture yet: wait for the job that makes it") from error
 
 
 @router.get("/ui/photos/{photo_id}/thumbnail.jpg")
@@ -94,12 +87,12 @@ def correction_layer(
     correction_id: str, name: Literal["before", "after", "smooth", "clean"], call: CallDep
 ) -> Response:
     """Show a part of a photo as the sliders of a preview mix it."""
-    row = _compared(call, correction_id)
-    if row.params.get("roi") is None:
-        raise InvalidParameterError(f"correction {correction_id} is of a whole photo: it has tiles")
-    if name in {"smooth", "clean"} and not row.params.get("layers"):
-        raise InvalidParameterError(f"correction {correction_id} has no layers")
-    return _picture(_stored(call, f"{row.run_folder}{LAYER_FILES[name]}"), "image/png")
+    key = f"{_compared(call, correction_id).run_folder}{LAYER_FILES[name]}"
+    try:
+        return _picture(call.storage.get(key), "image/png")
+    except FileNotFoundError as error:
+        text = f"correction {correction_id} has no layer {name}: it is of a whole photo, or without layers"
+        raise NotReadyError(text) from error
 
 
 # Of each EXIF orientation: whether rows and columns change places, and which then count from the other end

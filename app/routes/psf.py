@@ -43,16 +43,10 @@ HATCH_PX: Final = 7  # pixels between the strokes over a cell that is not known 
 SCALE: Final = "X-PSF-Scale"
 ANSWERED_BY: Final = "X-PSF-Answered-By"
 # What headers say of pictures and arrays, which have no other room for it
+_TEXT: Final = {"schema": {"type": "string"}}
 _HEADERS: Final = {
-    SCALE: {
-        "description": "of one PSF as PNG: the value of white, and the gamma",
-        "schema": {"type": "string"},
-    },
-    ANSWERED_BY: {
-        "description": "what made the answer, as `support.answered_by` of the JSON; of a map all that took "
-        "part, those of most places first, with semicolons between",
-        "schema": {"type": "string"},
-    },
+    SCALE: _TEXT | {"description": "of one PSF as PNG: the value of white, and the gamma"},
+    ANSWERED_BY: _TEXT | {"description": "as `support.answered_by`; of a map all, most places first"},
 }
 _FILES: Final = {name: {"schema": {"type": "string", "format": "binary"}} for name in MEDIA_TYPES.values()}
 _ANSWERS: Final[Answers] = {

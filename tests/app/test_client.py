@@ -276,22 +276,3 @@ def test_waiting_does_not_begin_where_there_is_no_service() -> None:
         pytest.raises(httpx2.ConnectError),
     ):
         Client(http=http).wait("1")
-
-
-def test_several_photos_are_named_at_once_and_say_where_they_were_learned_from(
-    api: Client, steps: Steps, store: Store
-) -> None:
-    waiting = [steps.receive() for _ in range(2)]
-    for photo in waiting:
-        steps.inspect(photo, serial=None)
-        store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
-
-    keys = [photo.public_id for photo in waiting]
-    named = [api.change_photo(key, new_lens={"label": "Mine"}, aperture=2.0) for key in keys]
-
-    assert {photo.state for photo in named} == {"received"}  # they go on, with the lens and aperture given
-    assert {job["id"] for job in api.get("/v1/jobs")["items"]} == set(keys)
-    learned = steps.counted()
-    counts = api.photo(learned.public_id).patches
-    listed = api.get(f"/v1/photos/{learned.public_id}/patches")["items"]
-    assert len(listed) == counts.total + counts.rejected > 0

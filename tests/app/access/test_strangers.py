@@ -231,15 +231,6 @@ def test_every_answer_says_what_a_browser_may_do_with_it(client: TestClient, pat
     assert "unsafe-eval" not in headers["content-security-policy"]
 
 
-def test_even_our_own_fault_says_so(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    services = client.app.state.services  # type: ignore[attr-defined]  # an application of ours
-    monkeypatch.setattr(services.store.photos, "page", lambda *_, **__: 1 / 0)
-    answer = client.get("/v1/photos")
-
-    assert answer.status_code == 500
-    assert answer.headers["x-content-type-options"] == "nosniff"
-
-
 @pytest.mark.parametrize("path", ["/", "/docs"])
 def test_pages_load_nothing_from_elsewhere(client: TestClient, path: str) -> None:
     page = client.get(path, headers={"Accept": "text/html"}).text
@@ -270,19 +261,3 @@ def test_a_path_cannot_forge_a_line_of_the_log(client: TestClient, caplog: pytes
     assert said[-1].startswith("GET /v1/x%0A2026-01-01%20INFO")
     assert "\n" not in said[-1]
     assert "\x1b" not in said[-1]
-
-
-# --- small things of HTTP ---------------------------------------------------------------------
-
-
-# --- pictures ---------------------------------------------------------------------------------
-
-
-def test_a_map_of_the_field_is_bounded(client: TestClient, steps: Any) -> None:
-    lens = steps.lens_id(steps.counted())
-
-    largest = client.get(f"/v1/lenses/{lens}/field.png?grid=25x25&size=255&aperture=1.4")
-
-    assert (largest.status_code, largest.json()["code"]) == (422, "invalid_parameter")
-    assert "40.6 million pixels" in largest.json()["detail"]
-    assert client.get(f"/v1/lenses/{lens}/field.png?grid=9x6&size=55&aperture=1.4").status_code == 200

@@ -49,19 +49,20 @@ def things(steps: Steps, store: Store, settings: Settings) -> Things:
 # --- lists ------------------------------------------------------------------------------------------
 
 
-def corrections(steps: Steps, number: int) -> list[str]:
+def jobs(steps: Steps, number: int) -> list[str]:
     photo = steps.counted()
     asked = {"method": "fast", "output": {"format": "png8"}, "roi": None}
-    return [steps.correct(photo, strength=k / 10, **asked).public_id for k in range(number)]
+    made = [steps.correct(photo, strength=k / 10, **asked).public_id for k in range(number - 1)]
+    return [photo.public_id, *made]
 
 
 MAKERS: dict[str, Callable[[Steps, int], list[str]]] = {
     "/v1/photos": lambda steps, number: [steps.receive().public_id for _ in range(number)],
-    "/v1/jobs": lambda steps, number: [steps.receive().public_id for _ in range(number)],
+    "/v1/jobs": jobs,
     "/v1/lenses": lambda steps, number: [
         steps.lens_id(steps.counted(serial=str(k), patches=1)) for k in range(number)
     ],
-    "/v1/corrections": corrections,
+    "/v1/corrections": lambda steps, number: jobs(steps, number + 1)[1:],
 }
 
 
@@ -153,7 +154,7 @@ REFUSED: list[tuple[str, str, Any, int, str]] = [
     ("POST", "/v1/lenses", {"label": ""}, 422, INVALID),
     *(
         ("GET", f"/v1/lenses/LENS/field.png?grid={grid}", None, 422, INVALID)
-        for grid in ("0x3", "26x1", "axb", "9", "-1x2")
+        for grid in ("0x3", "26x1", "axb", "9", "-1x2", "25x25&size=255")
     ),
     *(("GET", f"/v1/jobs/PHOTO?wait={wait}", None, 422, INVALID) for wait in ("-1", "21", "nan", "soon")),
     ("GET", f"/v1/lenses/LENS/psf?r=0&version={10**20}", None, 422, INVALID),

@@ -312,14 +312,3 @@ def test_events_send_each_state_until_the_end(
         json.loads(line.removeprefix("data: ")) for line in text.splitlines() if line.startswith("data: ")
     ]
     assert [event["state"] for event in events] == ["queued", "cancelled"]
-
-
-def test_jobs_of_photos_and_corrections_share_a_list(client: TestClient, steps: Steps, store: Store) -> None:
-    photo = steps.counted()
-    steps.correct(photo, method="standard", strength=1.0, output={}, roi=None)
-
-    first = get(client, "/v1/jobs?limit=1")
-    second = get(client, first["next"])
-
-    assert [job["kind"] for job in first["items"] + second["items"]] == ["correction", "photo"]
-    assert second["next"] is None

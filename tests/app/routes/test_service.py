@@ -16,7 +16,7 @@ from obstore.exceptions import GenericError
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
-from app.http.errors import CODE_OF_STATUS, STATUS_OF_CODE, status_of
+from app.http.errors import STATUS_OF_CODE, status_of
 from app.main import create_app
 from app.routes import health
 from app.runtime.settings import Settings
@@ -100,6 +100,7 @@ def test_our_own_fault_is_a_problem_without_its_cause(
 
     assert (answer.status_code, answer.json()["code"]) == (500, "internal_error")
     assert "secret" not in answer.text
+    assert answer.headers["x-content-type-options"] == "nosniff"
     assert answer.json()["request_id"] == answer.headers["x-request-id"] == "abc-1"
 
 
@@ -212,34 +213,6 @@ def test_every_operation_has_its_own_id_and_describes_its_problems(client: TestC
             if status[0] in "45" and path != "/readyz":
                 assert "application/problem+json" in answer["content"], (path, method, status)
                 assert "HTTPValidationError" not in str(answer), (path, method)
-
-
-def test_the_description_names_all_endpoints_of_the_contract(client: TestClient) -> None:
-    paths = schema_of(client)["paths"]
-
-    assert set(paths) >= {
-        "/healthz",
-        "/readyz",
-        "/v1/photos",
-        "/v1/photos/{photo_id}",
-        "/v1/jobs/{job_id}",
-        "/v1/jobs/{job_id}/cancel",
-        "/v1/jobs/{job_id}/events",
-        "/v1/lenses",
-        "/v1/lenses/{lens_id}",
-        "/v1/lenses/{lens_id}/psf",
-        "/v1/lenses/{lens_id}/field.png",
-        "/v1/lenses/{lens_id}/calibrations",
-        "/v1/lenses/{lens_id}/lateral-colour",
-        "/v1/corrections",
-        "/v1/corrections/{correction_id}",
-        "/v1/corrections/{correction_id}/result",
-        "/v1/version",
-        "/v1/formats",
-        "/v1/limits",
-    }
-    assert set(paths["/v1/photos/{photo_id}"]) == {"get", "patch", "delete"}
-    assert CODE_OF_STATUS[404] == "not_found"
 
 
 HOSTILE = [

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from inspect import iscoroutinefunction
 from operator import attrgetter
 from typing import Annotated, Any, Generic, TypeVar
@@ -38,7 +38,7 @@ def found(what: str, key: str, row: T | None) -> T:
     return row
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Services:
     """The parts of one application."""
 
@@ -68,7 +68,7 @@ class Fresh(Generic[T]):
             return self._value
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Call(Services):
     """One request: the services, who asks, and the head of the response."""
 
@@ -117,8 +117,7 @@ class Call(Services):
     def of(cls, request: Request, response: Response, who: Who) -> Call:
         """Return a request to the application that it came to."""
         services: Services = request.app.state.services
-        parts = {part.name: getattr(services, part.name) for part in fields(services)}
-        return cls(**parts, request=request, response=response, who=who)
+        return cls(**vars(services), request=request, response=response, who=who)
 
 
 BEARER = HTTPBearer(auto_error=False, description="A key that `lensmodel keys create` made.")

@@ -64,14 +64,7 @@ STATUS_OF_CODE: Final[Mapping[str, int]] = {
     }.items()
     for code in codes.split()
 }
-CODE_OF_STATUS: Final[Mapping[int, str]] = {
-    404: "not_found",
-    405: "method_not_allowed",
-    413: "image_too_large",
-    415: "unsupported_format",
-    422: "invalid_parameter",
-    503: "busy",
-}
+CODE_OF_STATUS: Final[Mapping[int, str]] = {404: "not_found", 405: "method_not_allowed"}  # of the framework
 
 
 def status_of(error: library.LensModelError) -> int:

@@ -15,7 +15,7 @@ from app.http.model_cache import check_version
 from app.routes import common
 from app.routes.common import Cursor, Limit, OnlyId
 from app.routes.photos import SEND_AGAIN, check_usage
-from app.schemas import V1, CorrectionIn, CorrectionOut, Page
+from app.schemas import V1, CorrectionIn, CorrectionOut, Page, Region
 from app.store.photos import stored_settings
 from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
@@ -46,8 +46,7 @@ def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
     photo = call.photo(options.photo_id)
     if options.method not in deconvolvers:
         raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
-    _check_read(photo)
-    _check_region(photo, options)
+    _check_photo(photo, options.roi)
     lens = _lens_for(call, photo, options.lens_id)
     if not options.any_lens and lens.id != photo.lens_id:
         common.check_same_lens(call, lens, photo, f"{photo.filename} seems to be of another lens")
@@ -64,27 +63,16 @@ def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
     return views.correction_out(row)
 
 
-def _check_read(photo: PhotoRow) -> None:
-    """Check that the file was inspected: its size and settings are part of the request."""
+def _check_photo(photo: PhotoRow, roi: Region | None) -> None:
+    """Check that the file was inspected, as its size and settings are part of the request, and the region."""
     if photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: {SEND_AGAIN}")
-    if photo.width is not None:
-        return
-    if photo.state in {"received", "inspecting"}:
-        raise NotReadyError(
-            f"photo {photo.public_id} is still being read ({photo.state}): wait for its job",
-            headers={"Retry-After": "1"},
-        )
-    raise ConflictError(f"photo {photo.public_id} could not be read ({photo.state}): send it again")
-
-
-def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
-    roi = options.roi
-    if roi is None:
-        return
-    assert photo.width is not None
-    assert photo.height is not None
-    if roi.x + roi.width > photo.width or roi.y + roi.height > photo.height:
+    if photo.width is None or photo.height is None:
+        if photo.state in {"received", "inspecting"}:
+            text = f"photo {photo.public_id} is still being read ({photo.state}): wait for its job"
+            raise NotReadyError(text, headers={"Retry-After": "1"})
+        raise ConflictError(f"photo {photo.public_id} could not be read ({photo.state}): send it again")
+    if roi is not None and (roi.x + roi.width > photo.width or roi.y + roi.height > photo.height):
         raise InvalidParameterError(
             f"roi {roi.x},{roi.y} {roi.width}x{roi.height} reaches beyond the photo of "
             f"{photo.width}x{photo.height} pixels: draw it in"

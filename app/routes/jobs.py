@@ -61,18 +61,17 @@ async def get_job(
     A finished job answers at once. With `If-None-Match` only a change from that state counts, so
     that nothing is missed between two requests.
     """
-    job = await run_in_threadpool(find_job, call, job_id)
-    known_tag = call.request.headers.get("if-none-match", "").strip('W/"')
-    previous = known_tag or fingerprint(job)
+    known = call.request.headers.get("if-none-match", "").strip('W/"')
     deadline = time.monotonic() + min(wait, LONG_POLL_S)
-    while fingerprint(job) == previous and job.state not in FINAL and time.monotonic() < deadline:
+    job = await run_in_threadpool(find_job, call, job_id)
+    before = known or fingerprint(job)
+    while (tag := fingerprint(job)) == before and job.state not in FINAL and time.monotonic() < deadline:
         await asyncio.sleep(min(LOOK_S, max(deadline - time.monotonic(), 0.0)))
         job = await run_in_threadpool(find_job, call, job_id)
-    tag = fingerprint(job)
     headers = {"ETag": f'W/"{tag}"', "Cache-Control": "no-cache"}
     if job.state not in FINAL:
         headers["Retry-After"] = "1"
-    if known_tag == tag:
+    if known == tag:
         return Response(status_code=304, headers=headers)
     call.response.headers.update(headers)
     return job

@@ -13,7 +13,6 @@ from starlette.testclient import TestClient
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.jobs import Result
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
@@ -42,7 +41,14 @@ def things(steps: Steps, store: Store, settings: Settings) -> Things:
     Storage(settings.storage).put("corrections/x/result", b"the file")
     run = store.jobs.start(row.public_id, row.epoch)
     assert run is not None
-    assert store.jobs.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
+    made = {
+        "key": "corrections/x/result",
+        "etag": "e",
+        "media_type": "image/png",
+        "bytes": 8,
+        "name": "o.png",
+    }
+    assert store.jobs.finish(run, {}, **made)
     return Things(photo.public_id, steps.lens_id(photo), row.public_id)
 
 

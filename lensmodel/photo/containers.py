@@ -244,14 +244,7 @@ def _inflated(packed: bytes) -> bytes | None:
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 _LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
 _JPEG: Final = {6, 7}  # compression, of TIFF 6.0 and of its technical note 2
-_RAW_COMPRESSION: Final = {
-    32767,
-    32769,
-    32770,
-    34713,
-    65000,
-    65535,
-}  # Sony, Epson, Samsung, Nikon, Kodak, Pentax
+_RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}  # Sony to Pentax: libtiff, tiff.h
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
 # PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3); two kinds of
@@ -261,41 +254,46 @@ _READ_COLOURS: Final = {0, 1, 2, 3, 6}
 _OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
 
 
-def _read_tiff(buffer: Buffer, limits: Limits) -> Header:
+def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Header:
     """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF."""
     reader = TiffReader.open(buffer)
-    if reader is None:
-        raise TruncatedImageError("the TIFF ends inside its header; the upload was cut off")
-    chain = list(reader.chain())
-    if not chain:
+    chain = [] if reader is None else list(reader.chain())
+    if reader is None or not chain:
         raise TruncatedImageError("the TIFF has no readable directory; the upload was cut off")
-    first, every = chain[0][1], list(_with_children(reader, chain))
-    header = Header("tiff", tiff=(reader,), xmp=_block(first, 700), icc=_block(first, 34675))
+    every = list[tuple[int, Tags]]()
+    for offset, tags in chain:
+        children = tags.integers(SUB_DIRECTORIES, 16)
+        every += [(offset, tags), *((below, reader.directory(below)[0]) for below in children)]
+    first = chain[0][1]
     if _DNG_VERSION in first:
-        return _read_dng(replace(header, kind="dng"), max(every, key=_pixels)[1], buffer, limits)
-    if any(
-        tags.integer(262) in _RAW_PHOTOMETRIC or tags.integer(259) in _RAW_COMPRESSION for _, tags in every
-    ):
-        _, largest = max(every, key=_pixels)
-        header = _sized(replace(header, kind="raw"), largest)
-        check_size(header.width, header.height, len(buffer), limits)
-        _check_mosaic(largest)
+        kind = "dng"
+    elif any(t.integer(262) in _RAW_PHOTOMETRIC or t.integer(259) in _RAW_COMPRESSION for _, t in every):
+        kind = "raw"
+    place, photo = max(every, key=lambda at: (kind != "tiff" or not _is_derived(at[1]), _pixels(at[1])))
+    header = Header(
+        kind,
+        width=photo.integer(256),
+        height=photo.integer(257),
+        channels=photo.integer(277, 1),
+        bits=photo.integer(258, 1),
+        compression=photo.integer(259, 1),
+        directory=place if kind == "tiff" else 0,
+        tiff=(reader,),
+        xmp=_block(first, 700),
+        icc=_block(photo if kind == "tiff" else first, 34675),
+    )
+    check_size(header.width, header.height, len(buffer), limits)
+    if kind == "tiff":
+        if len(chain) >= MAX_DIRECTORIES:
+            raise UnsupportedFormatError(
+                f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
+            )
+        _check_strips(photo, len(buffer))
+        _check_colours(photo)
         return header
-    place, photo = max(every, key=lambda at: (not _is_derived(at[1]), _pixels(at)))
-    header = replace(_sized(header, photo), directory=place, icc=_block(photo, 34675))
-    check_size(header.width, header.height, len(buffer), limits)
-    if len(chain) >= MAX_DIRECTORIES:
-        raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
-    _check_strips(photo, len(buffer))
-    _check_colours(photo)
-    return header
-
-
-def _read_dng(header: Header, photo: Tags, buffer: Buffer, limits: Limits) -> Header:
-    """Take from the directory of its largest picture what is to be done with the numbers of a DNG."""
-    header = _sized(header, photo)
-    check_size(header.width, header.height, len(buffer), limits)
     _check_mosaic(photo)
+    if kind == "raw":
+        return header
     lossy = header.compression == _LOSSY
     return replace(
         header,
@@ -311,26 +309,8 @@ def _block(tags: Tags, tag: int) -> bytes | None:
     return tags.raw(tag)[:MAX_BLOCK_BYTES] or None
 
 
-def _sized(header: Header, tags: Tags) -> Header:
-    return replace(
-        header,
-        width=tags.integer(256),
-        height=tags.integer(257),
-        channels=tags.integer(277, 1),
-        bits=tags.integer(258, 1),
-        compression=tags.integer(259, 1),
-    )
-
-
-def _with_children(reader: TiffReader, chain: Sequence[tuple[int, Tags]]) -> Iterator[tuple[int, Tags]]:
-    for offset, tags in chain:
-        yield offset, tags
-        for below in tags.integers(SUB_DIRECTORIES, 16):
-            yield below, reader.directory(below)[0]
-
-
-def _pixels(at: tuple[int, Tags]) -> int:
-    return at[1].integer(256) * at[1].integer(257)
+def _pixels(tags: Tags) -> int:
+    return tags.integer(256) * tags.integer(257)
 
 
 def _is_derived(tags: Tags) -> bool:
@@ -342,16 +322,12 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
     """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6."""
     # the shorter of the rows counts: a damaged file may name fewer colours than it says
     height, width = len(rows), min(map(len, rows), default=0)
-    if (height, width) == (6, 6):
-        return
-    if (height, width) == (2, 2):
-        diagonals = {"".join(sorted(rows[0][k] + rows[1][1 - k])) for k in (0, 1)}
-        if diagonals == {"GG", "BR"}:
-            return
-    raise UnsupportedFormatError(
-        f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only Bayer "
-        "mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
-    )
+    bayer = (height, width) == (2, 2) and "".join(rows) in {"RGGB", "BGGR", "GRBG", "GBRG"}
+    if not bayer and (height, width) != (6, 6):
+        raise UnsupportedFormatError(
+            f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only "
+            "Bayer mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
+        )
 
 
 def _check_mosaic(tags: Tags) -> None:
@@ -418,8 +394,7 @@ def _check_colours(tags: Tags) -> None:
 
 # --- RAW files that are not plain TIFF ---------------------------------------------------------
 
-_CIFF_CAMERA: Final = re.compile(rb"Canon\0([ -~]{1,60})\0")
-"""Record 0x080A of a CRW file: maker and model (CIFF 1.0, 1997)."""
+_CIFF_CAMERA: Final = re.compile(rb"Canon\0([ -~]{1,60})\0")  # record 0x080A of a CRW file: CIFF 1.0, 1997
 
 
 def _read_raw(buffer: Buffer, limits: Limits) -> Header:
@@ -437,13 +412,9 @@ def _read_raw(buffer: Buffer, limits: Limits) -> Header:
         with contextlib.suppress(NotAnImageError, TruncatedImageError):
             preview = _read_jpeg(buffer[at : at + MAX_BLOCK_BYTES], limits)
             return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
-        return Header("raw")
-    reader = TiffReader.open(buffer)
-    chain = [] if reader is None else list(reader.chain())
-    if reader is None or not chain:
-        return Header("raw", tiff=() if reader is None else (reader,))
-    _, largest = max(_with_children(reader, chain), key=_pixels)
-    return _sized(Header("raw", tiff=(reader,), xmp=_block(chain[0][1], 700)), largest)
+    with contextlib.suppress(TruncatedImageError):
+        return _read_tiff(buffer, limits, "raw")
+    return Header("raw")
 
 
 _PARSERS: Final[Mapping[FileKind, Callable[[Buffer, Limits], Header]]] = {

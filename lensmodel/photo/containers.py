@@ -326,7 +326,7 @@ def require_known_mosaic(rows: Sequence[str]) -> None:
     if not bayer and (height, width) != (6, 6):
         raise UnsupportedFormatError(
             f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only "
-            "Bayer mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
+            "2 x 2 Bayer mosaics and X-Trans are read: have the camera or a raw converter bin or develop it"
         )
 
 

@@ -19,8 +19,6 @@ import random
 import re
 import shutil
 import signal
-import sqlite3
-import subprocess
 import sys
 import tempfile
 import threading
@@ -36,10 +34,10 @@ from obstore.exceptions import BaseError
 from sqlalchemy import exc, func, select
 
 HERE = Path(__file__).parents[1]
-STAND_INS = HERE / "stand_ins"
 sys.path.insert(0, str(HERE))
 
-from deadline import stretched  # noqa: E402 - of the tests of the service
+from crew import CELLS, CHANNELS, Crew, databases, pause, states  # noqa: E402 - of the tests of the service
+from deadline import stretched  # noqa: E402
 from servers import Postgres, moto, postgres  # noqa: E402
 from small_disk import kept_full, small_disk  # noqa: E402
 from uploads import receive  # noqa: E402
@@ -48,14 +46,12 @@ from app.blobs.storage import Storage  # noqa: E402
 from app.errors import BusyError  # noqa: E402
 from app.runtime.doctor import examine  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
-from app.runtime.supervisor import environment  # noqa: E402
 from app.store import Store  # noqa: E402
 from app.store.database import new_id  # noqa: E402
 from app.store.migrate import upgrade  # noqa: E402
 from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow  # noqa: E402
 
 OWNERS = ("one", "two")
-CELLS, CHANNELS = 8, 3
 PHOTO = b"a photo"
 
 
@@ -73,49 +69,19 @@ class Plan:
     patience_s: float = 300.0
 
 
-class Crew:
-    """Worker processes of one installation."""
-
-    def __init__(self, settings: Settings, extra: dict[str, str], log: Path) -> None:
-        self.log = log
-        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
-        self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | extra
-        self.processes: list[subprocess.Popen[bytes]] = []
-
-    def hire(self) -> None:
-        with self.log.open("a") as log:
-            self.processes.append(
-                subprocess.Popen(
-                    [sys.executable, str(STAND_INS / "quick_worker.py")],
-                    env=self._environment,
-                    stderr=log,
-                    start_new_session=True,
-                )
-            )
-
-    def bury(self, process: subprocess.Popen[bytes], *, group: bool) -> None:
-        if group:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-        process.kill()
-        process.wait()
-        self.processes.remove(process)
+class Victims(Crew):
+    """Workers that die, sleep, and are replaced."""
 
     def lose_one(self, chance: random.Random) -> None:
         """Kill one of them, alone or with its children, and hire another."""
-        self.bury(chance.choice(self.processes), group=chance.random() < 0.5)
+        self.kill(chance.choice(self.processes), group=chance.random() < 0.5)
         self.hire()
 
     @contextlib.contextmanager
     def paused(self, chance: random.Random, files: list[Path]) -> Iterator[None]:
         """Pause one of them, outside of transactions: with the lock of a file it would stop all of them."""
         pid = chance.choice(self.processes).pid
-        while True:
-            os.kill(pid, signal.SIGSTOP)
-            if all(_unlocked(path) for path in files):
-                break
-            os.kill(pid, signal.SIGCONT)
-            time.sleep(0.02)
+        pause(pid, files)
         try:
             yield
         finally:
@@ -126,21 +92,6 @@ class Crew:
         for process in [p for p in self.processes if p.poll() is not None]:
             self.processes.remove(process)
             self.hire()
-
-    def close(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.wait()
-
-
-def _unlocked(path: Path) -> bool:
-    try:
-        with contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as opened:
-            opened.execute("BEGIN IMMEDIATE")
-            opened.execute("ROLLBACK")
-    except sqlite3.OperationalError:
-        return False
-    return True
 
 
 @contextlib.contextmanager
@@ -259,11 +210,6 @@ def send(
     )
 
 
-def states(store: Store) -> list[str]:
-    with store.database.reading() as session:
-        return list(session.scalars(select(PhotoRow.state)))
-
-
 def said(store: Store) -> list[str]:
     """Return how photos are, with the reasons of those that ended."""
     with store.database.reading() as session:
@@ -293,7 +239,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         settings.data_dir.mkdir(parents=True)
         store, storage = Store(settings), Storage(settings.storage)
         upgrade(store.database)
-        crew = Crew(settings, given.extra, folder / "workers.log")
+        crew = Victims(settings, folder / "workers.log", given.extra)
         full_disks = plan.full_disks if given.full_disks else 0
         try:
             for number in range(plan.photos - plan.late):
@@ -308,7 +254,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
                 crew.hire()
             deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
             deeds += ["pause"] * plan.pauses
-            files = [] if servers else [settings.data_dir / name for name in ("app.db", "jobs.db")]
+            files = [] if servers else databases(settings)
             chance.shuffle(deeds)
             for deed in deeds:
                 time.sleep(chance.uniform(0.2, 1.5))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import random
 import sqlite3
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
@@ -19,10 +17,10 @@ from typing import Any
 
 import psycopg
 import pytest
-from deadline import Deadline
+from crew import Crew, check_counts, states, until
 from obstore import exceptions as stored
 from servers import postgres
-from sqlalchemy import exc, func, select
+from sqlalchemy import exc
 from starlette.testclient import TestClient
 from uploads import receive
 
@@ -31,18 +29,14 @@ from app.jobs.running import durable, end_job
 from app.jobs.worker import Worker
 from app.runtime.outage import Patience, is_outage
 from app.runtime.settings import Settings
-from app.runtime.supervisor import environment
 from app.store import LensName, Store
 from app.store.database import new_id
 from app.store.jobs import Job
 from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
-from app.store.tables import EventRow, PhotoRow, SampleRow
+from app.store.tables import PhotoRow
 from lensmodel.cli.ending import InterruptedByUser
 
-HERE = Path(__file__).parents[1]
-STAND_INS = HERE / "stand_ins"
-CELLS = 8
 PATIENCE_S = 180.0
 """Of an idle machine, see `deadline`."""
 
@@ -244,25 +238,8 @@ def test_an_unknown_job_cannot_be_retried(client: TestClient) -> None:
 
 @contextmanager
 def hired(settings: Settings) -> Iterator[subprocess.Popen[bytes]]:
-    path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
-    with (settings.data_dir / "workers.log").open("a") as log:
-        process = subprocess.Popen(
-            [sys.executable, str(STAND_INS / "quick_worker.py")],
-            env=os.environ | environment(settings) | {"PYTHONPATH": path},
-            stderr=log,
-        )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-def until(condition: Callable[[], object], log: Path) -> None:
-    deadline = Deadline(PATIENCE_S)
-    while not condition():
-        assert not deadline.passed(), log.read_text()[-4000:]
-        time.sleep(0.1)
+    with contextlib.closing(Crew(settings, settings.data_dir / "workers.log")) as crew:
+        yield crew.hire()
 
 
 def send(store: Store, storage: Storage, count: int, first: int = 0) -> list[str]:
@@ -276,19 +253,6 @@ def send(store: Store, storage: Storage, count: int, first: int = 0) -> list[str
     return ids
 
 
-def states(store: Store) -> set[str]:
-    with store.database.reading() as session:
-        return set(session.scalars(select(PhotoRow.state)))
-
-
-def check_counted_once(store: Store, photos: int) -> None:
-    with store.database.reading() as session:
-        samples = session.scalar(select(func.count()).select_from(SampleRow))
-        events = session.scalar(select(func.count()).where(EventRow.kind == "photo_added"))
-    assert states(store) == {"counted"}
-    assert (samples, events) == (photos * CELLS * 3, photos)
-
-
 def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store, tmp_path: Path) -> None:
     settings = settings.model_copy(update={"worker_slots": 2})
     storage = Storage(settings.storage)
@@ -297,16 +261,18 @@ def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store,
     log = settings.data_dir / "workers.log"
     with hired(settings):
         send(store, storage, 1)
-        until(lambda: states(store) == {"counted"}, log)  # a worker without any photo founds a missing folder
+        until(
+            lambda: set(states(store)) == {"counted"}, log
+        )  # a worker without any photo founds a missing folder
         storage.folder.rename(aside)
         send(store, Storage(f"file://{aside}"), 2, first=1)
         until(lambda: log.read_text().count("is away") >= 4, log)
         seen = states(store)
         aside.rename(storage.folder)
-        until(lambda: states(store) == {"counted"}, log)
+        until(lambda: set(states(store)) == {"counted"}, log)
 
     assert "failed" not in seen
-    check_counted_once(store, 3)
+    check_counts(store, 3)
 
 
 @pytest.mark.slow
@@ -324,11 +290,11 @@ def test_workers_that_start_while_the_storage_is_away_wait_for_it(settings: Sett
         seen, left = states(store), list(storage.folder.iterdir())
         storage.folder.rmdir()
         aside.rename(storage.folder)
-        until(lambda: states(store) == {"counted"}, log)
+        until(lambda: set(states(store)) == {"counted"}, log)
 
     assert "failed" not in seen
     assert left == []
-    check_counted_once(store, 2)
+    check_counts(store, 2)
 
 
 @pytest.mark.tools
@@ -353,10 +319,10 @@ def test_photos_outlast_a_database_that_is_away(tmp_path: Path) -> None:
             server.stop()
             time.sleep(9.0)  # long enough for three quick tries
             server.start()
-            until(lambda: states(store) == {"counted"}, log)
+            until(lambda: set(states(store)) == {"counted"}, log)
             survived = worker.poll() is None
 
-        check_counted_once(store, 6)
+        check_counts(store, 6)
         assert survived
         store.close()
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -17,53 +14,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from deadline import Deadline, stretched
-from sqlalchemy import func, select, update
+from crew import CELLS, Crew, check_counts, databases, done_patches, pause, states, until
+from deadline import stretched
+from sqlalchemy import update
 from uploads import receive
 
 from app.blobs.storage import Storage
 from app.jobs.worker import Worker
 from app.runtime.settings import Settings
-from app.runtime.supervisor import environment
 from app.store import Store
 from app.store.owners import ANY_OWNER
-from app.store.tables import EventRow, GarbageRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import GarbageRow, PhotoRow
 
-HERE = Path(__file__).parents[1]
-STAND_INS = HERE / "stand_ins"
-CELLS = 8
 LEASE_S = 3.0
-
-
-class Crew:
-    """Worker processes of one database."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._log = (settings.data_dir / "workers.log").open("a")
-        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
-        self._environment = os.environ | environment(settings) | {"PYTHONPATH": path}
-        self.processes: list[subprocess.Popen[bytes]] = []
-
-    def hire(self) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen(
-            [sys.executable, str(STAND_INS / "quick_worker.py")],
-            env=self._environment,
-            stderr=self._log,
-            start_new_session=True,
-        )
-        self.processes.append(process)
-        return process
-
-    def kill(self, process: subprocess.Popen[bytes]) -> None:
-        process.kill()
-        process.wait()
-        self.processes.remove(process)
-
-    def close(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.wait()
-        self._log.close()
 
 
 @pytest.fixture
@@ -73,9 +36,8 @@ def settings(tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def crew(settings: Settings, store: Store) -> Iterator[Crew]:
-    made = Crew(settings)
-    yield made
-    made.close()
+    with closing(Crew(settings, settings.data_dir / "workers.log")) as made:
+        yield made
 
 
 @pytest.fixture
@@ -89,52 +51,6 @@ def send(settings: Settings, store: Store, steps: Any) -> Callable[[int], list[P
         return photos
 
     return send
-
-
-def until(condition: Callable[[], object], within_s: float = 90.0) -> None:
-    deadline = Deadline(within_s)
-    while not condition():
-        assert not deadline.passed(), "it never happened"
-        time.sleep(0.05)
-
-
-def states(store: Store) -> list[str]:
-    with store.database.reading() as session:
-        return list(session.scalars(select(PhotoRow.state)))
-
-
-def done_patches(store: Store) -> int:
-    with store.database.reading() as session:
-        return session.scalar(select(func.count()).where(PatchRow.state == "done")) or 0
-
-
-def stop_outside_of_transactions(pid: int, settings: Settings) -> None:
-    """Stop a process that holds no write lock: with one it would stop everybody, not only itself."""
-    while True:
-        os.kill(pid, signal.SIGSTOP)
-        try:
-            for name in ("app.db", "jobs.db"):
-                path = settings.data_dir / name
-                with closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as opened:
-                    opened.execute("BEGIN IMMEDIATE")
-                    opened.execute("ROLLBACK")
-        except sqlite3.OperationalError:
-            os.kill(pid, signal.SIGCONT)
-            time.sleep(0.02)
-        else:
-            return
-
-
-def check_counts(store: Store, photos: int) -> None:
-    """Each photo counted exactly once, each patch sampled exactly once."""
-    lens = store.lenses.page("local", before=None, limit=10)[0]
-    with store.database.reading() as session:
-        samples = session.scalar(select(func.count()).select_from(SampleRow))
-        events = session.scalar(select(func.count()).where(EventRow.kind == "photo_added"))
-    assert states(store) == ["counted"] * photos
-    assert (lens.version, lens.photo_count, lens.sample_count) == (photos, photos, photos * CELLS * 3)
-    assert (samples, events) == (photos * CELLS * 3, photos)
-    assert done_patches(store) == photos * CELLS
 
 
 def test_a_worker_in_doubt_ends_what_broke_and_nothing_else(
@@ -230,7 +146,7 @@ def test_a_worker_that_slept_through_its_lease_stops_and_counts_nothing_twice(
     send(3)
     sleeper = crew.hire()
     until(lambda: done_patches(store) >= 1)
-    stop_outside_of_transactions(sleeper.pid, settings)
+    pause(sleeper.pid, databases(settings))
     crew.hire()
     until(lambda: states(store) == ["counted"] * 3)
     os.kill(sleeper.pid, signal.SIGCONT)
@@ -253,9 +169,7 @@ def test_twenty_random_deaths_lose_nothing_and_count_nothing_twice(
     for _ in range(kills):
         time.sleep(chance.uniform(0.3, 2.0))
         victim = chance.choice(crew.processes)
-        if chance.random() < 0.5:
-            os.killpg(victim.pid, signal.SIGKILL)  # the fork server with it; its children notice
-        crew.kill(victim)
+        crew.kill(victim, group=chance.random() < 0.5)
         crew.hire()
 
     until(lambda: set(states(store)) == {"counted"}, within_s=240)

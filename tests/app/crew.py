@@ -1,0 +1,114 @@
+"""Worker processes of one installation, which tests kill, pause and replace; and what they must have done."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from deadline import Deadline
+from sqlalchemy import func, select
+
+from app.runtime.settings import Settings
+from app.runtime.supervisor import environment
+from app.store import Store
+from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
+
+STAND_INS = Path(__file__).parent / "stand_ins"
+CELLS, CHANNELS = 8, 3  # of each photo, in the tasks of `stand_ins/quick_tasks.py`
+
+
+class Crew:
+    """Workers with quick tasks; to be closed."""
+
+    def __init__(self, settings: Settings, log: Path, extra: Mapping[str, str] | None = None) -> None:
+        self.log = log
+        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
+        self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | dict(extra or {})
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def hire(self) -> subprocess.Popen[bytes]:
+        with self.log.open("a") as log:
+            process = subprocess.Popen(
+                [sys.executable, str(STAND_INS / "quick_worker.py")],
+                env=self._environment,
+                stderr=log,
+                start_new_session=True,
+            )
+        self.processes.append(process)
+        return process
+
+    def kill(self, process: subprocess.Popen[bytes], *, group: bool = False) -> None:
+        """Kill a worker; with `group` its children too, which else notice."""
+        if group:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
+        self.processes.remove(process)
+
+    def close(self) -> None:
+        for process in [*self.processes]:
+            self.kill(process)
+
+
+def pause(pid: int, files: Sequence[Path]) -> None:
+    """Stop a process while it has locked none of the databases: else it would stop all the others too."""
+    while True:
+        os.kill(pid, signal.SIGSTOP)
+        if all(_unlocked(path) for path in files):
+            return
+        os.kill(pid, signal.SIGCONT)
+        time.sleep(0.02)
+
+
+def _unlocked(path: Path) -> bool:
+    try:
+        with contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as opened:
+            opened.execute("BEGIN IMMEDIATE")
+            opened.execute("ROLLBACK")
+    except sqlite3.OperationalError:
+        return False
+    return True
+
+
+def databases(settings: Settings) -> list[Path]:
+    """Return the files of the tables and of the jobs."""
+    return [settings.data_dir / name for name in ("app.db", "jobs.db")]
+
+
+def until(condition: Callable[[], object], log: Path | None = None, within_s: float = 180.0) -> None:
+    """Wait for something, for some seconds of an idle machine."""
+    deadline = Deadline(within_s)
+    while not condition():
+        assert not deadline.passed(), "it never happened" if log is None else log.read_text()[-4000:]
+        time.sleep(0.05)
+
+
+def states(store: Store) -> list[str]:
+    with store.database.reading() as session:
+        return list(session.scalars(select(PhotoRow.state)))
+
+
+def done_patches(store: Store) -> int:
+    with store.database.reading() as session:
+        return session.scalar(select(func.count()).where(PatchRow.state == "done")) or 0
+
+
+def check_counts(store: Store, photos: int) -> None:
+    """Each photo counted exactly once, each patch sampled exactly once."""
+    lens = store.lenses.page("local", before=None, limit=10)[0]
+    with store.database.reading() as session:
+        samples = session.scalar(select(func.count()).select_from(SampleRow))
+        events = session.scalar(select(func.count()).where(EventRow.kind == "photo_added"))
+    each = CELLS * CHANNELS
+    assert states(store) == ["counted"] * photos
+    assert (lens.version, lens.photo_count, lens.sample_count) == (photos, photos, photos * each)
+    assert (samples, events) == (photos * each, photos)
+    assert done_patches(store) == photos * CELLS

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import KeyedColumnElement
 
-from app.store.database import Repository, new_id, reads, writes
+from app.store.database import Repository, new_id, reads, writes, writes_durably
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, now, owner_id
 from app.store.tables import (
     CORRECTION_ACTIVE,
@@ -63,7 +63,7 @@ class Accounts(Repository):
 
     # --- keys -------------------------------------------------------------------------------------
 
-    @writes
+    @writes_durably
     def create_key(
         self,
         session: Session,
@@ -97,7 +97,7 @@ class Accounts(Repository):
         )
         return text
 
-    @writes
+    @writes_durably
     def revoke_key(self, session: Session, prefix: str) -> bool:
         """End a key and all sessions that began with it; False if there is no such key."""
         key = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix).with_for_update())
@@ -196,7 +196,7 @@ class Accounts(Repository):
 
     # --- erasure --------------------------------------------------------------------------------
 
-    @writes
+    @writes_durably
     def begin_erasing(self, session: Session, owner: str) -> int | None:
         """Remove the name and keys of an owner whose data are to be erased; return the row's key, if any."""
         row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner).with_for_update())

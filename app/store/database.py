@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar, cast
 
@@ -56,10 +56,13 @@ class Database:
         if self.is_sqlite:
             self.path = Path(self.url.database or "")
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = _sqlite(url, "BEGIN IMMEDIATE")
-            self.reader = _sqlite(url, "BEGIN", read_only=True)
+            # NORMAL never corrupts, but can lose the last commits when the power fails; each commit of FULL
+            # waits for the disk, which would delay leases where that is slow
+            self.writer = _sqlite(url, "BEGIN IMMEDIATE", "NORMAL")
+            self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
+            self.reader = _sqlite(url, "BEGIN", "NORMAL", read_only=True)
         else:
-            self.writer = create_engine(
+            self.writer = self.durable = create_engine(
                 url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
             )
             # one snapshot for each reading transaction, as on SQLite: what is read together is of one moment
@@ -92,9 +95,12 @@ class Database:
             yield session
 
     @contextmanager
-    def writing(self) -> Iterator[Session]:
+    def writing(self, *, durable: bool = False) -> Iterator[Session]:
         """Give a session whose changes are committed together at the end, or not at all."""
-        with Session(self.writer, expire_on_commit=False) as session, session.begin():
+        # `durable` also survives loss of power: for what a caller may rely on afterwards, such as an accepted
+        # upload whose memory card is formatted next
+        engine = self.durable if durable else self.writer
+        with Session(engine, expire_on_commit=False) as session, session.begin():
             yield session
         reads = self._in_scope()
         if reads is not None:
@@ -102,8 +108,8 @@ class Database:
 
     def close(self) -> None:
         """Close all connections."""
-        self.writer.dispose()
-        self.reader.dispose()
+        for engine in (self.writer, self.durable, self.reader):
+            engine.dispose()
 
 
 _SCOPE: ContextVar[Session | None] = ContextVar("scope", default=None)
@@ -146,7 +152,12 @@ def writes(method: Method[R, P, T]) -> Called[R, P, T]:
     return _in(method, Database.writing)
 
 
-def _sqlite(url: str, begin: str, *, read_only: bool = False) -> Engine:
+def writes_durably(method: Method[R, P, T]) -> Called[R, P, T]:
+    """Give a method a transaction of its own that survives loss of power once it has returned."""
+    return _in(method, partial(Database.writing, durable=True))
+
+
+def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
     engine = create_engine(
         url,
         connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000},
@@ -160,8 +171,7 @@ def _sqlite(url: str, begin: str, *, read_only: bool = False) -> Engine:
         connection.isolation_level = None  # we say BEGIN ourselves
         connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
         connection.execute("PRAGMA journal_mode=WAL")
-        # what was committed survives loss of power: after an upload a memory card may be formatted
-        connection.execute("PRAGMA synchronous=FULL")
+        connection.execute(f"PRAGMA synchronous={synchronous}")
         connection.execute("PRAGMA foreign_keys=ON")
         if read_only:
             connection.execute("PRAGMA query_only=ON")

@@ -13,7 +13,7 @@ from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import ConflictError, UnknownError
-from app.store.database import changed, insert_or_find, new_id, reads, writes
+from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
 from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
@@ -67,7 +67,7 @@ class Jobs(Works[CorrectionRow]):
 
     # --- corrections ------------------------------------------------------------------------------
 
-    @writes
+    @writes_durably
     def correct(
         self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:

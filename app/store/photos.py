@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, joinedload
 from app import distances
 from app.errors import BusyError, UnknownError
 from app.store import lenses
-from app.store.database import changed, insert_or_find, new_id, reads, writes
+from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
 from app.store.lenses import LensName, forget_if_empty, forget_patches, note_change
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_to_change, now, page_of
 from app.store.patches import Patches
@@ -143,7 +143,7 @@ class Photos(Patches, Works[PhotoRow]):
         """Announce blobs below `prefix`: garbage an hour after that time unless a photo claims them."""
         discard(session, prefix, after=within + SPARE)
 
-    @writes
+    @writes_durably
     def receive(
         self,
         session: Session,
@@ -203,7 +203,7 @@ class Photos(Patches, Works[PhotoRow]):
         discard(session, photo.blob_key, *(f"{photo.folder}{name}" for name in names), after=timedelta(0))
         return True
 
-    @writes
+    @writes_durably
     def restore_file(self, session: Session, photo_id: str, blob_key: str, *, again: bool = False) -> None:
         """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
         photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
@@ -240,7 +240,7 @@ class Photos(Patches, Works[PhotoRow]):
         current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch)
         session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
 
-    @writes
+    @writes_durably
     def record_location(
         self,
         session: Session,
@@ -376,7 +376,7 @@ class Photos(Patches, Works[PhotoRow]):
 
     # --- profiles ---------------------------------------------------------------------------------
 
-    @writes
+    @writes_durably
     def take_in(
         self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
     ) -> int | None:

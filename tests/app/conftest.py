@@ -158,7 +158,7 @@ def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
 def statements_compiled_once() -> Iterator[None]:
     """Let all engines of SQLite share what they make of statements.
 
-    Each test opens four of them, two of its own and two of its application; each would compile every
+    Each test opens six of them, three of its own and three of its application; each would compile every
     statement anew, which takes longer than the test.
     """
     first = create_engine("sqlite://", query_cache_size=5000)

@@ -185,12 +185,12 @@ class Worker:
         for row in jobs.workers():
             if row.host == self._host and not is_running(row.pid, row.pid_started):
                 jobs.bury(row.id)
-        for dead in jobs.bury_stale(self._settings.lease_seconds):
-            if dead != self.id and jobs.forget(dead):  # should this end here, `_reconcile` does the rest
-                self._engine.take_over(dead)
-                shutil.rmtree(self._scratch / dead, ignore_errors=True)
-                metrics.TAKEN_OVER.inc()
-                log.info("took over the work of worker %s", dead)
+        # should this end in between, `_reconcile` of another one does the rest
+        for dead in jobs.remove_dead(self._settings.lease_seconds, by=self.id):
+            self._engine.take_over(dead)
+            shutil.rmtree(self._scratch / dead, ignore_errors=True)
+            metrics.TAKEN_OVER.inc()
+            log.info("took over the work of worker %s", dead)
 
     def _reconcile(self) -> None:
         """End jobs that the engine lost or gave up, so that none stays unfinished for ever."""

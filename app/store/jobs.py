@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias
 
 from sqlalchemy import delete, func, select, update
@@ -30,6 +30,7 @@ from app.store.work import ENDED_BADLY, Works
 
 Kind: TypeAlias = Literal["photo", "correction", "measure"]
 
+GONE: Final = datetime(1970, 1, 1, tzinfo=UTC)  # heartbeat of a worker that will have no other
 _REQUEST: Final = ("photo_id", "lens_public_id", "lens_version", "params_hash")
 
 # Tables of unfinished work by its kind, and its states, that of work which nobody began first
@@ -201,39 +202,31 @@ class Jobs(Works[CorrectionRow]):
     @writes
     def beat(self, session: Session, worker_id: str) -> bool:
         """Renew the lease; False if the worker was declared dead: it must then stop at once."""
-        live = (WorkerRow.id == worker_id, WorkerRow.state == "live")
-        return changed(session, update(WorkerRow).where(*live).values(heartbeat_at=self._now(session))) == 1
+        mine = (WorkerRow.id == worker_id, WorkerRow.heartbeat_at > GONE)
+        return changed(session, update(WorkerRow).where(*mine).values(heartbeat_at=self._now(session))) == 1
 
     @reads
     def live(self, session: Session, lease_seconds: float) -> list[WorkerRow]:
         """Return the workers whose last heartbeat is within the lease."""
         since = self._now(session) - timedelta(seconds=lease_seconds)
-        live = (WorkerRow.state == "live", WorkerRow.heartbeat_at > since)
-        return list(session.scalars(select(WorkerRow).where(*live)))
+        return list(session.scalars(select(WorkerRow).where(WorkerRow.heartbeat_at > since)))
 
     @reads
     def workers(self, session: Session) -> list[WorkerRow]:
-        """Return every worker that has a row, dead ones too."""
+        """Return every worker that has a row, whatever its lease."""
         return list(session.scalars(select(WorkerRow)))
 
     @writes
-    def bury_stale(self, session: Session, lease_seconds: float) -> list[str]:
-        """Declare workers dead that missed their lease; return the ids of all dead ones."""
-        before = self._now(session) - timedelta(seconds=lease_seconds)
-        silent = (WorkerRow.state == "live", WorkerRow.heartbeat_at < before)
-        session.execute(update(WorkerRow).where(*silent).values(state="dead"))
-        return list(session.scalars(select(WorkerRow.id).where(WorkerRow.state == "dead")))
-
-    @writes
     def bury(self, session: Session, worker_id: str) -> None:
-        """Declare one worker dead: it has stopped, or its process is known to be gone."""
-        session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(state="dead"))
+        """Let a lease end at once: the worker has stopped, or its process is known to be gone."""
+        session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(heartbeat_at=GONE))
 
     @writes
-    def forget(self, session: Session, worker_id: str) -> bool:
-        """Remove a dead worker; True for the one who did it, and takes over all it had begun."""
-        dead = (WorkerRow.id == worker_id, WorkerRow.state == "dead")
-        return changed(session, delete(WorkerRow).where(*dead)) == 1
+    def remove_dead(self, session: Session, lease_seconds: float, *, by: str) -> list[str]:
+        """Remove the others whose lease has ended; the one who did it takes over all that they had begun."""
+        before = self._now(session) - timedelta(seconds=lease_seconds)
+        dead = delete(WorkerRow).where(WorkerRow.heartbeat_at < before, WorkerRow.id != by)
+        return list(session.scalars(dead.returning(WorkerRow.id)))
 
     # --- garbage ----------------------------------------------------------------------------------
 

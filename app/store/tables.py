@@ -358,13 +358,11 @@ class WorkerRow(Base):
     """One worker process and the time of its last heartbeat."""
 
     __tablename__ = "worker"
-    __table_args__ = (CheckConstraint(_one_of("state", ("live", "dead")), name="state"),)
 
     id: Mapped[str] = mapped_column(primary_key=True)
     host: Mapped[str]
     pid: Mapped[int]
     pid_started: Mapped[float]  # when the process began: a pid alone may belong to another process by now
-    state: Mapped[str] = mapped_column(default="live")
     started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
     # Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces

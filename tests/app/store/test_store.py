@@ -369,11 +369,11 @@ def test_a_worker_declared_dead_cannot_beat_again(store: Store, steps: Steps) ->
     assert store.jobs.beat("w")
     assert [row.id for row in store.jobs.live(10)] == ["w"]
 
-    assert store.jobs.bury_stale(0.0) == ["w"]
+    store.jobs.bury("w")
 
     assert not store.jobs.beat("w")
     assert store.jobs.live(10) == []
-    store.jobs.forget("w")
+    assert [store.jobs.remove_dead(10, by=name) for name in ("w", "other", "third")] == [[], ["w"], []]
     assert store.jobs.workers() == []
 
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -96,6 +97,7 @@ class JobContext:
     def __post_init__(self) -> None:
         self._locks = defaultdict(threading.Lock)
         self.warmed.set()  # unless the worker says that it compiles them
+        self.cells = ThreadPoolExecutor(self.settings.worker_slots + 1)  # one more waits for the next slot
         self.cache = self.settings.data_dir.resolve() / "developed"  # developed photos, of this machine alone
 
     def wants(self, photo: PhotoRow) -> Wanted:

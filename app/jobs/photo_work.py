@@ -10,14 +10,12 @@ import logging
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
-
-from structlog.contextvars import bind_contextvars, get_contextvars
 
 from app.jobs import inspection
 from app.jobs.answers import JobFailedError, NotWantedError
@@ -143,14 +141,20 @@ class _Steps:
         self._photos.plan_patches(*self._which, selection["patches"], selection["rejected"])
 
     def _estimate(self) -> None:
-        """Estimate in each cell with open patches, in as many at once as the worker has slots."""
+        """Estimate in each cell with open patches; the cells of all photos of a worker share its slots."""
         cells: defaultdict[int | None, list[PatchRow]] = defaultdict(list)
         for row in self._photos.patches(*self._which):
             if row.state == "pending":
                 cells[row.cell].append(row)
-        log_context = partial(bind_contextvars, **get_contextvars())
-        with ThreadPoolExecutor(self._context.settings.worker_slots, initializer=log_context) as pool:
-            list(pool.map(self._estimate_cell, cells.values()))
+        run = self._context.cells.submit  # each in a copy of what the log tells of this job
+        jobs = [run(copy_context().run, self._estimate_cell, rows) for rows in cells.values()]
+        try:
+            for job in jobs:
+                job.result()
+        finally:  # should one have failed, none may still run when all are tried again
+            for job in jobs:
+                job.cancel()
+            wait(jobs)
 
     def _estimate_cell(self, rows: Sequence[PatchRow]) -> None:
         poor = {row.idx for row in rows}

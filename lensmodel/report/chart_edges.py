@@ -66,7 +66,11 @@ def edges_csv(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> str:
     for number, edge in enumerate(edges, start=1):
         place, response = photo.frame.position(*edge.middle), edge.response
         where = (f"{value:.5g}" for value in (*edge.middle, place.r, place.phi))
-        figures = f"{math.degrees(response.normal):.2f}", f"{response.mtf50:.4f}", f"{response.overshoot:.2f}"
+        figures = (
+            f"{math.degrees(response.normal):.2f}",
+            f"{min(response.mtf50, NYQUIST):.4f}",
+            f"{response.overshoot:.2f}",
+        )
         writer.writerow([number, *where, place_in_words(place), _direction(photo, edge), *figures])
     return out.getvalue()
 

@@ -92,7 +92,7 @@ UNKNOWN: Final = 0.5
 # Errors of the transfer function that a range of MTF50 allows for (chosen on three ray-traced lenses; how
 # often ranges then hold is printed by `lab.lens_test`)
 _ERRORS: Final = 2.0
-# Share of MTF50 of a chart, a target or points that it may be off by (chosen: what tests ask of corners)
+# Share of MTF50 of a chart, a target or points that it may be off by even there (chosen: as tests ask)
 _MEASURED: Final = 0.15
 _RINGS: Final = (np.arange(8) + 0.5) / 16.0  # middles of the rings of frequency whose error an answer says
 _SCALE: Final = np.linspace(0.0, 1.0, 513)  # cycles/pixel
@@ -158,7 +158,7 @@ class Spot:
 
     place: str
     position: FieldPosition
-    tangential: float
+    tangential: float  # the Nyquist frequency, .5, means at least that
     sagittal: float
     tangential_range: Range
     sagittal_range: Range
@@ -467,14 +467,20 @@ def _spot(
 
 
 def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Range]:
-    """MTF50 along an angle, and where it lies with the contrast wrong by `_ERRORS` times what is expected."""
+    """MTF50 along an angle, and where it lies with the contrast wrong by `_ERRORS` times what is expected.
+
+    Neither goes beyond the Nyquist frequency, which then means "at least".
+    """
     value = mtf50_from_kernel(answer.kernel, angle)
     if answer.ring_error is None or answer.answered_by != "network":
-        share = _MEASURED if measured else answer.predicted_error
-        return value, (value * (1.0 - share), value * (1.0 + share))
-    contrast = mtf_from_kernel(answer.kernel, angle, _SCALE)
-    error = _ERRORS * np.interp(_SCALE, _RINGS, answer.ring_error)
-    return value, (crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5))
+        # between and beyond the places of a chart less is known than at them
+        share = max(answer.predicted_error, _MEASURED if measured else 0.0)
+        between = max(value * (1.0 - share), 0.0), value * (1.0 + share)
+    else:
+        contrast = mtf_from_kernel(answer.kernel, angle, _SCALE)
+        error = _ERRORS * np.interp(_SCALE, _RINGS, answer.ring_error)
+        between = crossing(_SCALE, contrast - error, 0.5), crossing(_SCALE, contrast + error, 0.5)
+    return min(value, NYQUIST), (min(between[0], NYQUIST), min(between[1], NYQUIST))
 
 
 def _curves(model: LensModel, settings: LensSettings, aspect: float, size: int) -> tuple[Curve, ...]:

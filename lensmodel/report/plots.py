@@ -24,6 +24,7 @@ from lensmodel.report.lens_report import (
     LensReport,
     Unit,
 )
+from lensmodel.report.tables import place_table
 
 try:
     import matplotlib as mpl
@@ -34,6 +35,7 @@ try:
     from matplotlib.image import AxesImage
     from matplotlib.patches import Circle, Rectangle
     from matplotlib.ticker import MaxNLocator
+    from matplotlib.transforms import Bbox
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
@@ -143,7 +145,9 @@ def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     drawn = [_photographer(report)]
     for number in report.apertures:
-        panels = _panels(report, report.at(number), "c/px")
+        found = report.at(number)
+        at = f", {found.at}" if found.at else ""
+        panels = [*_panels(report, found, "c/px"), (f"MTF50 by place{at}", _on(_table, report, found))]
         drawn += [_page(report.name, "", panels[k : k + _A_PAGE]) for k in range(0, len(panels), _A_PAGE)]
     return drawn
 
@@ -320,10 +324,12 @@ def _sharpness_map(
 
 
 def _error_map(ax: Axes, found: ApertureReport) -> None:
-    """By how much MTF50 may be off at each place, in percent."""
+    """By how much MTF50 may be off at each place, in percent; no figure where it is beyond Nyquist's."""
     shares = np.array([spot.give_or_take for spot in found.map])
-    words = [f"{100.0 * share:.0f}" for share in shares]
-    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0))
+    shown = [min(spot.tangential, spot.sagittal) < NYQUIST for spot in found.map]
+    words = [f"{100.0 * share:.0f}" if told else "" for share, told in zip(shares, shown, strict=True)]
+    hatched = [spot.unknown for spot in found.map]
+    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0), hatched)
 
 
 def _difference(ax: Axes, comparison: Comparison) -> None:
@@ -382,9 +388,9 @@ def _points(place: Place, found: ApertureReport) -> None:
     near = slice(middle - half, middle + half + 1)
     for ax, spot, kernel in zip(place.subplots(1, len(kernels)), found.spots, kernels, strict=True):
         ax.imshow(kernel[near, near], cmap="gray", vmin=0.0)
-        name = spot.side + (" (not known)" if spot.unknown else "")
+        name = spot.side + ("\n(not known)" if spot.unknown else "")
         weight = "bold" if spot is found.worst else "normal"
-        ax.set_title(name, fontsize=8.5, weight=weight, loc="center")
+        ax.set_title(name, fontsize=8.5, weight=weight, loc="center", va="bottom")
         ax.set(xticks=[], yticks=[])
         ax.set_xlabel(spot.words.replace(", S", "\nS"), fontsize=7.5)
         ax.grid(visible=False)
@@ -419,13 +425,34 @@ def _side_softer(ax: Axes, found: ApertureReport) -> None:
     if softer is None or softer.error >= 1.0:
         ax.set_xlabel("too little is known to say")
         return
-    scale = 1.0 / math.log(2.0)  # sides that differ by a factor of two reach the edge
+    # sides that differ by a factor of two reach the edge; of those that differ by more the arrow ends there
+    scale = 1.0 / max(math.log(2.0), softer.amount)
     x, y = (scale * softer.amount * f(softer.direction) for f in (math.cos, math.sin))
     ax.add_patch(Circle((x, y), 2.0 * scale * softer.error, color=_INKS[0], alpha=0.2))
     ax.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": _INKS[1], "lw": 2.0})
     ax.set_xlabel(
         "arrow: to the softer side; circle: two standard errors; certain where the cross lies outside it"
     )
+
+
+def _table(ax: Axes, report: LensReport, found: ApertureReport) -> None:
+    """MTF50 of one aperture by place, in each unit that is known."""
+    ax.set_axis_off()
+    head, rows = place_table(report)
+    lines = [[cell.replace(" [", "\n[").replace(" (", "\n(") for cell in row[1:]] for row in rows
+             if row[0] == (found.at or "unknown")]  # fmt: skip
+    table = ax.table(
+        lines,
+        colLabels=head[1:],
+        cellLoc="left",
+        colLoc="left",
+        edges="horizontal",
+        bbox=Bbox.unit(),
+    )
+    table.auto_set_font_size(False)
+    table.set_fontsize(6.2)
+    for cell in table.get_celld().values():
+        cell.set(linewidth=0.4, edgecolor=_GREY)
 
 
 def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:

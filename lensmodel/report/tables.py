@@ -32,7 +32,8 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
                     (spot.sagittal, spot.sagittal_range),
                 )
             ]
-            rows.append([found.at or "unknown", spot.place.removeprefix("the "), *figures])
+            place = spot.place.removeprefix("the ") + (" (not known)" if spot.unknown else "")
+            rows.append([found.at or "unknown", place, *figures])
     return head, rows
 
 

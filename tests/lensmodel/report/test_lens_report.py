@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 import re
@@ -32,6 +33,7 @@ from lensmodel.report import (
     lens_report,
     sharpness,
 )
+from lensmodel.report.centring import Asymmetry, Centring
 from lensmodel.report.html import to_html
 from lensmodel.report.lens_report import UNKNOWN
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
@@ -178,6 +180,22 @@ def test_beyond_the_outermost_square_of_a_chart_nothing_is_known() -> None:
     unknown = np.array([spot.unknown for spot in found.map])
     assert unknown[radii > 0.78].all()
     assert not unknown[radii < 0.65].any()
+    for spot in found.map:  # not known to the 15 percent of what was measured
+        if spot.tangential < 0.5:
+            assert spot.tangential_range[0] <= max(spot.tangential * (1.0 - spot.predicted_error), 0.0) + 1e-9
+            assert spot.tangential_range[1] >= min(spot.tangential * (1.0 + spot.predicted_error), 0.5) - 1e-9
+    assert {row[1] for row in place_table(report)[1] if "(not known)" in row[1]} == {
+        f"{spot.place.removeprefix('the ')} (not known)"
+        for spot in (*found.spots, *found.sides)
+        if spot.unknown
+    }
+    assert charts(report, None)[1].svg.count(b"url(#h") == unknown.sum()  # hatched
+    page = pages(report)[0]
+    page.draw_without_rendering()
+    titles = [ax.title for ax in page.axes if "not known" in ax.get_title()]
+    assert len(titles) == 4
+    boxes = [title.get_window_extent() for title in titles]
+    assert not any(a.overlaps(b) for a, b in itertools.pairwise(boxes))
 
 
 def test_sides_are_given_apart_and_their_two_directions_too() -> None:
@@ -234,7 +252,28 @@ def test_a_point_within_a_pixel_is_reported_as_at_least_nyquist() -> None:
 
     assert "as sharp as the sensor can show" in found.verdict
     assert "at least .500" in place_table(found)[1][0][2]
-    assert ">.50" in charts(found, None)[0].svg.decode().replace("&gt;", ">")
+    maps, errors = charts(found, None)[:2]
+    assert ">.50" in maps.svg.decode().replace("&gt;", ">")
+    assert not [text for text in ET.fromstring(errors.svg).itertext() if text.strip().isdigit()]
+    rows = [row for row in csv.DictReader(io.StringIO(to_csv(found))) if row["quantity"] == "MTF50"]
+    assert {(row["value"], row["low"], row["high"]) for row in rows} == {("0.5", "0.5", "0.5")}
+
+
+@pytest.mark.parametrize("amount", [0.2, 2.0])
+def test_the_arrow_to_the_softer_side_ends_inside_the_picture(amount: float) -> None:
+    found = report_of(bad_side=0.3)
+    softer = Asymmetry(amount, direction=0.4, error=0.1, significant=True)
+    tested = replace(found.tested[0], centring=Centring("decentred", "softer", softer))
+    (picture,) = (
+        ax
+        for figure in pages(replace(found, tested=(tested,)))
+        for ax in figure.axes
+        if ax.get_xlabel().startswith("arrow")
+    )
+
+    (arrow,) = picture.texts
+    assert math.atan2(*reversed(arrow.xy)) == pytest.approx(0.4)
+    assert 0.1 < math.hypot(*arrow.xy) <= 1.0
 
 
 def test_all_documents_hold_the_same_figures(soft: LensReport) -> None:

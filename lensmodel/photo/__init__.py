@@ -2,8 +2,7 @@
 
 from lensmodel.photo.containers import HEAD_BYTES, sniff
 from lensmodel.photo.development import develop, inspect
-from lensmodel.photo.metadata import is_placeholder, read_metadata
-from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.metadata import read_metadata
 from lensmodel.photo.values import (
     ColorSpace,
     Encoding,
@@ -29,9 +28,7 @@ __all__ = [
     "PhotoInfo",
     "PhotoMetadata",
     "develop",
-    "estimate_noise",
     "inspect",
-    "is_placeholder",
     "read_metadata",
     "shown",
     "sniff",

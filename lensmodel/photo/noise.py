@@ -137,19 +137,15 @@ def _levels(
 def _scale(values: NDArray[np.float32]) -> float:
     """Robust standard deviation: the s for which the mean of min(v^2, (1.5 s)^2) is that of a normal v.
 
-    A median would do where numbers are fine. Differences of a camera's 8-bit numbers are few, and their
-    median jumps from one to the next: by a factor of 2 where the noise is half a step.
+    A median of a camera's 8-bit differences jumps by a factor of 2 where the noise is half a step.
     P. J. Huber, "Robust estimation of a location parameter", Ann. Math. Stat. 35, 1964, proposal 2.
     """
     power = np.square(values, dtype=np.float32).ravel()
     sigma = _MAD_TO_SIGMA * float(np.sqrt(np.median(power)))
     for _ in range(20):
-        if sigma == 0.0:
-            break
-        before = sigma
-        clipped = np.minimum(power, np.float32((_CUT * sigma) ** 2))
+        before, clipped = sigma, np.minimum(power, np.float32((_CUT * sigma) ** 2))
         sigma = float(np.sqrt(clipped.mean(dtype=np.float64) / _CUT_POWER))
-        if abs(sigma - before) < 1e-3 * before:
+        if abs(sigma - before) <= 1e-3 * before:
             break
     return sigma
 

@@ -140,27 +140,23 @@ class TiffReader:
 
     def directory(self, offset: int) -> tuple[Tags, int]:
         """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""
-        count_size, entry_size, word = (8, 20, "Q") if self.big else (2, 12, "I")
-        word_size = struct.calcsize("=" + word)
-        start, tags = self.base + offset, Tags()
-        head = bytes(self.buffer[start : start + count_size]) if offset > 0 and start > 0 else b""
-        if len(head) < count_size:
+        head_size, entry_size, word = (8, 20, "Q") if self.big else (2, 12, "I")
+        word_size, start, tags = struct.calcsize("=" + word), self.base + offset, Tags()
+        head = bytes(self.buffer[start : start + head_size]) if offset > 0 and start > 0 else b""
+        if len(head) < head_size:
             return tags, 0
-        count = struct.unpack(self.order + ("Q" if self.big else "H"), head)[0]
-        at = start + count_size
-        for _ in range(min(count, MAX_ENTRIES)):
-            raw = bytes(self.buffer[at : at + entry_size])
-            if len(raw) < entry_size:
-                return tags, 0
-            number, kind, values = struct.unpack(f"{self.order}HH{word}", raw[: 4 + word_size])
+        count, at = struct.unpack(self.order + ("Q" if self.big else "H"), head)[0], start + head_size
+        table = bytes(self.buffer[at : at + entry_size * min(count, MAX_ENTRIES)])
+        entries = struct.Struct(f"{self.order}HH{word}{word_size}s")
+        for number, kind, values, raw in entries.iter_unpack(table[: len(table) // entry_size * entry_size]):
             if kind in _FORMATS:
                 inside = values * _SIZES[kind] <= word_size
-                far = self.base + struct.unpack(self.order + word, raw[-word_size:])[0]
+                far = self.base + struct.unpack(self.order + word, raw)[0]
                 place = at + 4 + word_size if inside else far
                 tags.setdefault(number, Tag(kind, values, place, self.order, self.buffer))
             at += entry_size
         tail = bytes(self.buffer[at : at + word_size])
-        complete = count <= MAX_ENTRIES and len(tail) == word_size
+        complete = len(table) == count * entry_size and len(tail) == word_size
         return tags, struct.unpack(self.order + word, tail)[0] if complete else 0
 
     def chain(self) -> Iterator[tuple[int, Tags]]:

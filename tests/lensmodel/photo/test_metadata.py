@@ -18,6 +18,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
 from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.metadata import is_placeholder
 from lensmodel.photo.xmp import read_xmp
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
@@ -130,7 +131,7 @@ def test_values_that_say_nothing_are_unknown_and_others_stand_in(
     ],
 )
 def test_a_placeholder_is_no_serial_but_zeros_may_be_in_one(placeholder: bool, serials: str) -> None:
-    assert {photo.is_placeholder(serial) for serial in serials.split("|")} == {placeholder}
+    assert {is_placeholder(serial) for serial in serials.split("|")} == {placeholder}
 
 
 def olympus_note(serial: bytes) -> bytes:

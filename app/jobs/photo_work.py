@@ -332,5 +332,5 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
         if why is not None:
             raise JobFailedError("other_lens", f"the profile seems to be of another lens: {why}; {REMEDY}")
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
-    if store.photos.take_in(file, samples, names) is None:
+    if not store.photos.take_in(file, samples, names):
         raise NotWantedError

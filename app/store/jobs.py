@@ -17,6 +17,7 @@ from app.store.database import changed, insert_or_find, new_id, reads, writes, w
 from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
+    ENDED_BADLY,
     PHOTO_WORKED_ON,
     CorrectionRow,
     EventRow,
@@ -26,7 +27,7 @@ from app.store.tables import (
     PhotoRow,
     WorkerRow,
 )
-from app.store.work import ENDED_BADLY, Works
+from app.store.work import Works
 
 Kind: TypeAlias = Literal["photo", "correction", "measure"]
 

@@ -30,6 +30,7 @@ from app.store.owners import (
 from app.store.samples import COLUMNS, LensState, sample_in
 from app.store.tables import (
     CORRECTION_ACTIVE,
+    ENDED_BADLY,
     PHOTO_WORKED_ON,
     CorrectionRow,
     EventRow,
@@ -42,7 +43,6 @@ from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import PsfSample
 
 TEACHES: Final = PhotoRow.state == "counted"
-NO_RESULT: Final = ("failed", "cancelled")
 
 # How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
@@ -396,7 +396,7 @@ def forget_if_empty(session: Session, photo: PhotoRow, *, gone: bool = False) ->
     others = select(PhotoRow.id).where(PhotoRow.lens_id == lens.id, PhotoRow.id != photo.id)
     named_by_owner = lens.label is not None or lens.serial_source == "user"
     if not named_by_owner:
-        others = others.where(PhotoRow.state.not_in(NO_RESULT))
+        others = others.where(PhotoRow.state.not_in(ENDED_BADLY))
     if (gone or not named_by_owner) and session.scalar(others.limit(1)) is None:
         _forget(session, lens)
 

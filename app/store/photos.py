@@ -22,6 +22,7 @@ from app.store.patches import Patches
 from app.store.samples import PROFILE, columns_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
+    ENDED_BADLY,
     PHOTO_UNFINISHED,
     PHOTO_WORKED_ON,
     PROFILE_FILE,
@@ -177,7 +178,7 @@ class Photos(Patches, Works[PhotoRow]):
             return Received(known, fresh=True)
         merged = _of_upload(given, known.given)
         again = (
-            known.state in {"failed", "cancelled"}
+            known.state in ENDED_BADLY
             or (calibrate and not known.calibrate)
             or (known.state == "needs_lens" and merged != known.given)
             or (known.kind == PROFILE_FILE and known.state == "stored")
@@ -379,11 +380,11 @@ class Photos(Patches, Works[PhotoRow]):
     @writes_durably
     def take_in(
         self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
-    ) -> int | None:
-        """Let the samples of a profile join its lens; return the number of their photos."""
-        # None where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of the
-        # profile becomes a counted photo without a file, which can be excluded or deleted as any other. What
-        # was imported before is not imported again.
+    ) -> bool:
+        """Let the samples of a profile join its lens."""
+        # False where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of
+        # the profile becomes a counted photo without a file, which can be excluded or deleted as any other.
+        # What was imported before is not imported again.
         groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
         for sample in samples:
             groups[sample.photo, sample.settings.with_channel("g")].append(sample)
@@ -392,19 +393,17 @@ class Photos(Patches, Works[PhotoRow]):
         if lens is None or not self.move(
             session, file.public_id, ANY_OWNER, ("inspecting",), "stored", ended, epoch=file.epoch
         ):
-            return None
+            return False
         discard(session, file.blob_key)
         own = set(session.scalars(select(PhotoRow.public_id).where(PhotoRow.lens_id == lens.id)))
         of_profiles = (PhotoRow.owner_id == lens.owner_id, PhotoRow.kind == PROFILE)
         before = set(session.scalars(select(PhotoRow.sha256).where(*of_profiles)))
-        imported = 0
         for (photo, settings), of_photo in groups.items():
             digest = hashlib.sha256(f"{PROFILE}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
             if photo not in own and digest not in before:
                 name = names.get(photo, photo or PROFILE)[:200]
                 _import(session, lens, settings, of_photo, sha256=digest, filename=name)
-                imported += 1
-        return imported
+        return True
 
 
 _FILED: Final = PhotoRow.file_gone_at.is_(None)  # of photos whose file is kept

@@ -36,7 +36,7 @@ PHOTO_UNFINISHED: Final = (*PHOTO_WORKED_ON, "needs_lens")
 CORRECTION_ACTIVE: Final = ("queued", "running")
 # Kind of a photo that is none: a file of samples for a lens, which a worker reads like a photo
 PROFILE_FILE: Final = "lensprofile"
-PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
+ENDED_BADLY: Final = ("failed", "cancelled")  # of photos and of corrections
 
 PATCH_STATES: Final = ("pending", "done", "rejected", "failed")
 CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)

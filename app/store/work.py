@@ -7,17 +7,16 @@ loses a race against a cancel, changes nothing the second time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Final, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.store.database import Repository, reads, writes
 from app.store.owners import ANY_OWNER, Owner, find_owned, find_to_change, now
-from app.store.tables import CorrectionRow, PhotoRow
+from app.store.tables import ENDED_BADLY, CorrectionRow, PhotoRow
 
 Row = TypeVar("Row", PhotoRow, CorrectionRow)
-ENDED_BADLY: Final = ("failed", "cancelled")
 
 
 class Works(Repository, Generic[Row]):

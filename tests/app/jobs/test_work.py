@@ -378,29 +378,24 @@ def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
     assert [sandbox.ran.count(task) for task in before] == [2 if task == dies_in else 1 for task in before]
 
 
-def test_a_photo_without_serial_waits_for_its_owner(
-    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any
+@pytest.mark.parametrize(
+    ("lacks", "says"),
+    [
+        ({"lens": LENS | {"serial": None, "serial_source": "none"}}, "choose a lens"),
+        ({"aperture": None}, "aperture"),
+    ],
+)
+def test_a_photo_without_serial_or_aperture_waits_for_its_owner(
+    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any, lacks: dict[str, Any], says: str
 ) -> None:
-    sandbox.answers["inspect"] = [changed(photo, lens=LENS | {"serial": None, "serial_source": "none"})]
+    sandbox.answers["inspect"] = [changed(photo, **lacks)]
 
     work(photo.public_id, 1)
 
     waiting = steps.fresh(photo)
     assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
-    assert "choose a lens" in waiting.error_detail
+    assert says in waiting.error_detail
     assert sandbox.ran == ["locate", "inspect"]
-
-
-def test_a_photo_without_aperture_waits_and_says_so(
-    work: Handler, photo: PhotoRow, sandbox: Scripted, steps: Any
-) -> None:
-    sandbox.answers["inspect"] = [changed(photo, aperture=None)]
-
-    work(photo.public_id, 1)
-
-    waiting = steps.fresh(photo)
-    assert waiting.state == "needs_lens"
-    assert "aperture" in waiting.error_detail
 
 
 def test_a_photo_to_be_stored_only_is_not_developed(

@@ -103,7 +103,9 @@ async def _stored(
             digest.update(piece)
             await blob.write(piece)
         if size == 0:
-            raise ServiceError(f"the file is empty: {REMEDY}", code="malformed_upload")
+            raise ServiceError(
+                "the file is empty; copy it again from the camera or card", code="malformed_upload"
+            )
         kind = kind or sniff(head)
     return digest.hexdigest(), size, kind
 

@@ -295,7 +295,11 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
     aspect, test = _aspect(call, row), _test(call, row)
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
     chosen = aperture or (apertures[0] if apertures else None)
-    question = {"size": 25, "aspect": aspect} | ({} if chosen is None else {"aperture": chosen})
+    found = None if test is None else test.at(chosen)
+    question = {
+        "size": shown.cell_px([] if found is None else [spot.kernel for spot in found.spots]),
+        "aspect": aspect,
+    } | ({} if chosen is None else {"aperture": chosen})
 
     def map_of(cells: int) -> str:
         rows = max(2, round(math.sqrt(cells / aspect)))
@@ -314,7 +318,7 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
         aperture=chosen,
         map_of=map_of,
         test=test,
-        found=None if test is None else test.at(chosen),
+        found=found,
     )
 
 

@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from app.http.dependencies import Call
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
@@ -24,6 +27,8 @@ NARROWEST_MM: Final = 10.0  # Width of the smallest sensor behind a mount (chose
 # Focal length in mm below which a lens that has no name is no separate one (chosen): fisheyes begin at 8 mm,
 # and those that have no contacts do not tell their aperture
 SHORTEST_MM: Final = 8.0
+CELLS_PX: Final = (9, 15, 25)  # of a map (chosen): in the least a point of a sharp lens fills a quarter
+CELL_SHARE: Final = 0.9  # of the light of a point that its cell shows (chosen): tails are too faint to see
 # Series of cameras without a mount whose sensors or focal lengths do not give them away
 _COMPACTS: Final = re.compile(
     r"powershot|ixus|coolpix|finepix|cybershot|^dsc(rx|hx|wx|h|w|t|p|s)\d|^dmc(f|t|l[cfx])|^dc(f|t|lx)|^x100"
@@ -67,11 +72,23 @@ def next_step(call: Call, listed: Sequence[PhotoOut], lenses: Sequence[LensOut])
     """Return the newest photo that is, or soon can be, corrected; None where it has been already."""
     known = {lens.id for lens in lenses if lens.samples}
     hopeful = [photo for photo in listed if photo.state not in {*HOPELESS, "excluded", "needs_lens"}]
+    hopeful = [photo for photo in hopeful if photo.lens_id]  # whose lens is asked for yet may wait for long
     photo = next((each for each in hopeful if each.state != "stored" or each.lens_id in known), None)
     if photo is None:
         return None
     corrections = correction_routes.list_corrections(call, limit=PHOTOS, photo_id=photo.id).items
     return photo if all(correction.roi for correction in corrections) else None  # of a part: a preview
+
+
+def cell_px(kernels: Sequence[ArrayLike]) -> int:
+    """Return the side of the cells of a map in pixels: the least that shows all of these kernels."""
+
+    def fits(side: int) -> bool:
+        shown = (np.asarray(kernel) for kernel in kernels)
+        margins = ((kernel, max(len(kernel) - side, 0) // 2) for kernel in shown)
+        return all(k[m : len(k) - m, m : len(k) - m].sum() >= CELL_SHARE * k.sum() for k, m in margins)
+
+    return next((side for side in CELLS_PX if kernels and fits(side)), CELLS_PX[-1])
 
 
 def waiting(call: Call) -> list[WaitingGroup]:

@@ -14,7 +14,7 @@ from app.schemas import CorrectionOut, LensOut, PhotoOut, Problem, Working
 from lensmodel.cli.console import gain_words
 from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
-from lensmodel.report import sharpness
+from lensmodel.report import caution, sharpness
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "In the queue",
@@ -241,5 +241,6 @@ def correctable(photo: PhotoOut) -> bool:
 # Templates use all of these as filters
 FILTERS: Final[Mapping[str, Callable[..., object]]] = {
     "sharpness": sharpness,
+    "caution": caution,
     **{name: made for name, made in globals().items() if getattr(made, "__module__", "") == __name__},
 }

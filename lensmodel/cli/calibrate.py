@@ -88,6 +88,8 @@ def calibrate(
     shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     target = files.named(profile)
     paths = files.photos(photos)
+    if others := files.passed_over(photos):
+        shown.note(f"passed over: {others}")
     files.refuse_photo(target, paths)
     with files.as_usage():
         config = sampling.Config(LensSettings(aperture=aperture), model, estimator, kernel_size, selector)
@@ -117,13 +119,13 @@ def calibrate(
                 bars.update(task, completed=len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
-    photo_count, sample_count = (len(lens.profile.photos), len(lens.samples)) if lens else (0, 0)
+    photo_count = len(lens.profile.photos) if lens else 0
     failed = [result for result in results if result["state"] == "failed"]
     shown.document(
         {
             "profile": str(target) if lens else None,
             "photos": photo_count,
-            "samples": sample_count,
+            "samples": len(lens.samples) if lens else 0,
             "coverage": coverage,
             "model": preset_of(lens.model).name if lens else None,
             "results": results,
@@ -131,7 +133,8 @@ def calibrate(
     )
     if lens is not None and len(failed) < len(results):
         cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
-        shown.result(f"{target}: photos {photo_count}, samples {sample_count} ({cover})")
+        places = sum(coverage.values())
+        shown.result(f"{target}: photos {photo_count}, blur measured at {places} places ({cover})")
     if lens is None:
         shown.error(
             "no photo could be used, so there is no profile; the lines above say what each photo needs"

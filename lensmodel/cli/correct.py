@@ -161,6 +161,8 @@ def correct(
     if profile is None and lens != "auto":
         raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
     targets, twice = outputs.targets_of(files.photos(photos), output, file_format)
+    if others := files.passed_over(photos):
+        shown.note(f"passed over: {others}")
     with files.as_usage():  # before any work
         if method is not None:
             deconvolvers.create(method)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,10 @@ from lensmodel.workflow.calibrating import LensStore
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import preset_of
 
+# Endings of pictures in folders that are told of where they are passed over (docs/formats.md)
+NOT_READ: Final = frozenset(
+    {".heic", ".heif", ".avif", ".webp", ".jxl", ".jp2", ".gif", ".bmp", ".psd", ".exr"}
+)
 # What phones add to the names of the files of one shot
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
 
@@ -34,8 +39,10 @@ def photos(names: Iterable[str]) -> list[Path]:
             inside = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
             matches = _originals(inside)
             if not matches:
+                others = passed_over([name])
                 raise UsageError(
                     f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
+                    + (f" (passed over: {others})" if others else "")
                 )
         elif path.is_file():
             matches = [path]
@@ -46,6 +53,20 @@ def photos(names: Iterable[str]) -> list[Path]:
         unique.update(dict.fromkeys(matches))
     raw = {_shot(p) for p in unique if p.suffix.lower() in RAW_ENDINGS}
     return [p for p in unique if p.suffix.lower() in RAW_ENDINGS or _shot(p) not in raw]
+
+
+def passed_over(names: Iterable[str]) -> str:
+    """Say which pictures of folders are not taken for their kind, and which folders inside hold photos."""
+    folders = [path for path in (Path(name).expanduser() for name in names) if path.is_dir()]
+    inside = [path for folder in folders for path in folder.iterdir() if not path.name.startswith(".")]
+    kinds = Counter(path.suffix[1:].upper() for path in inside if path.suffix.lower() in NOT_READ)
+    said = [f"{kind} files, which are not read: {count}" for kind, count in sorted(kinds.items())]
+    deeper = [
+        f"the photos in {path}: name it too"
+        for path in sorted(inside)
+        if path.is_dir() and _originals(each for each in path.iterdir() if each.suffix.lower() in ENDINGS)
+    ]
+    return "; ".join([*said, *deeper])
 
 
 def _originals(paths: Iterable[Path]) -> list[Path]:

@@ -65,7 +65,8 @@ def correct_folder(correction: Correction, profiles: Path, most: int) -> dict[st
             done = correction.photos(group.paths, lens, bar, task, begin=begin, more=more)
             results += done
             rows.append(_row(group, None if lens is None else target, count, done))
-    display.result(_table(rows))
+    if rows or not unread:
+        display.result(_table(rows))
     _say_more(display, rows, unread, {target.parent for target in correction.targets.values()}, profiles)
     return {"groups": rows, "results": results}
 
@@ -152,7 +153,7 @@ def _say_more(
     """Say what the table does not: what was not read, which lens is little known, and where files are."""
     if display.as_json:
         return
-    if unread:
+    if unread and rows:
         display.note(f"not in the table: files that could not be read, {unread}; see above why")
     for row in rows:
         if row["learned_from"] == 1:
@@ -217,9 +218,10 @@ class PhotoGroup:
 
     @property
     def camera(self) -> str:
-        """The body in words."""
-        said = self.shots[0].metadata
-        return camera_name(said.camera_maker, said.camera_model) or "unknown camera"
+        """The bodies in words."""
+        said = [shot.metadata for shot in self.shots]
+        names = (camera_name(one.camera_maker, one.camera_model) or "unknown camera" for one in said)
+        return ", ".join(dict.fromkeys(names))
 
     @property
     def lens(self) -> str:

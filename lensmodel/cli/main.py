@@ -150,7 +150,7 @@ def main() -> None:
     try:
         app(prog_name="lensmodel")  # also where `python -m lensmodel` runs it
     except InterruptedByUser as stopped:
-        name = signal.Signals(stopped.number).name
+        name = "Ctrl-C" if stopped.number == signal.SIGINT else signal.Signals(stopped.number).name
         text, status = (
             f"stopped by {name}; finished files are kept, nothing is half-written",
             128 + stopped.number,

@@ -147,7 +147,9 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
     except (OSError, SyntaxError, ValueError) as error:
         if segments.read(1):
             raise NotAnImageError("the JPEG has no frame header, or one without a size") from error
-        raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off") from error
+        raise TruncatedImageError(
+            "the JPEG ends inside its header; copy it again from the camera or card"
+        ) from error
     exif = TiffReader.open(image.info.get("exif", b""), 6)
     # a zero follows a byte of 0xFF in a scan, where the end is looked for: a thumbnail before it has its own
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0
@@ -183,7 +185,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     """Read the chunks; image data are skipped, not read."""
     first = bytes(buffer[8:33])
     if len(first) < 25:
-        raise TruncatedImageError("the PNG ends inside its header; the upload was cut off")
+        raise TruncatedImageError("the PNG ends inside its header; copy it again from the camera or card")
     if first[4:8] != b"IHDR" or zlib.crc32(first[4:21]) != struct.unpack(">I", first[21:])[0]:
         raise NotAnImageError("the PNG's header chunk is damaged")
     width, height, bits, colour = struct.unpack(">IIBB", first[8:18])
@@ -217,10 +219,14 @@ def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
     while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
         if len(head) < 8:
-            raise TruncatedImageError("the PNG ends before its end chunk; the upload was cut off")
+            raise TruncatedImageError(
+                "the PNG ends before its end chunk; copy it again from the camera or card"
+            )
         length, name = struct.unpack(">I4s", head)
         if at + 12 + length > len(buffer):
-            raise TruncatedImageError(f"the PNG ends inside chunk {name!r}; the upload was cut off")
+            raise TruncatedImageError(
+                f"the PNG ends inside chunk {name!r}; copy it again from the camera or card"
+            )
         if name == b"IEND":
             return
         if not name == before == b"IDAT":
@@ -259,7 +265,7 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     reader = TiffReader.open(buffer)
     chain = [] if reader is None else list(reader.chain())
     if reader is None or not chain:
-        raise TruncatedImageError("the TIFF has no readable directory; the upload was cut off")
+        raise TruncatedImageError("the TIFF has no readable directory; copy it again from the camera or card")
     every = list[tuple[int, Tags]]()
     for offset, tags in chain:
         children = tags.integers(SUB_DIRECTORIES, 16)
@@ -369,7 +375,7 @@ def _check_strips(tags: Tags, file_bytes: int) -> None:
     if not starts or len(starts) != len(lengths) or not _ends_inside(tags, file_bytes):
         raise TruncatedImageError(
             f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
-            "damaged; the upload was cut off"
+            "damaged; copy it again from the camera or card"
         )
     stored = width * height * tags.integer(277, 1) * max(tags.integer(258, 1), 1) / 8
     if tags.integer(259, 1) == 1 and sum(lengths) < 0.999 * stored:

@@ -74,7 +74,7 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
     if not header.whole:
         raise TruncatedImageError(
-            f"the {header.kind.upper()} ends before its picture does; the upload was cut off"
+            f"the {header.kind.upper()} ends before its picture does; copy it again from the camera or card"
         )
     if min(width, height) < MIN_SIDE:
         raise NotAnImageError(

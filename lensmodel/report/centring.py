@@ -33,6 +33,7 @@ from scipy import special
 
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.types import LensSettings
+from lensmodel.measured import is_measured
 from lensmodel.model import LensModel
 from lensmodel.report.places import direction_in_words
 
@@ -101,7 +102,8 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
         third = np.array([_third_moment(samples[i]) for i in inner])
         constant = np.concatenate([np.broadcast_to(np.eye(2), (len(inner), 2, 2)), h[inner, :, None]], axis=2)
         coma = _asymmetry(root[inner, :, None] * constant, root[inner] * third, photos[inner])
-    return _verdict(softer, coma, int(photos.max()) + 1)
+    measured = all(is_measured(sample) for sample in samples)
+    return _verdict(softer, coma, int(photos.max()) + 1, measured=measured)
 
 
 def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
@@ -160,7 +162,7 @@ def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
     return math.sqrt(float(variance.mean())), n - 1
 
 
-def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> Centring:
+def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int, *, measured: bool = False) -> Centring:
     photographs = "one photo" if photos == 1 else f"{photos} photos"
     signs = []
     if softer.significant and softer.amount > _SOFTER:
@@ -182,7 +184,8 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> Centring
         return Centring("decentred", f"decentred: {'; '.join(signs)}", softer, coma)
     sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
     figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
-    if sides + spread <= _UNSURE:
+    # a subject at a slant may hide a fault as it may feign one; a chart was photographed straight on
+    if sides + spread <= _UNSURE and (photos > 1 or measured):
         return Centring(
             "centred", f"well centred within what {photographs} can tell: {figures}", softer, coma
         )

@@ -70,7 +70,7 @@ _FALLS: Final = ((0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much 
 # MTF50 in cycles/pixel of the centre, and what it is called (chosen: an ideal pixel behind an ideal lens
 # reaches .6, a demosaiced photo about .3)
 _LEVELS: Final = (
-    (0.35, "as sharp as the sensor can show"),
+    (0.35, "very sharp"),
     (0.2, "sharp"),
     (0.1, "a little soft"),
     (0.0, "soft"),
@@ -84,6 +84,7 @@ _ZONE_WORDS: Final[dict[Zone, str]] = {
     "corner": "in the corners",
 }
 
+CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
 _NAMED: Final = 8  # photos that a report names (chosen: two lines)
 # Expected relative L2 of a kernel that another photo would not better by what is seen (chosen)
 _WELL_KNOWN: Final = 0.1
@@ -310,25 +311,31 @@ class LensReport:
             lines.append(
                 f"Too little is known of {first.unknown_share:.0%} of the picture; those figures are guesses."
             )
-        return (*lines, self.advice)
+        return (*lines, *filter(None, [self.details.get(CAUTION)]), self.advice)
 
 
 def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
+def caution(photos: Sequence[str]) -> str:
+    """Say of the file names of photos that cameras have sharpened some; nothing where none is a JPEG."""
+    jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in photos)
+    share = "" if jpegs == len(photos) else f" ({jpegs} of {len(photos)} photos)"
+    return (
+        f"Learned from JPEG files{share}: the camera's sharpening makes a lens look sharper." if jpegs else ""
+    )
+
+
 def provenance(serial: str | None, cameras: Iterable[str], photos: Sequence[str]) -> dict[str, str]:
     """Say on which copy and photos a report rests, when and by what it was written; a caveat for JPEG."""
     names = sorted(photos)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in names)
     details = {
         "Serial number": serial or "",
         "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
         "Photos": ", ".join(names[:_NAMED]) + more,
-        "Caution": f"{jpegs} of the photos are JPEG files: a camera's sharpening makes a lens look sharper"
-        if jpegs
-        else "",
+        CAUTION: caution(names),
         "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
     }
     return {name: words for name, words in details.items() if words}
@@ -525,7 +532,7 @@ def sharpness(found: ApertureReport) -> str:
     center, worst = found.spots[0].mean, found.worst
     figure = SensorGeometry().words(center, "c/px", found.spots[0].mean_range)
     level = next(words for least, words in _LEVELS if center >= least)
-    words = f"this copy is {level} in the centre (MTF50 {figure})"
+    words = f"this copy is {level} in the centre (MTF50 {figure} cycles/pixel)"
     share = worst.mean / max(center, 1e-6)
     # surely softer only where even the top of its range lies below the middle of the centre's
     sure = not worst.unknown and worst.mean_range[1] < center

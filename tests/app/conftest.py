@@ -47,20 +47,20 @@ class Steps:
         self.store, self.owner = store, owner
         self._numbers = itertools.count(1)
 
-    def receive(self, *, calibrate: bool = True, **given: Any) -> PhotoRow:
-        return self._receive(f"{next(self._numbers):064x}", calibrate=calibrate, given=given)
+    def receive(self, *, calibrate: bool = True, filename: str = "", **given: Any) -> PhotoRow:
+        return self._receive(f"{next(self._numbers):064x}", filename, calibrate=calibrate, given=given)
 
     def receive_again(self, photo: PhotoRow, **given: Any) -> PhotoRow:
-        return self._receive(photo.sha256, calibrate=photo.calibrate, given=given)
+        return self._receive(photo.sha256, photo.filename, calibrate=photo.calibrate, given=given)
 
-    def _receive(self, sha256: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
+    def _receive(self, sha256: str, filename: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
         public_id = new_id()
         self.store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
         return self.store.photos.receive(
             self.owner,
             public_id=public_id,
             sha256=sha256,
-            filename=f"p{int(sha256, 16)}.dng",
+            filename=filename or f"p{int(sha256, 16)}.dng",
             kind="dng",
             byte_size=1000,
             blob_key=f"photos/{public_id}/original",
@@ -106,8 +106,10 @@ class Steps:
         ]
         return self.store.photos.add_samples(photo.public_id, photo.epoch, samples)
 
-    def counted(self, *, patches: int = 2, width: float = 1.0, **options: Any) -> PhotoRow:
-        photo = self.receive()
+    def counted(
+        self, *, patches: int = 2, width: float = 1.0, filename: str = "", **options: Any
+    ) -> PhotoRow:
+        photo = self.receive(filename=filename)
         self.inspect(photo, **options)
         self.plan(photo, patches)
         self.estimate(photo, tuple(range(patches)), width=width)

@@ -26,7 +26,7 @@ from app.jobs.task_files import SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.pictures import in_sensor, turned_box
 from app.pages.routes import unused_name
-from app.pages.shown import grouped
+from app.pages.shown import cell_px, grouped
 from app.pages.words import held_map, plain
 from app.runtime.settings import Settings
 from app.schemas import Region
@@ -474,9 +474,9 @@ def test_what_was_learned_leads_to_correcting_until_it_was(
     client.post("/v1/corrections", json={"photo_id": photo.public_id})
     corrected = client.get("/ui/parts?page=home").text
 
-    for part in (first, working):
-        assert f"Next: correct {photo.filename}" in part
-        assert "as soon as this is done" in part
+    assert "Next: correct" not in first  # it may yet ask for its lens
+    assert f"Next: correct {photo.filename}" in working
+    assert "as soon as this is done" in working
     assert "Measuring blur: 1 of 2 places" in working.partition('id="next"')[2].partition("</section>")[0]
     assert f'<a class="button" href="/photos/{photo.public_id}">Correct this photo</a>' in ready
     assert "Next: correct" not in corrected
@@ -553,6 +553,23 @@ def test_two_measured_versions_make_a_curve(client: TestClient, steps: Steps, st
         curves.append('alt="Error after each version"' in client.get(f"/lenses/{lens}/tests").text)
 
     assert curves == [False, True]
+
+
+def test_the_cells_of_a_map_are_as_small_as_the_blur_allows() -> None:
+    sharp, soft, softest = (gaussian(31, np.eye(2) * sigma**2) for sigma in (0.8, 2.5, 6.0))
+
+    assert [cell_px(kernels) for kernels in ([sharp], [sharp, soft], [softest], [])] == [9, 15, 25, 25]
+
+
+def test_a_lens_of_jpegs_is_said_to_look_sharper(client: TestClient, steps: Steps) -> None:
+    words = "camera&#39;s sharpening makes a lens look sharper"
+    pages = []
+    for name in ("one.dng", "two.jpg"):
+        photo = steps.counted(filename=name)
+        pages.append(client.get(f"/lenses/{steps.lens_id(photo)}").text)
+
+    assert [words in page for page in pages] == [False, True]
+    assert "Learned from JPEG files (1 of 2 photos)" in pages[1]
 
 
 def test_a_photographer_reads_no_figures_in_a_verdict() -> None:

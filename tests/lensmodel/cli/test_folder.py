@@ -41,6 +41,9 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_photo(photos / "b.dng", 2, shape=SMALL)
     write_photo(photos / "c.dng", 3, serial="L-43", sigma=20.0, shape=SMALL)  # nothing to be learned from
     (photos / "broken.dng").write_bytes(b"no photo")
+    (photos / "phone.HEIC").write_bytes(b"another kind")
+    (photos / "day 2").mkdir()
+    shutil.copy(photos / "a.dng", photos / "day 2")
     samples = [
         PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
         for r in (0.1, 0.5, 0.9)
@@ -85,8 +88,32 @@ def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> Non
     errors = (journey / "errors.txt").read_text().splitlines()
 
     assert any("broken.dng" in line for line in errors)
+    passed_over = f"HEIC files, which are not read: 1; the photos in {Path('holiday', 'day 2')}: name it too"
+    assert any(passed_over in line for line in errors)
     (why,) = (line for line in errors if "#L-43" in line)
     assert "detail" in why
+
+
+def test_a_group_names_every_body_and_none_that_another_photo_names(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.jpg", tmp_path / "two.jpg"
+    Image.new("RGB", (64, 48)).save(one, exif=Image.Exif())
+    exif = Image.Exif()
+    exif[271] = "Maker Only"
+    Image.new("RGB", (64, 48)).save(two, exif=exif)
+
+    (group,) = groups([Shot.of(two), Shot.of(one)])
+
+    assert set(group.camera.split(", ")) == {"unknown camera", "Maker Only"}
+
+
+def test_nothing_but_unreadable_files_makes_no_table(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("no photo")
+
+    done = lensmodel("correct", "notes.txt", "--lens", "auto", cwd=tmp_path)
+
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "notes.txt" in done.stderr
+    assert "table" not in done.stderr
 
 
 def test_corrected_photos_are_beside_the_originals(journey: Path) -> None:
@@ -295,7 +322,7 @@ def _cut_picture(path: Path) -> None:
 
 USELESS = {
     "a.dng": (_without_aperture, "does not say its aperture"),
-    "b.dng": (_cut, "cut off"),
+    "b.dng": (_cut, "copy it again"),
     "c.dng": (_of_four_colours, "colours"),
     "d.dng": (_quad_bayer, "4 x 4"),
     "e.jpg": (_picture_without_aperture, "does not say its aperture"),

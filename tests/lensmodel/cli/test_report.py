@@ -122,7 +122,7 @@ def test_the_page_says_what_it_rests_on_and_names_a_maker_once() -> None:
         "Canon EOS 6D",
         "a.jpg, b.dng",
     )
-    assert found["Caution"].startswith("1 of the photos")
+    assert found["Caution"].startswith("Learned from JPEG files (1 of 2 photos): the camera's sharpening")
     assert not {"Caution", "Serial number"} & provenance(None, [], ["b.dng"]).keys()
     assert provenance(None, [], [f"{k}.dng" for k in range(20)])["Photos"].endswith("and 12 more")
     assert name_of({"maker": "Acme", "model": "ACME 42mm"}) == "ACME 42mm"

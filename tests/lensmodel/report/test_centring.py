@@ -200,6 +200,15 @@ def test_a_handful_of_samples_or_one_photo_cannot_tell(count: int, words: str) -
     assert words in found.text
 
 
+@pytest.mark.parametrize(("estimator", "verdict"), [("default", "unknown"), ("measured-edges", "centred")])
+def test_one_ordinary_photo_does_not_prove_a_lens_centred_and_a_chart_does(
+    estimator: str, verdict: str
+) -> None:
+    samples = [replace(s, estimator=estimator) for s in true_samples(aligned("coma"), 1, cells=(6, 8))]
+
+    assert centring(quick(samples), samples[0].settings).verdict == verdict
+
+
 @pytest.mark.parametrize(
     ("sides", "error", "verdict"),
     [(0.24, 0.10, "unknown"), (0.08, 0.05, "centred"), (0.48, 0.1, "unknown"), (8.95, 12.3, "unknown")],

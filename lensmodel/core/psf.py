@@ -144,7 +144,8 @@ def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDi
     a, b = a / a.sum(), b / b.sum()
     n = int(scipy.fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
     fa, fb = _centred_fft(a, n), _centred_fft(b, n)
-    peak, c = correlation_peak(fa * np.conj(fb))
+    cross = fa * np.conj(fb)
+    peak, c = correlation_peak(cross, whole_peak(cross))
     aa, bb = float((a * a).sum()), float((b * b).sum())
     freq = scipy.fft.fftfreq(n)
     inside = np.hypot(freq[:, None], freq[None, :]) <= 0.5
@@ -157,18 +158,27 @@ def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDi
     )
 
 
-def correlation_peak(cross: npt.NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
-    """Shift `(row, col)` at which the correlation of two square arrays is largest, and its value there.
+def whole_peak(cross: npt.NDArray[np.complex128]) -> tuple[int, int]:
+    """Whole pixels `(row, col)` by which the first of two square arrays lies beyond the other.
 
-    `cross` is their cross spectrum A conj(B), of the full FFT; the shift says how far a lies beyond b. It is
-    found on whole pixels, then between them by Newton steps on the Fourier series::
+    `cross` is their cross spectrum A conj(B), of the full FFT.
+    """
+    n, surface = len(cross), scipy.fft.ifft2(cross).real
+    row, col = (np.array(np.unravel_index(surface.argmax(), surface.shape)) + n // 2) % n - n // 2
+    return int(row), int(col)
+
+
+def correlation_peak(
+    cross: npt.NDArray[np.complex128], near: tuple[int, int]
+) -> tuple[tuple[float, float], float]:
+    """Shift `(row, col)` near whole pixels at which a correlation peaks, and its value there.
+
+    It is found by Newton steps on the Fourier series::
 
         c(d) = 1/n² sum_f cross(f) exp(2 pi i f d)
     """
-    n = len(cross)
-    surface = scipy.fft.ifft2(cross).real
-    whole = (np.array(np.unravel_index(surface.argmax(), surface.shape)) + n // 2) % n - n // 2
-    d, freq = whole.astype(np.float64), 2.0 * np.pi * scipy.fft.fftfreq(n)
+    n, d = len(cross), np.array(near, dtype=np.float64)
+    freq = 2.0 * np.pi * scipy.fft.fftfreq(n)
 
     def phased() -> npt.NDArray[np.complex128]:
         return cross * np.outer(np.exp(1j * freq * d[0]), np.exp(1j * freq * d[1]))

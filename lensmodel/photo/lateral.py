@@ -12,7 +12,7 @@ from scipy import fft, ndimage, optimize
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import correlation_peak
+from lensmodel.core.psf import correlation_peak, whole_peak
 from lensmodel.core.types import Channel, Plane, Planes
 
 Polynomial = tuple[float, float, float, float]
@@ -171,17 +171,19 @@ def _shift(moved: NDArray[np.float64], reference: NDArray[np.float64]) -> tuple[
     The second window follows the whole-pixel shift, so that the taper cuts both the same.
     """
     inner = slice(_SEARCH, _SEARCH + _WINDOW)
-    still, whole, part = reference[inner, inner] * _TAPER, (0, 0), (0.0, 0.0)
-    for _ in range(2):
-        whole = (whole[0] + round(part[0]), whole[1] + round(part[1]))
-        if max(map(abs, whole)) >= _SEARCH:
-            return None
+    still, whole = fft.fft2(tapered := reference[inner, inner] * _TAPER), (0, 0)
+    for tries_left in (2, 1, 0):
         rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
         cut = moved[rows, cols] * _TAPER
-        part, _ = correlation_peak(fft.fft2(cut) * np.conj(fft.fft2(still)))
-        if max(map(abs, part)) <= 0.5:
+        cross = fft.fft2(cut) * np.conj(still)
+        step = whole_peak(cross)
+        if step == (0, 0) or not tries_left:
             break
-    likeness = float((cut * still).sum() / math.sqrt((cut**2).sum() * (still**2).sum() + 1e-30))
+        whole = (whole[0] + step[0], whole[1] + step[1])
+        if max(map(abs, whole)) >= _SEARCH:
+            return None
+    likeness = float((cut * tapered).sum() / math.sqrt((cut**2).sum() * (tapered**2).sum() + 1e-30))
+    part, _ = correlation_peak(cross, (0, 0))
     if likeness < _MIN_CORRELATION or max(map(abs, part)) > 1.0:
         return None
     return whole[0] + part[0], whole[1] + part[1]

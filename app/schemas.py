@@ -127,18 +127,13 @@ Ended = Literal["counted", "stored", "excluded", "failed", "cancelled"]
 PhotoState = Literal[Working, "needs_lens", Ended]
 
 
-class Settings(Question):
-    """At which settings of its lens a photo was taken."""
+class Taken(Question):
+    """With which lens a photo was taken, and at which settings."""
 
     aperture: Aperture | None = None
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
     pixel_pitch_um: PixelPitch | None = None
-
-
-class Taken(Settings):
-    """With which lens a photo was taken, and at which settings."""
-
     lens_id: Id | None = None
     lens_serial: Name | None = None
     lens_model: Name | None = None
@@ -175,11 +170,10 @@ class PhotoChange(Taken):
     calibrate: bool | None = Field(None, description="true: learn the lens from a photo that was only stored")
 
 
-class PhotosChange(Settings):
+class PhotosChange(Taken):
     """What to say of several photos at once: which lens it was, and at which settings."""
 
     photo_ids: list[Id] = Field(min_length=1, max_length=1000)
-    lens_id: Id | None = None
     new_lens: NewLens | None = None
 
 

@@ -243,18 +243,13 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     now known. A counted one changes its lens's model at once.
     """
     photo = call.photo(photo_id)
-    if not change.model_fields_set:
-        raise InvalidParameterError(
-            "nothing to change: send lens_id, new_lens, aperture, excluded or another field"
-        )
-    given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    lens = _target_lens(call, photo, change)
+    asked = _asked(call, photo, change)
     if change.calibrate is False:
         raise InvalidParameterError("calibrate=false: send excluded=true to take a photo out of its lens")
     if change.calibrate and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
     done = call.store.photos.change(
-        [photo_id], call.owner, given, lens=lens, excluded=change.excluded, calibrate=bool(change.calibrate)
+        [photo_id], call.owner, **asked, excluded=change.excluded, calibrate=bool(change.calibrate)
     )
     photo = call.photo(photo_id)
     if not done:
@@ -265,39 +260,31 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
     return views.photo_out(photo)
 
 
-def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName | str | None:
-    ways = (change.lens_id, change.lens_serial, change.new_lens)
-    if sum(way is not None for way in ways) > 1:
-        raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
-    if change.lens_id is not None:
-        return call.lens(change.lens_id).public_id
-    maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
-    if change.new_lens is not None:
-        return LensName(maker, model, None, label=change.new_lens.label)
-    if change.lens_serial is not None:
-        return LensName(maker, model, change.lens_serial)
-    if change.lens_model is not None or change.lens_maker is not None:
-        raise InvalidParameterError("lens_model alone does not tell copies apart: send lens_serial with it")
-    return None
-
-
 @router.patch("/photos")
 def change_photos(change: PhotosChange, call: CallDep) -> Page[PhotoOut]:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 
     Each photo changes as by itself; where one is gone nothing changes.
     """
-    if not change.model_fields_set - {"photo_ids"}:
-        raise InvalidParameterError("send lens_id or new_lens, or the settings of these photos")
-    if change.lens_id is not None:
-        if change.new_lens is not None:
-            raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
-        call.lens(change.lens_id)
     keys = list(dict.fromkeys(change.photo_ids))
-    given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    lens: LensName | str | None = change.lens_id
-    if change.new_lens is not None:
-        first = call.photo(keys[0])
-        lens = LensName(first.lens_maker, first.lens_model, None, label=change.new_lens.label)
-    call.store.photos.change(keys, call.owner, given, lens=lens)
+    call.store.photos.change(keys, call.owner, **_asked(call, call.photo(keys[0]), change))
     return Page[PhotoOut](items=[views.photo_out(call.photo(key)) for key in keys])
+
+
+def _asked(call: Call, photo: PhotoRow, change: PhotoChange | PhotosChange) -> dict[str, Any]:
+    """Return the settings and the lens that a change names, the lens as one like that of `photo`."""
+    if not change.model_fields_set - {"photo_ids"}:
+        raise InvalidParameterError("nothing to change: send lens_id, new_lens, aperture or another field")
+    if sum(way is not None for way in (change.lens_id, change.lens_serial, change.new_lens)) > 1:
+        raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
+    maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
+    lens: LensName | str | None = None
+    if change.lens_id is not None:
+        lens = call.lens(change.lens_id).public_id
+    elif change.new_lens is not None:
+        lens = LensName(maker, model, None, label=change.new_lens.label)
+    elif change.lens_serial is not None:
+        lens = LensName(maker, model, change.lens_serial)
+    elif change.lens_model is not None or change.lens_maker is not None:
+        raise InvalidParameterError("lens_model alone does not tell copies apart: send lens_serial with it")
+    return {"given": change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True), "lens": lens}

@@ -1,4 +1,4 @@
-"""What several routes share: look-ups, pages, files, and how answers are described."""
+"""What several routes share: parameters, files, refusals of another lens, descriptions of answers."""
 
 from __future__ import annotations
 

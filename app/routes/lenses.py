@@ -48,21 +48,19 @@ def list_lenses(
 ) -> Page[LensOut]:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
-    described = dict(zip([row.id for row in rows], _described(call, rows), strict=True))
-    return call.page(rows, limit, lambda row: described[row.id])
-
-
-def _described(call: Call, rows: list[LensRow]) -> list[LensOut]:
     coverage = call.store.lenses.coverage_of(rows)
-    return [
-        LensOut.of(row, apertures=coverage[row.id][0], focal_lengths_mm=coverage[row.id][1]) for row in rows
-    ]
+    return call.page(rows, limit, lambda row: _lens_out(row, *coverage[row.id]))
 
 
 @router.get("/lenses/{lens_id}")
 def get_lens(lens_id: str, call: CallDep) -> LensOut:
     """Return one lens."""
-    return _described(call, [call.lens(lens_id)])[0]
+    lens = call.lens(lens_id)
+    return _lens_out(lens, *call.store.lenses.coverage_of([lens])[lens.id])
+
+
+def _lens_out(row: LensRow, apertures: list[float], focals: list[float]) -> LensOut:
+    return LensOut.of(row, apertures=apertures, focal_lengths_mm=focals)
 
 
 @router.post("/lenses", status_code=201)

@@ -6,7 +6,7 @@ import io
 import json
 from dataclasses import replace
 from statistics import median
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Response
 from starlette.concurrency import run_in_threadpool
@@ -119,30 +119,22 @@ def get_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     the corners cannot spoil it.
     """
     lens = call.lens(lens_id)
-    lateral = call.store.lenses.lateral_of(lens)
-    red, blue = (_measured(lateral, colour) for colour in ("red", "blue"))
-    if not red or not blue:
+    shifts = call.store.lenses.lateral_of(lens)
+    # of photos with measured points: those of the others are zero by default
+    known = {
+        colour: [shift[colour] for shift in shifts if shift[f"{colour}_points"] > 0]
+        for colour in ("red", "blue")
+    }
+    if not all(known.values()):
         raise NoSamplesError(
             f"lens {lens_id} has no photo whose lateral colour could be measured: "
             "upload one in colour with detail near its corners"
         )
-    return LateralOut(
-        lens_id=lens.public_id,
-        version=lens.version,
-        photos=min(len(red), len(blue)),
-        red=_middle(red),
-        blue=_middle(blue),
-    )
-
-
-def _measured(entries: list[dict[str, Any]], colour: str) -> list[list[float]]:
-    """Return the polynomials of photos with measured points; those of the others are zero by default."""
-    return [entry[colour] for entry in entries if entry[f"{colour}_points"] > 0]
-
-
-def _middle(polynomials: list[list[float]]) -> tuple[float, float, float, float]:
-    a, b, c, v = (median(terms) for terms in zip(*polynomials, strict=True))
-    return a, b, c, v
+    middles = {
+        colour: [median(terms) for terms in zip(*those, strict=True)] for colour, those in known.items()
+    }
+    about = {"lens_id": lens_id, "version": lens.version, "photos": min(map(len, known.values()))}
+    return LateralOut.model_validate({**about, **middles})
 
 
 # --- profiles -----------------------------------------------------------------------------------------

@@ -117,23 +117,21 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
 
 def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
     """Refuse contradictory fields of a photo made to measure a lens."""
-    if measured and fields.kind is None:
-        raise InvalidParameterError("kind is missing: send target, pair, points or edges")
-    if fields.kind is not None and not fields.calibrate:
-        raise InvalidParameterError("calibrate=false and kind exclude each other: leave one of them out")
-    if (fields.kind == "pair") != (fields.reference_id is not None):
-        raise InvalidParameterError(
-            "a pair needs kind=pair and reference_id together: send the photo at about f/8 first, with "
-            "calibrate=false, and its id as reference_id with the open one"
-        )
+    selector, pair = fields.selector, fields.kind == "pair"
+    contradictions = {
+        "kind is missing: send target, pair, points or edges": measured and fields.kind is None,
+        "calibrate=false and kind exclude each other: leave one out": fields.kind and not fields.calibrate,
+        "a pair needs kind=pair and reference_id together: send the photo at about f/8 first, with "
+        "calibrate=false, and its id as reference_id with the open one": pair != bool(fields.reference_id),
+        "selector and kind exclude each other: leave one out": selector and fields.kind,
+        f"no selector {selector!r:.60}; known: {', '.join(selectors)}": selector
+        and selector not in selectors,
+    }
+    for why, holds in contradictions.items():
+        if holds:
+            raise InvalidParameterError(why)
     if fields.reference_id is not None:
         call.photo(fields.reference_id)
-    if fields.selector is not None:
-        if fields.kind is not None:
-            raise InvalidParameterError("selector and kind exclude each other: leave one out")
-        if fields.selector not in selectors:
-            known = ", ".join(selectors)
-            raise InvalidParameterError(f"no selector {fields.selector[:60]!r}; known: {known}")
 
 
 def _admit(call: Call) -> None:

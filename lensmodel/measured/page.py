@@ -173,14 +173,18 @@ def print_target(path: str | Path, page: TargetPage, *, paper: str = "a3") -> No
         if path.suffix.lower() == ".png":
             picture.save(file, "PNG", dpi=(dpi, dpi))
         else:  # at its best JPEG errs by one of 255 levels, a quarter of the distance between two greys
-            picture.save(file, "PDF", resolution=dpi, quality=100)
+            picture.save(file, "PDF", resolution=dpi, quality=100, title=_name(page, paper))
+
+
+def _name(page: TargetPage, paper: str) -> str:
+    return f"lensmodel target, detail {page.detail}, {paper.upper()}"
 
 
 def _greys(page: TargetPage, paper: str) -> Image.Image:
     """The raster with its name in the lower border."""
     steps = np.rint(page.raster * (_GREYS - 1)) * (255.0 / (_GREYS - 1))
     picture = Image.fromarray(np.rint(steps).astype(np.uint8))
-    text = f"lensmodel target, detail {page.detail}, {paper.upper()}: print at full size, grey, unsharpened"
+    text = f"{_name(page, paper)}: print at full size, grey, unsharpened"
     height = max(page.border * DOTS // 2, 10)
     place = (page.shape[1] * DOTS // 2, picture.height - page.border * DOTS // 2)
     ImageDraw.Draw(picture).text(place, text, fill=96, font_size=height, anchor="mm")

@@ -149,6 +149,7 @@ def test_a_target_is_written_to_print(tmp_path: Path, suffix: str) -> None:
         box = re.search(rb"/MediaBox \[ 0 0 (\S+) (\S+) \]", data)
         assert box is not None
         assert [float(side) for side in box.groups()] == pytest.approx([841.89, 595.28], rel=0.002)  # points
+        assert "lensmodel target, detail 300, A4".encode("utf-16-be") in data  # as printing names it
         start = data.index(b"stream\n", data.index(b"/DCTDecode")) + len(b"stream\n")
         data = data[start:]
     with Image.open(io.BytesIO(data)) as picture:

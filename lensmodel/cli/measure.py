@@ -176,10 +176,11 @@ def _developed(
     """Develop the photos of a measurement; write to a folder which edges are seen on the first."""
     photos = [develop(group[0], on_info=on_info), *map(develop, group[1:])]
     if show is not None:
-        from lensmodel.report.chart_edges import edge_pages, edges_csv  # noqa: PLC0415 - matplotlib, an extra
+        # matplotlib, an extra
+        from lensmodel.report.chart_edges import edge_pages, edges_csv, in_reading_order  # noqa: PLC0415
         from lensmodel.report.plots import to_pdf, to_png  # noqa: PLC0415 - as above
 
-        edges = chart_edges(photos[0])
+        edges = in_reading_order(chart_edges(photos[0]))
         pages = edge_pages(photos[0], edges)
         show.mkdir(parents=True, exist_ok=True)
         contents = (to_pdf(pages), to_png(pages[0]), edges_csv(photos[0], edges).encode())

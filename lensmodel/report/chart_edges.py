@@ -29,7 +29,21 @@ _INKS: Final[dict[Direction, str]] = {"tangential": "#b45309", "sagittal": "#0b6
 _COLUMNS, _ROWS = 4, 6  # edges on a page (chosen: curves are still read in print)
 _PAGE: Final = (11.69, 8.27)  # inches: A4, lying
 _WIDE: Final = 1600  # pixels of the chart on the page (chosen)
+_APART_PX: Final = 32.0  # between the middles of edges of two rows: half the smallest square (chosen)
 _PROFILE_PX: Final = 8.0  # pixels of a profile on each side: where its curve is (chosen)
+
+
+def in_reading_order(edges: Sequence[FoundEdge]) -> list[FoundEdge]:
+    """Order edges by the rows of their chart, which may lean, from the top left."""
+    quarter = math.pi / 2.0
+    lean = np.median([(edge.response.normal + quarter / 2.0) % quarter - quarter / 2.0 for edge in edges])
+    middles = np.array([edge.middle for edge in edges])
+    down = middles @ (math.cos(lean), math.sin(lean))  # (row, col), the angle counter-clockwise
+    along = middles @ (-math.sin(lean), math.cos(lean))
+    order = np.argsort(down, kind="stable")
+    rows = np.empty(len(edges), dtype=int)
+    rows[order] = np.cumsum(np.diff(down[order], prepend=down[order[0]]) > _APART_PX)
+    return [edges[k] for k in np.lexsort((along, rows))]
 
 
 def edge_pages(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> list[Figure]:

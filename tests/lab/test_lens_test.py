@@ -20,7 +20,7 @@ from lensmodel.measured.edges import SlantedEdges, chart_edges, squares_of
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality import find_edges, tangential_sagittal_mtf50
 from lensmodel.quality.edge import direction_of
-from lensmodel.report.chart_edges import edge_pages, edges_csv
+from lensmodel.report.chart_edges import edge_pages, edges_csv, in_reading_order
 from lensmodel.simulate import Aberrations, SimulatedCamera, SimulatedLens, photograph, write_photo
 
 CAMERA = SimulatedCamera(height=1000, width=1500)
@@ -131,7 +131,12 @@ def test_an_edge_between_the_two_directions_is_neither() -> None:
 
 def test_each_edge_can_be_looked_at(chart: tuple[LinearPhoto, tuple[Square, ...]]) -> None:
     photo, _ = chart
-    edges = chart_edges(photo)
+    edges = in_reading_order(chart_edges(photo))
+
+    heights, steps = np.array([edge.middle for edge in edges]).T
+    down, right = np.diff(heights), np.diff(steps)
+    assert (right > 0).sum() >= len(edges) - 15  # of five rows of squares with edges at three heights
+    assert (down[right > 0] < 32).all()  # the chart leans up to the right
 
     rows = list(csv.DictReader(io.StringIO(edges_csv(photo, edges))))
     drawn = edge_pages(photo, edges)

@@ -39,7 +39,7 @@ FAILURES: Final[Mapping[str, str]] = {
     "raw_decode_failed": "the RAW data cannot be read. It may be damaged, or the camera too new",
     "decompression_bomb": "it would unpack to far more than any photo holds",
     "memory_limit": "it needs more memory than the service may use",
-    "time_limit": "it took longer than the service allows",
+    "time_limit": "it took longer than the service allows. It may fit when the machine has less to do",
     "crashed_repeatedly": "reading it failed again and again. The file is probably damaged",
 }
 ZONES: Final[Mapping[str, str]] = {"center": "Centre", "mid": "Middle", "corner": "Corners"}

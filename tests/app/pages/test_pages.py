@@ -339,7 +339,8 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     learn.click()
 
     expect(page.locator(".group")).to_have_count(0)
-    expect(page.locator("#next-title")).to_be_focused()
+    # the next correction is offered once the service has looked at a photo again: before, its list has the focus
+    expect(page.locator("#next-title:focus, #photos-title:focus")).to_have_count(1)
     assert [url.rpartition("/v1/")[2] for url in wishes] == ["photos"]
     for photo in sent:
         job = service.job(photo["id"], until=lambda job: job["state"] == "waiting")

@@ -339,7 +339,7 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     learn.click()
 
     expect(page.locator(".group")).to_have_count(0)
-    # the next correction is offered once the service has looked at a photo again: before, its list has the focus
+    # no correction is offered until the service has looked at a photo again: the list has the focus before
     expect(page.locator("#next-title:focus, #photos-title:focus")).to_have_count(1)
     assert [url.rpartition("/v1/")[2] for url in wishes] == ["photos"]
     for photo in sent:

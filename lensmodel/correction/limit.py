@@ -18,21 +18,29 @@ from lensmodel.correction.clipped import compact
 from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.devices import chosen
-from lensmodel.correction.limit_on_device import (
-    COLOURLESS,
-    EDGE_SHARE,
-    HUE_REACH,
-    LEVEL,
-    LINE_SHARE,
-    PURER,
-    REACH,
-    TINY,
-    held_on_device,
-)
 
 Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+REACH: Final = 2
+"""Radius in pixels of the window whose light bounds a pixel (chosen: within one pixel only the blur of a thin
+line is seen and not its surroundings; further away lies another object)."""
+LEVEL: Final = 0.1
+"""Share of the range within which pixels belong to the level beside an edge (chosen: far more than noise)."""
+LINE_SHARE, EDGE_SHARE = 0.12, 0.25
+"""Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
+is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
+HUE_REACH: Final = 2
+"""Radius of the window whose colours a pixel may have (chosen: with 3, more blocks of foliage lose)."""
+PURER: Final = 0.01
+"""By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
+out get purer, and three times this shows in a light grey)."""
+COLOURLESS: Final = 0.05
+"""Share of the brightest light nearby that is added as grey to what lends its colour: what is far darker
+shows none beside it (chosen)."""
+OWN_COLOURLESS: Final = 0.02
+"""The same for the pixel itself (chosen: with more, letters in black get green)."""
+TINY: Final = 1e-5  # light, as seen, below which there is none
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
 )
@@ -52,6 +60,7 @@ _EDGE, _UNSURE = 0.06, 0.1
 which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
 _EXACT: Final = 0.02
 """Least error of a kernel that is reckoned with: none is known better over a whole tile (chosen)."""
+_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below it (chosen)
 _FREE: Final = 1e6  # stands for no bound where infinity would make differences undefined
 _DARKEST: Final = 0.5
 """Share of the darkest light nearby that remains where the kernel is unsure (chosen: one stop)."""
@@ -121,8 +130,10 @@ def limited(
     of the blur and some more, each colour stays below the photo's most within 1 pixel and above its least
     within 3, of lamps and white areas within 2; near white areas it gets no brighter. Broad clipped areas
     stay as they are, white ones in all colours. Colour, the shares of red, green and blue in the light, is
-    drawn towards the photo's own at the same place until their differences lie in the photo's range within 3
-    pixels; the light stays.
+    drawn towards the photo's own at the same place until their differences lie in the photo's range within 2
+    pixels; the light stays. At last each colour, as seen, leaves its own range within 2 pixels by no more
+    than the span of a line, at least by the width of that range and around lamps by no more: where a colour
+    has next to no light, its noise shows. What is white all around gets no darker.
 
     Parameters
     ----------
@@ -156,18 +167,25 @@ def limited(
         number = clipped.sum(axis=0, dtype=np.float32)
         kinds = np.maximum(np.minimum(number, 1.0), np.float32(2.0) * ((number > 1.0) | solved))
         glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
+        _inside_white(photo, held, np.float32(_CLIPPED) * clip)
         _beside_lamps(photo, held, broad | white, kinds, white.astype(np.float32), glow, near)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
     most = np.empty(shape, dtype=np.float32)
     device = chosen()
     if device is not None and number.size == 0:
+        from lensmodel.correction.limit_on_device import held_on_device  # noqa: PLC0415 - needs the numbers above
+
         colourless = _SIGMAS * dark + 1e-6
         held = held_on_device(device, photo, held, near, wide, (room, edge), float(darkest), colourless)
     else:
         shares = (np.float32(room), np.float32(edge))
         _hold_light(photo, held, near, wide, shares, darkest, most)
         _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6))
-    if halo is not None and halo < _FREE:
+    if halo is None:
+        own = np.where(near, np.float32(1.0), np.float32(max(room, 1.0)))
+        for plane, made, sensor in zip(photo, held, sensors, strict=True):
+            _hold_own(plane, made, own, np.float32(_SIGMAS * sensor.noise.sigma_at(0.0)))
+    elif halo < _FREE:
         low, high = np.empty_like(photo), np.empty_like(photo)
         for c in range(len(photo)):
             extremes(photo[c], photo[c], REACH, low[c], high[c])
@@ -318,6 +336,41 @@ def _hold_light(
 
 
 @jit
+def _inside_white(y: Real, x: Real, clip: Real) -> None:
+    """Keep a pixel that clips in all colours, with all around it, from getting darker, in place."""
+    rows, cols = y.shape[1:]
+    one = np.float32(1.0)
+    white, inside = np.ones((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    for c in range(3):
+        for i in range(rows):
+            for j in range(cols):
+                white[i, j] *= np.float32(y[c, i, j] >= clip[c])
+    extremes(white, white, 1, inside, white.copy())
+    for c in range(3):
+        for i in range(rows):
+            for j in range(cols):
+                x[c, i, j] = max(x[c, i, j], y[c, i, j]) if inside[i, j] == one else x[c, i, j]
+
+
+@jit
+def _hold_own(y: Real, x: Real, room: Real, dark: Number) -> None:
+    """Hold one colour within its own range within 2 pixels, widened, in place."""
+    rows, cols = y.shape
+    zero = np.float32(0.0)
+    seen = np.empty((rows, cols), np.float32)
+    low, high = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            seen[i, j] = np.sqrt(max(y[i, j], zero) + dark)
+    extremes(seen, seen, REACH, low, high)
+    for i in range(rows):
+        for j in range(cols):
+            more = room[i, j] * (high[i, j] - low[i, j])
+            least, most = max(low[i, j] - more, zero), high[i, j] + more
+            x[i, j] = min(max(x[i, j], least * least - dark), most * most - dark)
+
+
+@jit
 def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow: int, near: Mask) -> None:
     """Hold each colour around clipped light and lamps within that of the photo, in place; mark where that is.
 
@@ -360,7 +413,7 @@ def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
 
 
 @jit
-def _hold_colour(  # noqa: C901 - one pass over the tile, row by row
+def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
     y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number
 ) -> None:
     """Draw the colours of `x` into the range of those of `y` nearby, in place.
@@ -399,6 +452,8 @@ def _hold_colour(  # noqa: C901 - one pass over the tile, row by row
                 for j in range(cols):
                     low[k, j] = min(low[k, j], lows[row % side, k, j])
                     high[k, j] = max(high[k, j], highs[row % side, k, j])
+        for j in range(cols):
+            floors[i, j] = max(dark, np.float32(OWN_COLOURLESS / COLOURLESS) * floors[i, j])
         _axes(x, floors[i], i, made, there)
         _axes(y, floors[i], i, own, here)
         if lost:
@@ -408,7 +463,7 @@ def _hold_colour(  # noqa: C901 - one pass over the tile, row by row
             for j in range(cols):
                 step = there[k, j] - here[k, j]
                 room = high[k, j] - here[k, j] if step > zero else here[k, j] - low[k, j]
-                share[j] = min(share[j], (room + purer) / max(abs(step), np.float32(1e-6)))
+                share[j] = min(share[j], (max(room, zero) + purer) / max(abs(step), np.float32(1e-6)))
         for j in range(cols):
             t = one if kept[j] else max(share[j], zero)
             floor, grey = floors[i, j], floors[i, j] * np.float32(1.0 / 3.0)

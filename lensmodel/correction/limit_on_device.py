@@ -5,30 +5,23 @@ Both share these numbers, and differ by the rounding of single precision.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.correction.devices import Array, Device
-
-REACH: Final = 2
-"""Radius in pixels of the window whose light bounds a pixel (chosen: within one pixel only the blur of a thin
-line is seen and not its surroundings; further away lies another object)."""
-LEVEL: Final = 0.1
-"""Share of the range within which pixels belong to the level beside an edge (chosen: far more than noise)."""
-LINE_SHARE, EDGE_SHARE = 0.12, 0.25
-"""Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
-is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
-HUE_REACH: Final = 3
-"""Radius of the window whose colours a pixel may have: as far as lateral colour moves them."""
-PURER: Final = 0.03
-"""By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
-out get purer, and three times this shows in a light grey)."""
-COLOURLESS: Final = 0.05
-"""Share of the brightest light nearby that is added as grey: what is far darker shows no colour beside it
-(chosen)."""
-TINY: Final = 1e-5  # light, as seen, below which there is none
+from lensmodel.correction.limit import (
+    COLOURLESS,
+    EDGE_SHARE,
+    HUE_REACH,
+    LEVEL,
+    LINE_SHARE,
+    OWN_COLOURLESS,
+    PURER,
+    REACH,
+    TINY,
+)
 
 
 def held_on_device(
@@ -47,7 +40,7 @@ def held_on_device(
     seen = xp.sqrt(xp.clip(light, 0.0, None))
     least, most = _around(xp, xp.minimum, seen, REACH), _around(xp, xp.maximum, seen, REACH)
     x = _light_held(xp, y, x, light, (least, most), device.send(free), wide, shares, darkest)
-    return device.fetch(_colour_held(xp, y, x, _around(xp, xp.maximum, most, 1), dark))
+    return device.fetch(_colour_held(xp, y, x, _around(xp, xp.maximum, most, HUE_REACH - REACH), dark))
 
 
 def _light_held(
@@ -97,18 +90,21 @@ def _levels(xp: Any, light: Array, wide: int) -> tuple[Array, ...]:  # noqa: ANN
 
 
 def _colour_held(xp: Any, y: Array, x: Array, brightest: Array, dark: float) -> Array:  # noqa: ANN401 - same
-    floor = xp.clip(3.0 * COLOURLESS * brightest**2, dark, None)
+    lending, floor = (
+        xp.clip(3.0 * share * brightest**2, dark, None) for share in (COLOURLESS, OWN_COLOURLESS)
+    )
 
-    def shares_of(planes: Array) -> tuple[Array, Array, Array]:
+    def shares_of(planes: Array, floor: Array) -> tuple[Array, Array, Array]:
         light = xp.clip(planes, 0.0, None)
         total = xp.sum(light, axis=0) + floor
         shares = (light + floor / 3.0) / total
         return shares, shares - xp.roll(shares, -1, axis=0), total
 
-    (own, here, _), (made, there, total) = shares_of(y), shares_of(x)
-    low, high = (_around(xp, of, here, HUE_REACH) for of in (xp.minimum, xp.maximum))
+    (own, here, _), (made, there, total) = shares_of(y, floor), shares_of(x, floor)
+    _, lent, _ = shares_of(y, lending)
+    low, high = (_around(xp, of, lent, HUE_REACH) for of in (xp.minimum, xp.maximum))
     step = there - here
-    room = xp.where(step > 0.0, high - here, here - low)
+    room = xp.clip(xp.where(step > 0.0, high - here, here - low), 0.0, None)
     share = xp.clip(xp.min((room + PURER) / xp.clip(xp.abs(step), 1e-6, None), axis=0), 0.0, 1.0)
     return xp.where(share < 1.0, (own + share * (made - own)) * total - floor / 3.0, x)
 

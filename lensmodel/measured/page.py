@@ -12,7 +12,7 @@ Source of the idea: N. Joshi et al., "PSF estimation using sharp edge prediction
 M. Delbracio et al., IJCV 96, 2012, section 4, who show that white noise is the target that determines
 a PSF best.
 
-It is printed from a PNG or PDF, in 64 greys so that the file stays small.
+It is printed from a PNG or PDF, in 64 greys: noise does not compress, and more make the file larger still.
 """
 
 from __future__ import annotations

@@ -127,7 +127,8 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
 
     assert steps.estimate(photo) == 0
     store.photos.set_state(photo.public_id, ("received",), "selecting")
-    assert store.photos.plan_patches(photo.public_id, 1, [], []) == 0
+    late = [{"row": 5, "col": 5, "size": 64, "r": 0.5, "phi": 0.0, "cell": 0}]
+    assert store.photos.plan_patches(photo.public_id, 1, late, []) == 0
     store.photos.set_state(photo.public_id, ("selecting",), "received")
     assert not store.photos.is_live(photo.public_id, 1)
     assert store.photos.is_live(photo.public_id, 2)

@@ -13,6 +13,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.types import CHANNELS, ZONES, NoiseModel, Plane, Planes, Zone
 from lensmodel.correction.blur import UniformBlur, fast_shape
+from lensmodel.correction.clipped import LEAST_CLIPPED
 from lensmodel.correction.compiled.common import Complex, Real, smooth, through
 
 Window: TypeAlias = tuple[slice, slice]
@@ -30,7 +31,6 @@ CHECKS: Final = tuple(LIMITS)
 MODEL_ERROR: Final = 0.3
 """Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and prior
 and limit give way at edges (chosen)."""
-_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below it (chosen)
 _GLOW: Final = 0.005
 """Share of the light of a clipped pixel; a pixel that receives more of it does not count: of a lamp the file
 holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""
@@ -345,7 +345,7 @@ def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
         measured = evidence.measured[c]
         if measured is not None:
             counted *= measured
-        clipped = y[c] >= np.float32(_CLIPPED * evidence.clip[c])
+        clipped = y[c] >= np.float32(LEAST_CLIPPED * evidence.clip[c])
         if clipped.any():
             counted *= spread(clipped)[: shape[0], : shape[1]] < _GLOW
         noise, error = evidence.noise[c], max(evidence.psf_errors[c], MODEL_ERROR)

@@ -20,6 +20,9 @@ Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
 
+LEAST_CLIPPED: Final = 0.98
+"""Share of the clipping level from which light may have clipped: demosaicing leaves it a little below, and
+sensors do not clip at one level (chosen)."""
 _LEAST_SEEN: Final = 0.02
 """Least share of a point's light that counts as measured (chosen: a step divides by it, so that with less a
 few pixels of noise would make a light of any strength; with more, broad lights would come up too slowly)."""

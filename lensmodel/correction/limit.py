@@ -9,12 +9,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.clipped import compact
+from lensmodel.correction.clipped import LEAST_CLIPPED, compact
 from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.devices import chosen
@@ -34,7 +35,7 @@ HUE_REACH: Final = 2
 """Radius of the window whose colours a pixel may have (chosen: with 3, more blocks of foliage lose)."""
 PURER: Final = 0.01
 """By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
-out get purer, and three times this shows in a light grey)."""
+out get purer; with twice as much, a block more of foliage loses half a decibel, with none cars get dots)."""
 COLOURLESS: Final = 0.05
 """Share of the brightest light nearby that is added as grey to what lends its colour: what is far darker
 shows none beside it (chosen)."""
@@ -60,7 +61,6 @@ _EDGE, _UNSURE = 0.06, 0.1
 which more is allowed (chosen: half of what shows as a halo; the other half is left to grain)."""
 _EXACT: Final = 0.02
 """Least error of a kernel that is reckoned with: none is known better over a whole tile (chosen)."""
-_CLIPPED: Final = 0.98  # of the clipping level: demosaicing leaves clipped light a little below it (chosen)
 _FREE: Final = 1e6  # stands for no bound where infinity would make differences undefined
 _DARKEST: Final = 0.5
 """Share of the darkest light nearby that remains where the kernel is unsure (chosen: one stop)."""
@@ -167,7 +167,9 @@ def limited(
         number = clipped.sum(axis=0, dtype=np.float32)
         kinds = np.maximum(np.minimum(number, 1.0), np.float32(2.0) * ((number > 1.0) | solved))
         glow = wide + max(blur.reach for blur in blurs)  # and what a cut kernel leaves
-        _inside_white(photo, held, np.float32(_CLIPPED) * clip)
+        inside = (photo >= np.float32(LEAST_CLIPPED) * clip[:, None, None]).all(axis=0)
+        inside = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
+        held[:, inside] = np.maximum(held[:, inside], photo[:, inside])
         _beside_lamps(photo, held, broad | white, kinds, white.astype(np.float32), glow, near)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
     most = np.empty(shape, dtype=np.float32)
@@ -333,23 +335,6 @@ def _hold_light(
             x[0, i, j] = y[0, i, j] * fill if lost else x[0, i, j] * share
             x[1, i, j] = y[1, i, j] * fill if lost else x[1, i, j] * share
             x[2, i, j] = y[2, i, j] * fill if lost else x[2, i, j] * share
-
-
-@jit
-def _inside_white(y: Real, x: Real, clip: Real) -> None:
-    """Keep a pixel that clips in all colours, with all around it, from getting darker, in place."""
-    rows, cols = y.shape[1:]
-    one = np.float32(1.0)
-    white, inside = np.ones((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    for c in range(3):
-        for i in range(rows):
-            for j in range(cols):
-                white[i, j] *= np.float32(y[c, i, j] >= clip[c])
-    extremes(white, white, 1, inside, white.copy())
-    for c in range(3):
-        for i in range(rows):
-            for j in range(cols):
-                x[c, i, j] = max(x[c, i, j], y[c, i, j]) if inside[i, j] == one else x[c, i, j]
 
 
 @jit

@@ -6,7 +6,7 @@ import glob
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,12 +61,14 @@ def passed_over(names: Iterable[str]) -> str:
     inside = [path for folder in folders for path in folder.iterdir() if not path.name.startswith(".")]
     kinds = Counter(path.suffix[1:].upper() for path in inside if path.suffix.lower() in NOT_READ)
     said = [f"{kind} files, which are not read: {count}" for kind, count in sorted(kinds.items())]
-    deeper = [
-        f"the photos in {path}: name it too"
-        for path in sorted(inside)
-        if path.is_dir() and _originals(each for each in path.iterdir() if each.suffix.lower() in ENDINGS)
-    ]
+    deeper = [f"the photos in {path}: name it too" for path in sorted(inside) if _holds_photos(path)]
     return "; ".join([*said, *deeper])
+
+
+def _holds_photos(path: Path) -> bool:
+    with suppress(OSError):  # no folder, or one of the system's, as `lost+found` of a memory card
+        return bool(_originals(each for each in path.iterdir() if each.suffix.lower() in ENDINGS))
+    return False
 
 
 def _originals(paths: Iterable[Path]) -> list[Path]:

@@ -254,6 +254,24 @@ def test_raw_and_other_files_of_one_shot_are_one_photo(case: str, given: str, tm
     assert sorted(path.name for path in found) == sorted(expected)
 
 
+def test_a_folder_inside_that_cannot_be_read_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("lost+found", "more"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.dng").touch()
+    listed = Path.iterdir
+
+    def iterdir(path: Path) -> Iterator[Path]:
+        if path.name == "lost+found":
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+
+    assert files.passed_over([str(tmp_path)]) == f"the photos in {tmp_path / 'more'}: name it too"
+
+
 @pytest.mark.parametrize(
     "pattern",
     ["[2024] trip/*.dng", "[2024] trip/[ab].dng", "[2024]*/a.dng", "[[]2024] trip/a.dng", "**/a.dng"],

@@ -63,7 +63,7 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
             head = file.read(16)
         if isinstance(error, rawpy.LibRawIOError) or any(head.startswith(m, at) for at, m in _KNOWN_WHOLE):
             raise TruncatedImageError(
-                "the RAW file is damaged, or ends before its data do: the upload may have been cut off"
+                "the RAW file is damaged, or ends before its data do; copy it again from the camera or card"
             ) from error
         raise UnsupportedFormatError(
             "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
@@ -163,7 +163,7 @@ def _developed(
         black = np.array(raw.black_level_per_channel[:colours], dtype=float)
         spans = np.resize(np.resize(stated, colours) - black, 3)
         if spans.min() > 0.0:
-            saturation, full = round(spans.max()), share * spans / spans.max()
+            saturation, full = round(spans.max()), share * (spans / spans.max())
     rgb = np.asarray(
         raw.postprocess(
             demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
@@ -285,7 +285,9 @@ def balance_of_rendition(
     """
     if mosaic is None or not mosaic.is_bayer or (picture := _jpeg_of(raw)) is None:
         return None
-    sites = np.stack(mosaic.sites(mosaic.white), axis=-1)
+    planes = mosaic.sites(mosaic.white)
+    rows, cols = (min(sides) for sides in zip(*(plane.shape for plane in planes), strict=True))
+    sites = np.stack([plane[:rows, :cols] for plane in planes], axis=-1)  # of odd sides the rest is cut off
     height, width, colours = sites.shape
     rows, cols = (round(_BLOCKS * side / max(height, width)) for side in (height, width))
     if colours != 3 or min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:

@@ -84,7 +84,8 @@ def scene(seed: int = 0, *, grey: bool = True) -> np.ndarray:
 
 
 def mosaic_of(light: np.ndarray, balance: tuple[float, float, float]) -> Mosaic:
-    colours = np.tile(np.array([[0, 1], [3, 2]], dtype=np.uint8), (light.shape[0] // 2, light.shape[1] // 2))
+    rows, cols = np.indices(light.shape[:2]) % 2
+    colours = np.array([[0, 1], [3, 2]], dtype=np.uint8)[rows, cols]
     channel = np.where(colours == 3, 1, colours)
     values = np.take_along_axis(light / np.array(balance), channel[:, :, None], axis=2)[..., 0]
     return Mosaic((128 + values * 3900).astype(np.uint16), colours, (128.0,) * 4, 4028, is_bayer=True)
@@ -105,6 +106,15 @@ def test_balance_is_read_off_the_cameras_own_jpeg(balance: tuple[float, float, f
         mosaic_of(light, balance),
         None,
     )
+
+    assert seen == pytest.approx((balance[0], balance[2]), rel=0.03)
+
+
+def test_balance_is_read_of_a_mosaic_of_odd_sides_too() -> None:
+    light, balance = scene()[:-1, :-1], (1.2, 1.0, 1.9)
+    opened = Opened(jpeg_of(1.5 * light))
+
+    seen = balance_of_rendition(opened, mosaic_of(light, balance), None)  # type: ignore[arg-type]  # as above
 
     assert seen == pytest.approx((balance[0], balance[2]), rel=0.03)
 

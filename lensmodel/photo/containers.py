@@ -32,10 +32,12 @@ from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags,
 from lensmodel.photo.values import FileKind, Limits
 
 HEAD_BYTES: Final = 64  # that `sniff` wants to see
-MAX_BLOCK_BYTES: Final = 8 << 20  # largest ICC profile, XMP packet or head of a JPEG that is read
+MAX_BLOCK_BYTES: Final = 8 << 20  # largest ICC profile or XMP packet that is read
 BOMB_MEGAPIXELS: Final = 4.0  # below this a false claim costs nothing worth refusing
 BOMB_PIXELS_PER_BYTE: Final = 200.0  # an evenly grey JPEG reaches 100, and a photograph is never evenly grey
 MAX_CHUNKS: Final = 4096  # of a PNG that are looked at; image data do not count
+MAX_HEAD_BYTES: Final = 64 << 20  # of a JPEG before its picture: phones put whole pictures there (chosen)
+MAX_READS: Final = 1 << 17  # of that head, four of each segment and one of each stray byte (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,18 +141,44 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
 _END_OF_IMAGE: Final = b"\xff\xd9"  # marker: ITU-T T.81, table B.1
 
 
+class _Segments(io.BytesIO):
+    """The head of a JPEG for Pillow; Exif is kept here and blank there.
+
+    Pillow joins its blocks in quadratic time, and warns of each damaged entry.
+    """
+
+    def __init__(self, head: bytes) -> None:
+        super().__init__(head)
+        self.exif, self.reads = list[bytes](), 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self.reads += 1
+        if self.reads > MAX_READS:
+            raise NotAnImageError(
+                f"the JPEG's header does not end within {MAX_READS // 4} segments, or "
+                f"{MAX_READS} stray bytes; save it anew from the original"
+            )
+        data = super().read(size)
+        if not data.startswith(b"Exif\0"):
+            return data
+        self.exif.append(data)
+        return bytes(len(data))
+
+
 def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
-    """Let Pillow read the segments up to the first scan: frame size, EXIF, XMP, profile, quantisation."""
-    segments = io.BytesIO(buffer[:MAX_BLOCK_BYTES])
+    """Let Pillow read the segments up to the first scan: frame size, XMP, profile, quantisation."""
+    segments = _Segments(buffer[:MAX_HEAD_BYTES])
     try:
         image = JpegImageFile(segments)
     except (OSError, SyntaxError, ValueError) as error:
-        if segments.read(1):
-            raise NotAnImageError("the JPEG has no frame header, or one without a size") from error
+        if segments.tell() < len(segments.getbuffer()):
+            raise NotAnImageError(
+                f"the JPEG has no frame header, or none of 8 bits ({error}); save it anew from the original"
+            ) from error
         raise TruncatedImageError(
             "the JPEG ends inside its header; copy it again from the camera or card"
         ) from error
-    exif = TiffReader.open(image.info.get("exif", b""), 6)
+    readers = (TiffReader.open(block, 6) for block in segments.exif)
     # a zero follows a byte of 0xFF in a scan, where the end is looked for: a thumbnail before it has its own
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0
     return Header(
@@ -158,7 +186,7 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         *image.size,
         channels=image.layers,
         bits=image.bits,
-        tiff=() if exif is None else (exif,),
+        tiff=tuple(reader for reader in readers if reader is not None),
         xmp=image.info.get("xmp"),
         icc=image.info.get("icc_profile"),
         # cameras give the first table to luma
@@ -294,8 +322,8 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
             raise UnsupportedFormatError(
                 f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
             )
+        _check_colours(photo)  # first: chroma that is stored for several pixels looks cut off
         _check_strips(photo, len(buffer))
-        _check_colours(photo)
         return header
     _check_mosaic(photo)
     if kind == "raw":

@@ -13,7 +13,7 @@ import tifffile
 from PIL import Image
 
 from lensmodel import photo
-from lensmodel.core.errors import TruncatedImageError, UnsupportedFormatError
+from lensmodel.core.errors import NotAnImageError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
 from lensmodel.photo.tiff import laid_out, longs, shorts
@@ -109,6 +109,15 @@ def test_a_tiff_that_could_only_fail_is_refused_before_it_is_stored(
     tifffile.imwrite(tmp_path / "x.tif", pixels, metadata=None, **options)
 
     with pytest.raises(UnsupportedFormatError, match=word):
+        photo.inspect(tmp_path / "x.tif")
+
+
+def test_chroma_of_several_pixels_is_named_and_not_taken_for_a_file_that_was_cut_off(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "x.tif", PIXELS, photometric="ycbcr", metadata=None)
+    with tifffile.TiffFile(tmp_path / "x.tif", mode="r+") as file:
+        file.pages[0].tags[279].overwrite(PIXELS.size // 2)  # StripByteCounts of 4:2:0
+
+    with pytest.raises(UnsupportedFormatError, match="YCbCr"):
         photo.inspect(tmp_path / "x.tif")
 
 
@@ -209,3 +218,47 @@ def test_a_jpeg_of_stray_bytes_alone_ends_inside_its_header(tmp_path: Path) -> N
 def test_a_mosaic_that_names_too_few_colours_is_refused(rows: list[str]) -> None:
     with pytest.raises(UnsupportedFormatError):
         require_known_mosaic(rows)
+
+
+def _segments(code: int, *bodies: bytes) -> bytes:
+    return b"".join(struct.pack(">BBH", 0xFF, code, len(body) + 2) + body for body in bodies)
+
+
+def _with_segments(path: Path, segments: bytes, camera: str | None = None) -> Path:
+    exif = Image.Exif()
+    if camera:
+        exif[0x0110] = camera
+    Image.fromarray(PIXELS).save(path, "JPEG", exif=exif)
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + segments + data[2:])
+    return path
+
+
+def test_a_jpeg_with_a_large_header_is_read_whole(tmp_path: Path) -> None:
+    path = _with_segments(tmp_path / "x.jpg", _segments(0xE5, *[bytes(65_000)] * 140), camera="T-1")
+
+    info = photo.inspect(path)
+
+    assert (info.width, info.height, info.metadata.camera_model) == (64, 48, "T-1")
+
+
+@pytest.mark.parametrize("parts", [_segments(0xE5, *[b""] * 50_000), b"\0".join([b""] * 200_000)])
+def test_a_jpeg_header_of_very_many_parts_is_refused(parts: bytes, tmp_path: Path) -> None:
+    first = _segments(0xE5, b"")
+
+    with pytest.raises(NotAnImageError, match="within 32768 segments"):
+        photo.inspect(_with_segments(tmp_path / "x.jpg", first + parts))
+
+
+def test_exif_of_a_jpeg_is_read_within_bounds_and_without_a_warning(tmp_path: Path) -> None:
+    many = 2000  # entries that each say to hold what lies beyond the file
+    entries = b"".join(struct.pack("<HHII", tag, 7, 1 << 30, 8) for tag in range(2000, 2000 + many))
+    hostile = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", many) + entries + bytes(4)
+    path = _with_segments(tmp_path / "x.jpg", _segments(0xE1, hostile), camera="T-1")
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        info = photo.inspect(path)
+
+    assert info.metadata.camera_model == "T-1"
+    assert not said

@@ -10,7 +10,6 @@ SAMPLES: Final = "samples.json"  # position, settings, weight and origin of each
 ENCODED: Final = "encoded.npy"  # what patches say without a kernel, one a row
 CLEANED: Final = "cleaned"  # the file of a photo without the place where it was taken
 REPORT: Final = "report.json"  # the report of a lens test
-# Where the edges of a developed photo tell about the blur, by `app.blobs.small_pictures`
 # Small picture of a photo before it is developed, by `app.blobs.small_pictures`; stored ones too
 THUMBNAIL: Final = "glance.jpg"
 SHOWN: Final = "shown.tiles"  # the developed photo in full size, by `app.blobs.tiles`

@@ -92,6 +92,8 @@ def main(order: Order) -> None:
             traceback.print_exc()
         end = "memory_limit" if number in _TOO_LARGE else "bug"
         _report(order.folder, end=end, code=type(error).__name__)
+    finally:
+        _print_the_rest()
 
 
 def _report(folder: Path, **report: object) -> None:
@@ -120,6 +122,15 @@ def _print_to(path: Path) -> None:
     for stream in (1, 2):
         os.dup2(printed, stream)
     os.close(printed)
+
+
+def _print_the_rest() -> None:
+    """Write what a task printed; where that does not fit it is dropped, since it is not worth an outcome."""
+    for name in ("stdout", "stderr"):
+        try:
+            getattr(sys, name).flush()
+        except OSError:
+            setattr(sys, name, None)  # else `multiprocessing` would try again, and fail
 
 
 @contextlib.contextmanager

@@ -155,7 +155,7 @@ def _restrict_files(folder: Path, reads: Iterable[Path]) -> None:
     allowed |= dict.fromkeys(reads, _READ) | dict.fromkeys(map(Path, _DEVICES), _READ | _WRITE)
     try:
         for path, rights in (allowed | {folder: ~_EXECUTE}).items():
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 _allow(rules, path, rights & handled)
         _check(_libc.syscall(_RESTRICT_SELF, rules, 0))
     finally:

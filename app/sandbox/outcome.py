@@ -62,7 +62,7 @@ def outcome_of(status: int, folder: Path, limits: TaskLimits) -> Outcome:
     if status:
         return _died(status, limits)
     report = _report(folder / REPORT)
-    code, text = str(report.get("code", ""))[:MAX_CODE], str(report.get("text", ""))[:MAX_TEXT]
+    code, text = _text(report.get("code", ""), MAX_CODE), _text(report.get("text", ""), MAX_TEXT)
     match report.get("end"):
         case "ok":
             return Outcome("ok", value=report.get("value"))
@@ -87,6 +87,11 @@ def _died(status: int, limits: TaskLimits) -> Outcome:
     # SIGKILL comes not from the task nor from us, but from the kernel, out of memory
     killed = -status == signal.SIGKILL
     return ended("outage" if killed else "crashed", f"the process that did the work died: {how}")
+
+
+def _text(value: object, most: int) -> str:
+    """Return a text as a database can hold it: without parts of characters, and without zeros."""
+    return str(value)[:most].encode(errors="replace").decode().replace("\0", "")
 
 
 def _report(path: Path) -> dict[str, Any]:

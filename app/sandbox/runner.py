@@ -151,7 +151,7 @@ class Sandbox:
                 return ended("cancelled")
             reads = [*reads, self.cache]
             (folder / child.PROGRESS).write_bytes(child.STEPS.pack(0, 0))
-            (folder / REPORT).unlink(missing_ok=True)  # of a try before
+            _remove(folder / REPORT)  # of a try before
             if self.account is not None:
                 self.account.may_change(folder)
                 for path in reads:
@@ -247,6 +247,14 @@ def _leave_plain_files(folder: Path) -> None:
                 continue
             if not stat.S_ISDIR(status.st_mode):
                 path.unlink()
+
+
+def _remove(path: Path) -> None:
+    """Remove what a child left where its report belongs, a folder too."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _log_printed(task: str, path: Path, *, crashed: bool) -> None:

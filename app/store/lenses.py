@@ -261,7 +261,7 @@ class Lenses(Repository):
         session.execute(
             update(CorrectionRow)
             .where(CorrectionRow.lens_public_id == lens_id, CorrectionRow.state.in_(CORRECTION_ACTIVE))
-            .values(state="cancelled", finished_at=now())
+            .values(state="cancelled", stage_at=now(), finished_at=now())
         )
         _forget(session, lens)
         return True

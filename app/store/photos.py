@@ -325,8 +325,10 @@ class Photos(Patches, Works[PhotoRow]):
                 return False
             if isinstance(lens, LensName):
                 chosen = chosen or lenses.named(session, photo.owner_id, lens)
-            elif lens is not None:
-                chosen = chosen or find_to_change(session, LensRow, lens, owner)
+            elif lens is not None and chosen is None:
+                chosen = find_to_change(session, LensRow, lens, owner)
+                if chosen is None:
+                    raise UnknownError("lens", lens)
             begins = calibrate and not photo.calibrate
             if begins and photo.file_gone_at is not None:
                 return False

@@ -146,6 +146,7 @@ class LensRow(Owned, Base):
         CheckConstraint("version >= 0", name="version"),
         UniqueConstraint("owner_id", "identity_key"),
         Index("ix_lens_page", "owner_id", "public_id"),
+        {"sqlite_autoincrement": True},  # the key of a deleted lens is given to no other
     )
 
     maker: Mapped[str | None]

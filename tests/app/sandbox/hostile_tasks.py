@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import errno
 import importlib
+import io
 import os
 import signal
 import socket
@@ -93,8 +94,21 @@ def open_files(arguments: dict[str, Any], folder: Path, progress: ProgressHook) 
         return len(held)
 
 
+class _Full(io.RawIOBase):
+    """A file on a full disk."""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, _: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    sys.stdout = io.TextIOWrapper(io.BufferedWriter(_Full()))
+    sys.stdout.write("what is printed does not fit either")
+    if arguments["with_files"]:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def probe(  # noqa: C901 - one try each
@@ -264,6 +278,7 @@ def mislead(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         "nest": lambda: report.write_text("[" * 100_000),
         "list": lambda: report.write_text("[]"),
         "void": report.touch,
+        "folder": report.mkdir,
     }
     how[arguments["how"]]()
     _send(struct.pack("!i", len(done)) + done)

@@ -27,7 +27,7 @@ from app.runtime import logs, supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine, runner
 from app.sandbox.child import NICENESS
-from app.sandbox.outcome import Outcome, TaskLimits
+from app.sandbox.outcome import REPORT, Outcome, TaskLimits, outcome_of
 from app.sandbox.runner import MAX_SAID, Budget, Sandbox
 from lensmodel.cli.ending import UsageError
 
@@ -135,7 +135,8 @@ ENDINGS: dict[str, tuple[str, dict[str, Any], dict[str, Any], str, str, str]] = 
     "processor time": ("spin", {}, {"cpu_s": 1}, "time_limit", "time_limit", "1 s of processor time"),
     "crash": ("crash", {}, {}, "crashed", "crashed", "SIGSEGV"),
     "killed by the machine": ("die", {}, {}, "outage", "outage", "SIGKILL"),
-    "full disk": ("fill_the_disk", {}, {}, "outage", "outage", "no room"),
+    "full disk": ("fill_the_disk", {"with_files": True}, {}, "outage", "outage", "no room"),
+    "no room for words": ("fill_the_disk", {"with_files": False}, {}, "ok", "", ""),
     "unforeseen": ("blunder", {}, {}, "crashed", "internal_error", "KeyError"),
     "many bytes": (
         "litter",
@@ -393,14 +394,35 @@ def test_a_task_keeps_neither_its_worker_nor_others_waiting(run: Run, sandbox: S
     assert forkserver._forkserver._forkserver_pid == server  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("how", ["link", "pipe", "nest", "list", "void"])
-def test_a_report_is_read_as_untrusted(run: Run, tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("how", ["link", "pipe", "nest", "list", "void", "folder"])
+def test_a_report_is_read_as_untrusted(sandbox: Sandbox, tmp_path: Path, how: str) -> None:
     other = tmp_path / "other.json"
     other.write_text('{"end": "ok", "value": "of another"}')
+    arguments = {"how": how, "other": str(other)}
 
-    outcome = run("mislead", arguments={"how": how, "other": str(other)})
+    with sandbox.folder() as folder:  # a second try has the folder of the first
+        outcomes = [sandbox.run("mislead", arguments, folder=folder, limits=LIMITS) for _ in range(2)]
 
-    assert (outcome.ending, outcome.value) == ("crashed", None)
+    assert [(outcome.ending, outcome.value) for outcome in outcomes] == [("crashed", None)] * 2
+
+
+def test_a_database_can_hold_what_a_report_says(tmp_path: Path) -> None:
+    said = "half \ud800 of a character and an end\0"
+    (tmp_path / REPORT).write_text(json.dumps({"end": "error", "code": said, "text": said}))
+
+    outcome = outcome_of(0, tmp_path, LIMITS)
+
+    assert outcome.code == outcome.detail == "half ? of a character and an end"
+
+
+def test_a_path_beneath_a_file_leaves_all_measures_in_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_force("files")
+    (tmp_path / "library.zip").touch()
+    monkeypatch.setenv("PYTHONPATH", f"{confine.__file__}/inner:{tmp_path / 'library.zip'}/inner")
+
+    assert confine.available("none", tmp_path)["files"]
 
 
 def test_the_budget_lets_no_more_children_run_than_there_are_slots() -> None:

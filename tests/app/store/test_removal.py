@@ -44,6 +44,15 @@ def test_a_deleted_lens_is_gone_and_its_photos_can_be_corrected_with_another(
     assert rows(store, LensRow) == []
 
 
+def test_the_key_of_a_deleted_lens_is_given_to_no_other(client: TestClient, store: Store, steps: Any) -> None:
+    first = steps.fresh(steps.counted()).lens_id
+    client.delete(f"/v1/lenses/{lenses(client)[0]}")
+
+    second = steps.fresh(steps.counted()).lens_id
+
+    assert second > first
+
+
 def test_nothing_that_still_ran_brings_a_deleted_lens_back(
     client: TestClient, store: Store, steps: Any
 ) -> None:

@@ -15,7 +15,7 @@ from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError
 from uploads import receive
 
-from app.errors import BusyError
+from app.errors import BusyError, UnknownError
 from app.runtime.settings import Settings, table
 from app.store import LensName, Store, database
 from app.store.database import Database
@@ -317,6 +317,18 @@ def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -
 
     assert store.lenses.samples_of(old)[1] == []
     assert len(store.lenses.samples_of(new)[1]) == 12
+
+
+def test_a_photo_is_moved_to_no_lens_that_is_gone_or_of_another(store: Store, steps: Steps) -> None:
+    mine, other = steps.counted(serial="123"), store.lenses.create("another", "mine, and nobody else's")
+    deleted = store.lenses.create(OWNER, "here for a moment")
+    store.lenses.delete(deleted, OWNER)
+
+    for lens in (other, deleted):
+        with pytest.raises(UnknownError, match=lens):
+            store.photos.change([mine.public_id], OWNER, {"aperture": 2.0}, lens=lens)
+
+    assert steps.fresh(mine).aperture != 2.0
 
 
 def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, steps: Steps) -> None:

@@ -27,7 +27,7 @@ from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
 from app.sandbox.child import ProgressHook
-from app.sandbox.outcome import Outcome, TaskLimits
+from app.sandbox.outcome import MAX_RESULT, Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.tables import PhotoRow
@@ -208,6 +208,11 @@ class JobContext:
             shutil.rmtree(target, ignore_errors=True)
             folder.rename(target)  # complete, or absent
             return target
+
+    def keep(self, key: str, written: Path) -> None:
+        """Store what a task wrote for readers that read all of it; nothing that is missing or too large."""
+        if written.is_file() and written.stat().st_size <= MAX_RESULT:
+            self.storage.put(key, written)
 
     def _siblings(self, photo: PhotoRow, files: ExitStack) -> list[Path]:
         """Provide other photos of the same body, which tell of defects of its sensor, if they are here."""

@@ -134,8 +134,7 @@ def measure(context: JobContext, lens_id: str, version: int) -> None:
         "lateral": lenses.lateral_of(lens),
     }
     with context.task("measure", None, newest, samples=samples, about=about) as (metrics, folder):
-        if (folder / REPORT).is_file():
-            context.storage.put(report_key(lens_id, version, state.rebuild_epoch), folder / REPORT)
+        context.keep(report_key(lens_id, version, state.rebuild_epoch), folder / REPORT)
     lenses.record_metrics(lens_id, version, metrics)
 
 

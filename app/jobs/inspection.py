@@ -34,8 +34,7 @@ def inspect(context: JobContext, photo: PhotoRow, wanted: Wanted) -> None:
         _remove_place(context, photo, path, wanted)
         task = context.task("inspect", photo, wanted, reads=[path], path=str(path), max_megapixels=most)
         with task as (info, folder):
-            if (folder / THUMBNAIL).is_file():
-                context.storage.put(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
+            context.keep(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
     metadata = info["metadata"]
     camera = (metadata["camera_maker"], metadata["camera_model"])
     context.store.photos.record_inspection(

@@ -32,10 +32,10 @@ from app.jobs.photo_work import work_on
 from app.jobs.queue import Handler
 from app.jobs.running import durable, end_job
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import KERNELS, SAMPLES, SHOWN
+from app.jobs.task_files import KERNELS, SAMPLES, SHOWN, THUMBNAIL
 from app.runtime.settings import Settings
 from app.sandbox.child import ProgressHook
-from app.sandbox.outcome import Outcome, TaskLimits
+from app.sandbox.outcome import MAX_RESULT, Outcome, TaskLimits
 from app.sandbox.runner import Budget
 from app.store import Store
 from app.store.owners import ANY_OWNER
@@ -203,6 +203,23 @@ def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
     work(received(context, steps, **given).public_id, 1)
 
     assert sandbox.seen["select"]["selector"] == taken
+
+
+@pytest.mark.parametrize(("more", "kept"), [(0, True), (1, False)])
+def test_no_picture_is_kept_that_is_larger_than_may_be_read_at_once(
+    work: Handler, context: JobContext, sandbox: Scripted, photo: PhotoRow, more: int, kept: bool
+) -> None:
+    def inspect(arguments: dict[str, Any], folder: Path) -> Outcome:
+        with (folder / THUMBNAIL).open("wb") as file:
+            file.truncate(MAX_RESULT + more)
+        return Outcome("ok", value=INFO)
+
+    sandbox.answers["inspect"] = [inspect]
+    work(photo.public_id, 1)
+
+    stored = context.storage.folder
+    assert stored is not None
+    assert (stored / f"{photo.folder}{THUMBNAIL}").is_file() is kept
 
 
 def measured(arguments: dict[str, Any], folder: Path) -> Outcome:

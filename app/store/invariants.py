@@ -46,7 +46,7 @@ INVARIANTS: Final[Mapping[str, tuple[str, str]]] = {
             AND e.photo_public_id = photo.public_id AND e.kind IN ('photo_added', 'photo_included')
         )""",
     ),
-    "votes": (
+    "counted samples": (
         "exactly the samples of counted photos count",
         """
         SELECT DISTINCT photo.public_id FROM photo

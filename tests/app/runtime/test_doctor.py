@@ -69,11 +69,11 @@ DAMAGES: dict[str, tuple[str, Any]] = {
         lambda photo: update(LensRow).where(LensRow.id == photo.lens_id).values(sample_count=999),
     ),
     "a sample that does not count": (
-        "votes",
+        "counted samples",
         lambda photo: update(SampleRow).where(SampleRow.photo_id == photo.id).values(lens_id=None),
     ),
     "a sample of no version": (
-        "votes",
+        "counted samples",
         lambda photo: update(SampleRow).where(SampleRow.photo_id == photo.id).values(version_added=999),
     ),
     "a done patch without samples": (

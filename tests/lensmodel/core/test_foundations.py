@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lensmodel.core import errors, psf
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
 
 angles = st.floats(-10, 10)
 
@@ -68,6 +68,12 @@ def test_one_stop_is_a_factor_of_root_two() -> None:
     assert wide is not None
     assert stopped is not None
     assert stopped - wide == pytest.approx(1.0)
+
+
+def test_noise_variance_grows_with_level() -> None:
+    noise = NoiseModel(shot=1e-3, read=1e-6)
+
+    assert np.allclose(noise.variance(np.array([0.0, 1.0])), [1e-6, 1.001e-3])
 
 
 def test_registry_names_what_it_knows() -> None:

@@ -98,6 +98,11 @@ def test_what_the_photos_own_directory_says_goes_before_the_previews(tmp_path: P
         (np.zeros((48, 64, 3), np.uint8), {"photometric": "cielab"}, "Lab"),
         (np.zeros((48, 64, 3), np.uint8), {"photometric": "ycbcr"}, "YCbCr"),
         (np.zeros((48, 64, 3), np.uint16), {"photometric": "ycbcr", "compression": "lzw"}, "YCbCr"),
+        (
+            np.zeros((48, 64, 3), np.uint8),
+            {"photometric": "ycbcr", "extratags": [(530, 3, 2, (2, 1), True)]},
+            "YCbCr",
+        ),
         (np.zeros((48, 64, 6), np.uint8), {"photometric": "rgb", "planarconfig": "contig"}, "6 channels"),
         (np.zeros((48, 64), np.int16), {"photometric": "minisblack"}, "signed"),
         (np.zeros((48, 64), np.complex64), {"photometric": "minisblack"}, "complex"),

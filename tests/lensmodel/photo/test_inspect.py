@@ -87,6 +87,16 @@ def test_sniff_never_raises_anything_else(head: bytes) -> None:
         photo.sniff(head)
 
 
+@pytest.mark.parametrize(
+    ("kind", "size"), [("JPEG", (60, 40)), ("PNG", (60, 40)), ("TIFF", (60, 40)), ("DNG", (128, 96))]
+)
+def test_inspect_tells_kind_and_size(kind: str, size: tuple[int, int], tmp_path: Path) -> None:
+    (tmp_path / "photo").write_bytes(_whole(kind, tmp_path / "photo"))
+    info = photo.inspect(tmp_path / "photo")
+
+    assert (info.kind, (info.width, info.height)) == (kind.lower(), size)
+
+
 def _stack() -> bytes:
     out = io.BytesIO()
     pages = np.zeros((100, 32, 32), dtype=np.uint8)

@@ -234,6 +234,24 @@ def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: ph
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
+@pytest.mark.parametrize("output", ["tiff16", "png8", "jpeg", "dng"])
+def test_pillow_reads_the_numbers_in_exif(tmp_path: Path, output: photo.OutputFormat) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output, description="corrected é")
+    block = Image.Exif()
+    if output in {"tiff16", "dng"}:  # Pillow reads no 16-bit RGB; its EXIF reader takes the bytes
+        block.load(b"Exif\0\0" + path.read_bytes())
+    else:
+        with Image.open(path) as image:
+            block = image.getexif()
+    exif = block.get_ifd(0x8769)
+
+    assert (block[0x010F], block[0x0131], block[0x010E]) == ("Canon", "lensmodel", "corrected ?")
+    assert float(exif[0x829D]) == 2.8
+    assert float(exif[0x829A]) == pytest.approx(1 / 160)
+    assert (exif[0x8827], exif[0xA434]) == (400, "EF24mm f/1.4L")
+
+
 @pytest.fixture(scope="module")
 def read_by_exiftool(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """What it says of a file of each format: to start it takes longer than to read one more."""

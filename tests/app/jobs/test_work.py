@@ -6,6 +6,8 @@ import hashlib
 import io
 import json
 import math
+import tempfile
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -112,6 +114,7 @@ class Scripted:
         self.ran: list[str] = []
         self.seen: dict[str, dict[str, Any]] = {}
         self.files: set[str] = set()
+        self._choosing = threading.Lock()
         self.answers: dict[str, list[Answer]] = {
             "locate": [ok({"location": "none"})],
             "inspect": [ok(INFO)],
@@ -123,9 +126,7 @@ class Scripted:
     @contextmanager
     def folder(self) -> Iterator[Path]:
         self.scratch.mkdir(parents=True, exist_ok=True)
-        path = self.scratch / f"t{len(list(self.scratch.iterdir()))}"
-        path.mkdir()
-        yield path
+        yield Path(tempfile.mkdtemp(dir=self.scratch))  # cells ask for theirs at once
 
     def run(
         self,
@@ -145,7 +146,9 @@ class Scripted:
         if not wanted():
             return Outcome("cancelled")
         answers = self.answers[task]
-        return (answers.pop(0) if len(answers) > 1 else answers[0])(dict(arguments), folder)
+        with self._choosing:
+            answer = answers.pop(0) if len(answers) > 1 else answers[0]
+        return answer(dict(arguments), folder)
 
 
 def unmeasured(store: Store) -> list[tuple[str | int, ...]]:
@@ -462,7 +465,10 @@ def test_a_photo_too_small_for_patches_is_told_so(
 def test_cells_without_evidence_are_rejected_and_the_others_count(
     work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
-    sandbox.answers["estimate"] = [refused("no_samples"), estimate]
+    def second_only(arguments: dict[str, Any], folder: Path) -> Outcome:  # cells run in any order
+        return (estimate if arguments["numbers"] == [1] else refused("no_samples"))(arguments, folder)
+
+    sandbox.answers["estimate"] = [second_only]
 
     work(photo.public_id, 1)
 
@@ -505,6 +511,23 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
     assert steps.fresh(photo).state == "cancelled"
     lens = steps.fresh(photo).lens
     assert lens is None or (lens.version, lens.sample_count) == (0, 0)
+
+
+def test_work_of_an_old_epoch_changes_nothing(
+    work: Handler, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
+        context.store.photos.change([photo.public_id], "local", {"aperture": 4.0})
+        return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
+
+    sandbox.answers["select"].insert(0, restart)
+    work(photo.public_id, 1)
+    after_old = steps.fresh(photo)
+    work(photo.public_id, 2)
+
+    done = steps.fresh(photo)
+    assert (after_old.state, after_old.epoch) == ("received", 2)
+    assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
 
 
 def test_a_lost_file_is_told_of(work: Handler, context: JobContext, photo: PhotoRow, steps: Any) -> None:

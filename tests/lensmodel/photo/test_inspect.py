@@ -126,13 +126,16 @@ def test_what_is_no_photo_is_refused_with_the_reason(case: str, tmp_path: Path) 
         photo.inspect(tmp_path / "really.nef")
 
 
-@pytest.mark.parametrize("limits", [photo.Limits(max_bytes=100), photo.Limits(max_megapixels=0.001)])
+@pytest.mark.parametrize(
+    ("limits", "most"),
+    [(photo.Limits(max_bytes=100), "100$"), (photo.Limits(max_megapixels=0.001), r"0\.001 MP")],
+)
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "DNG"])
 def test_the_limits_hold_for_every_kind_and_an_honest_photo_is_no_bomb(
-    limits: photo.Limits, kind: str, tmp_path: Path
+    limits: photo.Limits, most: str, kind: str, tmp_path: Path
 ) -> None:
     (tmp_path / "x").write_bytes(_whole(kind, tmp_path / "x"))
-    with pytest.raises(ImageTooLargeError, match="the limit is") as caught:
+    with pytest.raises(ImageTooLargeError, match=f"the limit is {most}") as caught:
         photo.inspect(tmp_path / "x", limits)
 
     assert not isinstance(caught.value, DecompressionBombError)

@@ -34,13 +34,14 @@ is as bright as its middle over a tenth of a window, an edge over a quarter at l
 HUE_REACH: Final = 2
 """Radius of the window whose colours a pixel may have (chosen: with 3, more blocks of foliage lose)."""
 PURER: Final = 0.01
-"""By how much a colour's share of the light may leave the range nearby (chosen: colours that blur has washed
-out get purer; with twice as much, a block more of foliage loses half a decibel, with none cars get dots)."""
+"""By how much a colour's share of the light may leave the range nearby where the kernel is unsure (chosen:
+colours that blur has washed out get purer; with twice as much, a block more of foliage loses half a decibel,
+with none cars get dots). The surer, the more, as for lines: else a true kernel gains up to 1.2 dB less."""
 COLOURLESS: Final = 0.05
 """Share of the brightest light nearby that is added as grey to what lends its colour: what is far darker
 shows none beside it (chosen)."""
 OWN_COLOURLESS: Final = 0.02
-"""The same for the pixel itself (chosen: with more, letters in black get green)."""
+"""The same for the pixel itself where the kernel is unsure (chosen: with more, black letters get green)."""
 TINY: Final = 1e-5  # light, as seen, below which there is none
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
@@ -129,11 +130,12 @@ def limited(
     which were solved to be twice as bright as saturation, have rules of their own: around them, in the reach
     of the blur and some more, each colour stays below the photo's most within 1 pixel and above its least
     within 3, of lamps and white areas within 2; near white areas it gets no brighter. Broad clipped areas
-    stay as they are, white ones in all colours. Colour, the shares of red, green and blue in the light, is
-    drawn towards the photo's own at the same place until their differences lie in the photo's range within 2
+    stay as they are, white ones in all colours, and what is white all around gets no darker. Colour, the
+    shares of red, green and blue in the light, is drawn towards the photo's own at the same place until
+    their differences lie, but for .01 (up to .04 where the kernel is known), in the photo's range within 2
     pixels; the light stays. At last each colour, as seen, leaves its own range within 2 pixels by no more
     than the span of a line, at least by the width of that range and around lamps by no more: where a colour
-    has next to no light, its noise shows. What is white all around gets no darker.
+    has next to no light, its noise shows.
 
     Parameters
     ----------
@@ -152,6 +154,7 @@ def limited(
     """
     error = max(*errors, _EXACT)
     room, edge = widening(error) if halo is None else (min(halo, _FREE),) * 2
+    known = max(widening(error)[0], 1.0)
     reach = max(blur.spread for blur in blurs)
     dark = math.hypot(*(sensor.noise.sigma_at(0.0) for sensor in sensors))
     held = np.array(restored, dtype=np.float32, order="C")
@@ -178,13 +181,15 @@ def limited(
         from lensmodel.correction.limit_on_device import held_on_device  # noqa: PLC0415 - needs the numbers above
 
         colourless = _SIGMAS * dark + 1e-6
-        held = held_on_device(device, photo, held, near, wide, (room, edge), float(darkest), colourless)
+        held = held_on_device(
+            device, photo, held, near, wide, (room, edge), float(darkest), colourless, known
+        )
     else:
         shares = (np.float32(room), np.float32(edge))
         _hold_light(photo, held, near, wide, shares, darkest, most)
-        _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6))
+        _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6), np.float32(known))
     if halo is None:
-        own = np.where(near, np.float32(1.0), np.float32(max(room, 1.0)))
+        own = np.where(near, np.float32(1.0), np.float32(known))
         for plane, made, sensor in zip(photo, held, sensors, strict=True):
             _hold_own(plane, made, own, np.float32(_SIGMAS * sensor.noise.sigma_at(0.0)))
     elif halo < _FREE:
@@ -399,14 +404,15 @@ def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
 
 @jit
 def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
-    y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number
+    y: Real, x: Real, most: Real, number: Real, clip: Real, dark: Number, known: Number
 ) -> None:
     """Draw the colours of `x` into the range of those of `y` nearby, in place.
 
     `most` is the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
-    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(PURER)
+    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(PURER) * known
+    grey_share = min(np.float32(OWN_COLOURLESS / COLOURLESS) * known, one)
     lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
     reach, side = HUE_REACH, 2 * HUE_REACH + 1
     least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
@@ -438,7 +444,7 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
                     low[k, j] = min(low[k, j], lows[row % side, k, j])
                     high[k, j] = max(high[k, j], highs[row % side, k, j])
         for j in range(cols):
-            floors[i, j] = max(dark, np.float32(OWN_COLOURLESS / COLOURLESS) * floors[i, j])
+            floors[i, j] = max(dark, grey_share * floors[i, j])
         _axes(x, floors[i], i, made, there)
         _axes(y, floors[i], i, own, here)
         if lost:

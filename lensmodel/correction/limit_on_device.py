@@ -33,6 +33,7 @@ def held_on_device(
     shares: tuple[float, float],
     darkest: float,
     dark: float,
+    known: float,
 ) -> NDArray[np.float32]:
     """Hold light, but where it is `free`, and colour of a result; see `limit.limited`."""
     xp, y, x = device.xp, device.send(photo), device.send(made)
@@ -40,7 +41,7 @@ def held_on_device(
     seen = xp.sqrt(xp.clip(light, 0.0, None))
     least, most = _around(xp, xp.minimum, seen, REACH), _around(xp, xp.maximum, seen, REACH)
     x = _light_held(xp, y, x, light, (least, most), device.send(free), wide, shares, darkest)
-    return device.fetch(_colour_held(xp, y, x, _around(xp, xp.maximum, most, HUE_REACH - REACH), dark))
+    return device.fetch(_colour_held(xp, y, x, _around(xp, xp.maximum, most, HUE_REACH - REACH), dark, known))
 
 
 def _light_held(
@@ -89,9 +90,10 @@ def _levels(xp: Any, light: Array, wide: int) -> tuple[Array, ...]:  # noqa: ANN
     return tuple(_doubled(xp, plane, light.shape) for plane in (bottom, top, *edges))
 
 
-def _colour_held(xp: Any, y: Array, x: Array, brightest: Array, dark: float) -> Array:  # noqa: ANN401 - same
+def _colour_held(xp: Any, y: Array, x: Array, brightest: Array, dark: float, known: float) -> Array:  # noqa: ANN401 - same
     lending, floor = (
-        xp.clip(3.0 * share * brightest**2, dark, None) for share in (COLOURLESS, OWN_COLOURLESS)
+        xp.clip(3.0 * share * brightest**2, dark, None)
+        for share in (COLOURLESS, min(OWN_COLOURLESS * known, COLOURLESS))
     )
 
     def shares_of(planes: Array, floor: Array) -> tuple[Array, Array, Array]:
@@ -105,7 +107,7 @@ def _colour_held(xp: Any, y: Array, x: Array, brightest: Array, dark: float) -> 
     low, high = (_around(xp, of, lent, HUE_REACH) for of in (xp.minimum, xp.maximum))
     step = there - here
     room = xp.clip(xp.where(step > 0.0, high - here, here - low), 0.0, None)
-    share = xp.clip(xp.min((room + PURER) / xp.clip(xp.abs(step), 1e-6, None), axis=0), 0.0, 1.0)
+    share = xp.clip(xp.min((room + PURER * known) / xp.clip(xp.abs(step), 1e-6, None), axis=0), 0.0, 1.0)
     return xp.where(share < 1.0, (own + share * (made - own)) * total - floor / 3.0, x)
 
 

@@ -128,12 +128,13 @@ class Service:
         return found
 
     def job(self, job_id: str, until: Callable[[dict[str, Any]], object] | None = None) -> dict[str, Any]:
-        """Return a job once it ended, or once `until` holds."""
+        """Return a job once it ended, or once `until` holds, which it must before the end."""
         deadline = Deadline(PATIENCE_S)
         while True:
             job: dict[str, Any] = self.get(f"/v1/jobs/{job_id}")
-            if job["state"] in FINAL or (until is not None and until(job)):
+            if job["state"] in FINAL if until is None else until(job):
                 return job
+            assert job["state"] not in FINAL, f"ended before what was awaited: {job}"
             assert not deadline.passed(), f"{job}\n{self.log.read_text()[-4000:]}"
             time.sleep(0.25 if until is None else 0.1)
 

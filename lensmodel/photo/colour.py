@@ -110,6 +110,20 @@ def icc_space(icc: bytes) -> str:
     return icc[16:20].decode("latin-1").strip()
 
 
+def is_whole(icc: bytes) -> bool:
+    """Whether a profile has all the bytes that it says to have: ICC.1:2022, section 7.2.2."""
+    return 128 <= int.from_bytes(icc[:4], "big") <= len(icc) + 3  # the last tag is often not padded
+
+
+@lru_cache(maxsize=8)
+def is_of_rgb(icc: bytes) -> bool:
+    """Whether a profile, perhaps one of tables, says what light numbers of RGB stand for."""
+    try:
+        return is_whole(icc) and icc_space(icc) == "RGB" and len(_to_xyz(np.eye(3), icc, "rgb")) == 3
+    except (imagecodecs.CmsError, ValueError):
+        return False
+
+
 @lru_cache(maxsize=8)
 def matrix_profile(icc: bytes) -> MatrixProfile | None:
     """Ask LittleCMS for the XYZ of each channel's levels alone; None where the channels do not just add up.
@@ -117,7 +131,7 @@ def matrix_profile(icc: bytes) -> MatrixProfile | None:
     So it is with profiles of printers and those made of tables, and with nonsense.
     """
     space = {"RGB": "rgb", "GRAY": "gray"}.get(icc_space(icc))
-    if space is None:
+    if space is None or not is_whole(icc):
         return None
     codes = np.linspace(0.0, 1.0, CODES)
     channels = 3 if space == "rgb" else 1

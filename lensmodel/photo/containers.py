@@ -7,7 +7,6 @@ Sources: ITU-T T.81, annex B (JPEG); "Portable Network Graphics, third edition",
 from __future__ import annotations
 
 import contextlib
-import io
 import mmap
 import re
 import statistics
@@ -18,8 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from PIL.JpegImagePlugin import JpegImageFile
-
 from lensmodel.core.errors import (
     DecompressionBombError,
     ImageTooLargeError,
@@ -28,6 +25,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.colour import profile_by_chunks
+from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
 from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
@@ -37,7 +35,6 @@ BOMB_MEGAPIXELS: Final = 4.0  # below this a false claim costs nothing worth ref
 BOMB_PIXELS_PER_BYTE: Final = 200.0  # an evenly grey JPEG reaches 100, and a photograph is never evenly grey
 MAX_CHUNKS: Final = 4096  # of a PNG that are looked at; image data do not count
 MAX_HEAD_BYTES: Final = 64 << 20  # of a JPEG before its picture: phones put whole pictures there (chosen)
-MAX_READS: Final = 1 << 17  # of that head, four of each segment and one of each stray byte (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +52,7 @@ class Header:
     camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
     xmp: bytes | None = None  # XMP packet, and ICC profile: of a PNG also one made of what its chunks declare
     icc: bytes | None = None
+    icc_lost: bool = False  # whether there is an ICC profile that cannot be read at all
     # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
     # 8-bit numbers; 0 unknown, or not compressed so
     coarseness: float = 0.0
@@ -141,35 +139,11 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
 _END_OF_IMAGE: Final = b"\xff\xd9"  # marker: ITU-T T.81, table B.1
 
 
-class _Segments(io.BytesIO):
-    """The head of a JPEG for Pillow; Exif is kept here and blank there.
-
-    Pillow joins its blocks in quadratic time, and warns of each damaged entry.
-    """
-
-    def __init__(self, head: bytes) -> None:
-        super().__init__(head)
-        self.exif, self.reads = list[bytes](), 0
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        self.reads += 1
-        if self.reads > MAX_READS:
-            raise NotAnImageError(
-                f"the JPEG's header does not end within {MAX_READS // 4} segments, or "
-                f"{MAX_READS} stray bytes; save it anew from the original"
-            )
-        data = super().read(size)
-        if not data.startswith(b"Exif\0"):
-            return data
-        self.exif.append(data)
-        return bytes(len(data))
-
-
 def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
     """Let Pillow read the segments up to the first scan: frame size, XMP, profile, quantisation."""
-    segments = _Segments(buffer[:MAX_HEAD_BYTES])
+    segments = JpegSegments(buffer[:MAX_HEAD_BYTES])
     try:
-        image = JpegImageFile(segments)
+        image = opened_jpeg(segments)
     except (OSError, SyntaxError, ValueError) as error:
         if segments.tell() < len(segments.getbuffer()):
             raise NotAnImageError(
@@ -188,7 +162,7 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         bits=image.bits,
         tiff=tuple(reader for reader in readers if reader is not None),
         xmp=image.info.get("xmp"),
-        icc=image.info.get("icc_profile"),
+        icc=segments.profile(),
         # cameras give the first table to luma
         coarseness=float(statistics.median(image.quantization.get(0, [0]))),
         chroma_step=_chroma_step(image.layer),
@@ -207,6 +181,9 @@ def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]
 
 
 # --- PNG ---------------------------------------------------------------------------------------
+
+_OF_PICTURE: Final = {b"PLTE", b"tRNS", b"IDAT"}
+_PNG_END: Final = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
 def _read_png(buffer: Buffer, limits: Limits) -> Header:
@@ -230,7 +207,8 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         if name == b"eXIf" and (reader := TiffReader.open(body)):
             header = replace(header, tiff=(*header.tiff, reader))
         elif name == b"iCCP":
-            header = replace(header, icc=_inflated(body.partition(b"\0")[2][1:]))
+            profile = _inflated(body.partition(b"\0")[2][1:])
+            header = replace(header, icc=profile, icc_lost=profile is None)
         elif name == b"iTXt" and body.startswith(b"XML:com.adobe.xmp\0"):
             text = body[20:].partition(b"\0")[2].partition(b"\0")[2]
             header = replace(header, xmp=_inflated(text) if body[18:19] == b"\1" else text)
@@ -241,8 +219,8 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     return replace(header, icc=profile_by_chunks(header.icc, declared))
 
 
-def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, start and length of the chunks; of a run of image data only the first."""
+def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, int, int]]:
+    """Yield name, start and length of the chunks; of a run of image data only the first, or `every` one."""
     at, count, before = 33, 0, b"IHDR"
     while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
@@ -257,10 +235,18 @@ def png_chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
             )
         if name == b"IEND":
             return
-        if not name == before == b"IDAT":
-            count += 1
+        again = name == before == b"IDAT"
+        count += not again
+        if every or not again:
             yield name, at + 8, length
         before, at = name, at + 12 + length
+
+
+def png_picture(data: bytes) -> bytes:
+    """A PNG without all that is not its picture: decoders unpack that too, and print what they find amiss."""
+    chunks = png_chunks(data, every=True)
+    kept = (data[start - 8 : start + length + 4] for name, start, length in chunks if name in _OF_PICTURE)
+    return data[:33] + b"".join(kept) + _PNG_END
 
 
 def _inflated(packed: bytes) -> bytes | None:
@@ -275,6 +261,7 @@ def _inflated(packed: bytes) -> bytes | None:
 
 # --- TIFF, DNG and RAW files that look like TIFF -----------------------------------------------
 
+_ICC: Final = 34675  # tag of the profile: ICC.1:2022, annex B.4
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 _LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
 _JPEG: Final = {6, 7}  # compression, of TIFF 6.0 and of its technical note 2
@@ -314,8 +301,9 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         directory=place if kind == "tiff" else 0,
         tiff=(reader,),
         xmp=_block(first, 700),
-        icc=_block(photo if kind == "tiff" else first, 34675),
+        icc=_block(photo, _ICC) if kind == "tiff" else None,
     )
+    header = replace(header, icc_lost=kind == "tiff" and _ICC in photo and header.icc is None)
     check_size(header.width, header.height, len(buffer), limits)
     if kind == "tiff":
         if len(chain) >= MAX_DIRECTORIES:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -17,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.core.errors import (
-    ImageTooLargeError,
     LensModelError,
     NotAnImageError,
     TruncatedImageError,
@@ -27,8 +23,9 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Planes
-from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
-from lensmodel.photo.containers import Header
+from lensmodel.photo.colour import CODES, curves_of, decode, is_of_rgb, matrix_profile
+from lensmodel.photo.containers import Header, png_picture
+from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
 from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, PhotoMetadata, Transfer
@@ -36,8 +33,8 @@ from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, PhotoMetada
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col)` or `(row, col, channel)`."""
 
-UNDECODABLE: Final = (Image.DecompressionBombError, OSError, SyntaxError, ValueError)
-"""What Pillow raises at pictures that are damaged or hostile."""
+UNDECODABLE: Final = (NotAnImageError, OSError, SyntaxError, ValueError)
+"""What is raised at JPEGs that are damaged or hostile."""
 
 _TURNED: Final = (
     "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
@@ -54,7 +51,7 @@ def develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
         raise UnreadablePhotoError(
             f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
         )
-    transfer, icc = _transfer_of(said, pixels)
+    transfer, icc, without = _transfer_of(said, pixels)
     curves = curves_of(transfer, icc)
     planes: Planes = np.empty((3, height, width), dtype=np.float32)
     for k, curve in enumerate(curves):
@@ -82,21 +79,27 @@ def develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
         chroma_step=header.chroma_step[::-1] if info.turns else header.chroma_step,
         remarks=(
             *(("its transparency is dropped",) if transparent else ()),
+            *without,
             *((_TURNED,) if info.turns is None else ()),
         ),
     )
 
 
-def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None]:
-    """Which curve the file's numbers follow, and the profile that goes back into the output."""
-    icc = said.header.icc
+def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tuple[str, ...]]:
+    """Which curve the numbers follow, the profile for the output, and a word on one that is left out."""
+    icc, lost, floating = said.header.icc, said.header.icc_lost, pixels.dtype.kind == "f"
     if icc is not None and matrix_profile(icc) is not None:
-        return "icc", icc
-    if pixels.dtype.kind == "f":
-        return "linear", None
-    if icc is None and (declared := said.profile()) is not None:
-        return "icc", declared
-    return "srgb", icc if icc is not None and icc_space(icc) == "RGB" else None
+        return "icc", icc, _without_profile("its other tags say") if lost else ()
+    if icc is not None and not floating and is_of_rgb(icc):
+        return "srgb", icc, ()
+    declared = None if floating else said.profile()
+    instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
+    without = _without_profile(instead) if lost or icc is not None else ()
+    return ("linear" if floating else "icc" if declared else "srgb"), declared, without
+
+
+def _without_profile(instead: str) -> tuple[str, ...]:
+    return (f"its ICC profile is damaged or not for RGB: its colours are read as {instead}",)
 
 
 def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
@@ -107,32 +110,19 @@ def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
             with tifffile.TiffFile(path) as file:
                 file.filehandle.seek(header.directory)
                 pixels = _tiff_page(tifffile.TiffPage(file, 0))
-        elif header.kind == "png" and header.bits == 16:
-            pixels = imagecodecs.png_decode(path.read_bytes())
+        elif header.kind == "png":
+            pixels = imagecodecs.png_decode(png_picture(path.read_bytes()))
         else:
-            with unwarned(), Image.open(path, formats=(name,)) as image:
-                opaque = "transparency" not in image.info and not image.mode.endswith("A")
-                pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
+            with opened_jpeg(JpegSegments(path.read_bytes())) as image:
+                pixels = np.asarray(image.convert("RGB"))
         alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
         return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
     except (MemoryError, LensModelError):
         raise
-    except Image.DecompressionBombError as error:
-        raise ImageTooLargeError(
-            f"{header.width} x {header.height} pixels are more than the decoder takes"
-        ) from error
     except Exception as error:  # decoders meet hostile files with exceptions of any kind
         if "truncated" in str(error):
             raise TruncatedImageError(f"the {name} ends before its picture does ({error})") from error
         raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
-
-
-@contextmanager
-def unwarned() -> Iterator[None]:
-    """Silence Pillow on large pictures: our own limit is checked on the header, before it decodes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        yield
 
 
 def _tiff_page(page: tifffile.TiffPage) -> Pixels:
@@ -188,6 +178,7 @@ ORIENTATION: Final = {1: 6, 3: 8}  # of the sensor's pixels, by the quarter turn
 _OFFSET, _LENGTH = 0x0201, 0x0202  # of a JPEG thumbnail in the second directory of EXIF
 _MOST_BYTES: Final = 1 << 20  # of a thumbnail: the block of EXIF in a JPEG holds 64 KiB
 _MOST_PIXELS: Final = 1 << 20
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601, as in a JPEG
 _ROWS: Final = 48  # of both pictures when they are compared (chosen)
 _ALIKE: Final = 0.9  # least correlation with the thumbnail (chosen: compression leaves more than .98)
 _CLEARER: Final = 0.2  # by which the other turn correlates less, at least (chosen)
@@ -207,10 +198,8 @@ def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int 
     if thumbnail is None or thumbnail.height >= thumbnail.width:
         return None
     try:
-        with unwarned(), Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
-            image.draft("L", (256, 256))
-            picture = np.asarray(image.convert("L"), dtype=np.float64)
-    except UNDECODABLE:
+        picture = _lightness(path, header)
+    except (LensModelError, *UNDECODABLE):
         return None
     aspect = picture.shape[0] / picture.shape[1]
     seen = _sized(_without_bars(np.asarray(thumbnail, dtype=np.float64), aspect), aspect)
@@ -231,12 +220,21 @@ def require_known_turn(info: PhotoInfo) -> None:
         )
 
 
+def _lightness(path: Path, header: Header) -> NDArray[np.float32]:
+    """The picture in grey, `(row, col)`; a JPEG is decoded small."""
+    if header.kind == "jpeg":
+        with opened_jpeg(JpegSegments(path.read_bytes())) as image:
+            image.draft("L", (256, 256))
+            return np.asarray(image.convert("L"), dtype=np.float32)
+    return read_pixels(path, header)[0] @ _LUMA
+
+
 def _thumbnail(header: Header) -> Image.Image | None:
     for reader in header.tiff:
         tags, _ = reader.directory(reader.directory(reader.first)[1])
         begin, size = reader.base + tags.integer(_OFFSET), min(tags.integer(_LENGTH), _MOST_BYTES)
-        with suppress(*UNDECODABLE), unwarned():
-            image = Image.open(io.BytesIO(reader.buffer[begin : begin + size]), formats=("JPEG",))
+        with suppress(*UNDECODABLE):
+            image = opened_jpeg(JpegSegments(reader.buffer[begin : begin + size]))
             if image.width * image.height <= _MOST_PIXELS:
                 return image.convert("L")
     return None

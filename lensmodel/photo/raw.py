@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,10 +21,11 @@ from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3, srgb_to_linear
 from lensmodel.photo.defects import Suspects
+from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
-from lensmodel.photo.raster import UNDECODABLE, unwarned
+from lensmodel.photo.raster import UNDECODABLE
 from lensmodel.photo.values import Encoding, LensIdentity, LinearPhoto, PhotoInfo, PhotoMetadata, PlaneNoise
 
 log = logging.getLogger(__name__)
@@ -318,12 +318,11 @@ def _jpeg_of(raw: rawpy.RawPy) -> Image.Image | None:
         thumb = raw.extract_thumb()
         if thumb.format != rawpy.ThumbFormat.JPEG or not isinstance(thumb.data, bytes):
             return None
-        with unwarned():
-            picture = Image.open(io.BytesIO(thumb.data), formats=("JPEG",))
-            if picture.width * picture.height > _MOST_JPEG_PIXELS or min(picture.size) < _SMALLEST_JPEG // 2:
-                return None
-            picture.draft("RGB", (4 * _BLOCKS, 4 * _BLOCKS))
-            return picture.convert("RGB") if picture.mode in {"RGB", "L"} else None
+        picture = opened_jpeg(JpegSegments(thumb.data))
+        if picture.width * picture.height > _MOST_JPEG_PIXELS or min(picture.size) < _SMALLEST_JPEG // 2:
+            return None
+        picture.draft("RGB", (4 * _BLOCKS, 4 * _BLOCKS))
+        return picture.convert("RGB") if picture.mode in {"RGB", "L"} else None
     except (rawpy.LibRawError, *UNDECODABLE):
         return None
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import warnings
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from lensmodel import photo
 from lensmodel.core.errors import NotAnImageError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
-from lensmodel.photo.tiff import laid_out, longs, shorts
+from lensmodel.photo.tiff import laid_out, longs, shorts, text
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 RNG = np.random.default_rng(5)
@@ -267,3 +269,63 @@ def test_exif_of_a_jpeg_is_read_within_bounds_and_without_a_warning(tmp_path: Pa
 
     assert info.metadata.camera_model == "T-1"
     assert not said
+
+
+def overlapping(kind: bytes, tags: int = 4000, most: int = 16_000) -> bytes:
+    """A directory whose values are each all that follows it."""
+    entries = b"".join(struct.pack("<HHII", 2000 + tag, 7, most, 8) for tag in range(tags))
+    return kind + b"II*\0\x08\0\0\0" + struct.pack("<H", tags) + entries + bytes(4)
+
+
+HOSTILE = {
+    "Exif": _segments(0xE1, overlapping(b"Exif\0\0")),
+    "Exif in many parts": _segments(0xE1, overlapping(b"Exif\0\0"), *[b"Exif\0\0" + bytes(65_000)] * 100),
+    "list of pictures": _segments(0xE2, overlapping(b"MPF\0")),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_what_stands_beside_a_jpeg_costs_nothing_while_it_is_decoded(case: str, tmp_path: Path) -> None:
+    path = _with_segments(tmp_path / "x.jpg", HOSTILE[case], camera="T-1")
+    size = path.stat().st_size
+    photo.develop(_with_segments(tmp_path / "first.jpg", b""))  # compiles
+
+    tracemalloc.start()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        developed = photo.develop(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert developed.planes.shape == (3, 48, 64)
+    assert most < 4 * size + (16 << 20)
+
+
+def test_a_turned_jpeg_is_looked_at_within_the_same_bounds(tmp_path: Path) -> None:
+    block = b"Exif\0\0" + laid_out({0x0110: text("T-1"), 0x0112: shorts(1)}, {})
+    upright = np.ascontiguousarray(np.rot90(PIXELS))
+    Image.fromarray(upright).save(tmp_path / "x.jpg", exif=block)
+    data = (tmp_path / "x.jpg").read_bytes()
+    (tmp_path / "x.jpg").write_bytes(data[:2] + HOSTILE["list of pictures"] + data[2:])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert photo.inspect(tmp_path / "x.jpg").turns is None
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "1"])
+@pytest.mark.parametrize("beside", [b"iCCP", b"zTXt", b"gAMA"])
+def test_what_stands_beside_a_png_is_not_unpacked_to_decode_it(
+    mode: str, beside: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    image = Image.fromarray(PIXELS).convert(mode)
+    image.save(tmp_path / "x.png")
+    data = (tmp_path / "x.png").read_bytes()
+    body = b"" if beside == b"gAMA" else b"x\0\0" + zlib.compress(bytes(12 << 20))
+    chunk = struct.pack(">I", len(body)) + beside + body + struct.pack(">I", zlib.crc32(beside + body))
+    (tmp_path / "x.png").write_bytes(data[:33] + chunk + data[33:])
+
+    shown = numbers(tmp_path / "x.png")
+
+    assert (shown == np.asarray(image.convert("RGB"))).all()
+    assert capfd.readouterr() == ("", "")  # libpng prints what it finds amiss

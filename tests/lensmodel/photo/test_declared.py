@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image, ImageCms
 from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
 from lensmodel.core.errors import UnsupportedFormatError
-from lensmodel.photo.colour import matrix_profile
+from lensmodel.photo.colour import matrix_profile, named_profile
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 ADOBE = (0.3127, 0.3290, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
@@ -171,3 +172,112 @@ def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:
     Image.fromarray(PIXELS).save(tmp_path / "x.jpg", exif=block, icc_profile=srgb)
 
     assert photo.develop(tmp_path / "x.jpg").encoding.icc == srgb
+
+
+def parts_of(profile: bytes, marks: list[tuple[int, int]]) -> bytes:
+    """Segments of a JPEG with the parts of a profile, each with a number and a count."""
+    ends = [len(profile) * k // len(marks) for k in range(len(marks) + 1)]
+    bodies = [
+        b"ICC_PROFILE\0" + bytes(mark) + profile[first:last]
+        for mark, first, last in zip(marks, ends, ends[1:], strict=False)
+    ]
+    return b"".join(struct.pack(">BBH", 0xFF, 0xE2, len(body) + 2) + body for body in bodies)
+
+
+def jpeg_with(segments: bytes, exif: Image.Exif | None = None) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(PIXELS).save(
+        out, "JPEG", quality=100, subsampling=0, exif=Image.Exif() if exif is None else exif
+    )
+    return out.getvalue()[:2] + segments + out.getvalue()[2:]
+
+
+ADOBE_PROFILE = named_profile("adobergb")
+
+
+@pytest.mark.parametrize(
+    "marks",
+    [
+        [(1, 2), (2, 2)],
+        [(1, 0), (2, 0)],
+        [(1, 9), (2, 9), (3, 9)],
+        [(0, 2), (1, 2)],
+        [(1, 1), (1, 1), (1, 1)],
+    ],
+)
+def test_a_profile_whose_parts_are_miscounted_is_honoured_all_the_same(
+    marks: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    (tmp_path / "x.jpg").write_bytes(jpeg_with(parts_of(ADOBE_PROFILE, marks)))
+    developed = photo.develop(tmp_path / "x.jpg")
+
+    assert (developed.encoding.icc, developed.remarks) == (ADOBE_PROFILE, ())
+    assert np.abs(shown_in_srgb(written(tmp_path / "x.jpg", tmp_path)) - srgb_of(ADOBE, 563 / 256)).mean() < 1
+
+
+def test_a_profile_that_stands_twice_in_a_jpeg_is_one(tmp_path: Path) -> None:
+    twice = 2 * parts_of(ADOBE_PROFILE, [(1, 2), (2, 2)])
+    (tmp_path / "x.jpg").write_bytes(jpeg_with(twice))
+
+    assert photo.develop(tmp_path / "x.jpg").encoding.icc == ADOBE_PROFILE
+
+
+def of_cmyk() -> bytes:
+    profile = bytearray(ADOBE_PROFILE)
+    profile[16:20] = b"CMYK"
+    return bytes(profile)
+
+
+def png_icc(packed: bytes) -> bytes:
+    return png_with(chunk(b"iCCP", b"x\0\0" + packed))
+
+
+def tiff_icc(profile: bytes, pixels: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    tifffile.imwrite(out, pixels, photometric="rgb", iccprofile=profile, metadata=None)
+    return out.getvalue()
+
+
+UNUSABLE = {
+    "x.jpg, a part is missing": jpeg_with(
+        parts_of(ADOBE_PROFILE, [(1, 3), (2, 3), (3, 3)])[: -len(ADOBE_PROFILE) // 3 - 18]
+    ),
+    "x.jpg, nonsense": jpeg_with(parts_of(bytes(200), [(1, 1)])),
+    "x.jpg, CMYK": jpeg_with(parts_of(of_cmyk(), [(1, 1)])),
+    "x.png, not packed": png_icc(ADOBE_PROFILE),
+    "x.png, cut": png_icc(zlib.compress(ADOBE_PROFILE[:300])),
+    "x.tif, cut": tiff_icc(ADOBE_PROFILE[:300], PIXELS),
+    "x.tif, float": tiff_icc(ADOBE_PROFILE[:300], PIXELS.astype(np.float32) / 255),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_a_profile_that_cannot_be_used_is_left_out_with_a_word(case: str, tmp_path: Path) -> None:
+    path = tmp_path / case.split(",", maxsplit=1)[0]
+    path.write_bytes(UNUSABLE[case])
+    developed = photo.develop(path)
+
+    (remark,) = developed.remarks
+    assert remark.endswith("read as linear light" if "float" in case else "read as sRGB")
+    assert (developed.encoding.transfer, developed.encoding.icc) == (
+        "linear" if "float" in case else "srgb",
+        None,
+    )
+
+
+@pytest.mark.parametrize("name", ["x.jpg", "x.png"])
+def test_where_a_profile_cannot_be_used_the_file_says_its_colours_otherwise(
+    name: str, tmp_path: Path
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 2  # AdobeRGB
+    data = jpeg_with(parts_of(bytes(200), [(1, 1)]), exif)
+    if name == "x.png":
+        data = png_with(chunk(b"iCCP", b"x\0\0" + ADOBE_PROFILE), chrm(ADOBE), gama(256 / 563))
+    (tmp_path / name).write_bytes(data)
+    developed = photo.develop(tmp_path / name)
+
+    known = matrix_profile(developed.encoding.icc or b"")
+    assert known is not None
+    assert known.to_xyz[:, 1] == pytest.approx([0.2053, 0.6257, 0.0609], abs=2e-3)  # AdobeRGB's green, D50
+    assert developed.remarks[0].endswith("read as its other tags say")

@@ -99,29 +99,18 @@ def correction_layer(
 _TURNS: Final = {1: "", 2: "c", 3: "rc", 4: "r", 5: "t", 6: "tc", 7: "trc", 8: "tr"}
 
 
-def turned_box(
-    top: int, left: int, bottom: int, right: int, height: int, width: int, orientation: int
-) -> tuple[int, int, int, int]:
-    """Turn a part of a picture of `height` x `width` by EXIF orientation: top, left, height, width."""
-    turn = _TURNS.get(orientation, "")
-    if "t" in turn:
-        top, left, bottom, right, height, width = left, top, right, bottom, width, height
-    if "r" in turn:
-        top, bottom = height - bottom, height - top
-    if "c" in turn:
-        left, right = width - right, width - left
-    return top, left, bottom - top, right - left
-
-
-_BACK: Final = {6: 8, 8: 6}  # EXIF orientations whose inverse differs from them, with that inverse
-
-
 def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:
     """Return a part of the upright picture in the coordinates of the sensor, which has `height` x `width`."""
-    shape = (width, height) if orientation > 4 else (height, width)
-    ends = (part.y, part.x, part.y + part.height, part.x + part.width)
-    top, left, rise, run = turned_box(*ends, *shape, _BACK.get(orientation, orientation))
-    return Region(x=left, y=top, width=run, height=rise)
+    turn, x, y = _TURNS.get(orientation, ""), part.x, part.y
+    if "t" in turn:
+        height, width = width, height
+    if "r" in turn:
+        y = height - y - part.height
+    if "c" in turn:
+        x = width - x - part.width
+    if "t" in turn:
+        return Region(x=y, y=x, width=part.height, height=part.width)
+    return Region(x=x, y=y, width=part.width, height=part.height)
 
 
 def exists(storage: Storage, key: str) -> bool:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -23,18 +25,21 @@ from app.errors import InvalidParameterError, NotReadyError
 from app.http import errors, views
 from app.http.dependencies import Call, CallDep, OneSession, call_of
 from app.jobs.task_files import SHOWN, SIDES
-from app.pages import pictures, shown, words
+from app.pages import pictures, shown
 from app.routes.common import file_headers
 from app.routes.corrections import begin, list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
 from app.routes.photos import get_photo
-from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, blank_is_none
+from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, Working, blank_is_none
 from app.store.database import new_id
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
+from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.names import full_name
 from lensmodel.core.types import ZONES
+from lensmodel.correction.audit import HELD
 from lensmodel.photo.values import ENDINGS
-from lensmodel.report import LensReport, Side, Unit, compare
+from lensmodel.report import LensReport, Side, Unit, caution, compare, sharpness
 from lensmodel.report.tables import place_table
 from lensmodel.workflow.correcting import SEEN_DB
 
@@ -68,8 +73,17 @@ router = APIRouter(include_in_schema=False, route_class=OneSession)
 strangers = APIRouter(include_in_schema=False, route_class=OneSession)
 
 templates = Environment(loader=PackageLoader("app.pages"), autoescape=select_autoescape(), trim_blocks=True)
-templates.filters.update(words.FILTERS)
-templates.globals["picker_endings"] = ",".join((*sorted(ENDINGS), "image/*"))
+templates.filters.update(
+    sharpness=sharpness,
+    caution=caution,
+    gain_words=gain_words,
+    f_stop="f/{:.3g}".format,
+    plain=partial(re.sub, r" \([^)]*\)", ""),  # without the figures in brackets, which are for testers
+)
+templates.globals.update(
+    picker_endings=",".join((*sorted(ENDINGS), "image/*")), full_name=full_name, HELD=HELD
+)
+templates.globals["words"] = templates.get_template("words.html").module  # in all of them
 
 
 def include(site: APIRouter) -> None:
@@ -162,7 +176,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         "photo.html",
         photo=_upright(photo, row),
         can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
-        gently=row.kind == "jpeg",
+        row=row,
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
@@ -171,7 +185,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         lens=lens,
         corrections=corrections,
         done=done,
-        nothing=words.nothing_words(row.kind),
         least=SEEN_DB,
         before=f"{shown_by}/before",
         after=f"{shown_by}/after" if better else None,
@@ -213,24 +226,16 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
     plan = call.correction(correction_id)
     correction, row = views.correction_out(plan), plan.photo
-    report = correction.report or {}
-    audit = report.get("audit") or {}
-    changed = not report.get("nothing_to_correct")
-    looked = correction.roi is None and changed
+    looked = correction.roi is None and not (plan.report or {}).get("nothing_to_correct")
     can_look = looked and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
-    zones, most_gain = words.gain_bars(report.get("zones") or {})
     return page(
         "correction.html",
         correction=correction,
         job=views.job_out(plan),
         photo=_upright(views.photo_out(row), row),
+        row=row,
         can_look=can_look,
-        zones=zones if changed else [],
-        most_gain=most_gain,
-        nothing=words.nothing_words(row.kind),
         learned_from=0 if plan.lens is None else plan.lens.photo_count,
-        audit=words.held_back(audit) if changed else None,
-        held=words.held_map(audit, row.height or 0, row.width or 0, row.orientation or 1) if can_look else [],
         places=PLACES,
     )
 
@@ -362,7 +367,7 @@ def lens_charts(
     if not against or (at is not None and at == aperture):
         return page("_charts.html", **_charts(test, aperture, unit))
     if at is not None:  # two apertures of one lens
-        sides = [Side(words.f_stop(number or 0.0), test.at(number)) for number in (aperture, at)]
+        sides = [Side(f"f/{number or 0:.3g}", test.at(number)) for number in (aperture, at)]
     else:
         other = stored_report(call, call.lens(against))
         same = aperture if aperture in other.apertures else None
@@ -438,7 +443,7 @@ def _home(call: Call, _: str = "") -> Part:
 
 def _photo(call: Call, photo_id: str) -> Part:
     photo = get_photo(photo_id, call)
-    return "_photo_state.html", {"photo": photo}, not words.active(photo)
+    return "_photo_state.html", {"photo": photo}, photo.state not in get_args(Working)
 
 
 def _correction(call: Call, correction_id: str) -> Part:

@@ -98,8 +98,8 @@ class Gate:
         """Say whether access is still valid: long responses check it repeatedly."""
         return not self.is_closed() if who.token is None else self._look_up(who.token) is not None
 
-    def sign_in(self, text: str) -> tuple[Who, str]:
-        """Begin a session with a key; return its owner, and the token for the browser."""
+    def sign_in(self, text: str) -> str:
+        """Begin a session with a key; return the token for the browser."""
         who = self._look_up(accounts.digest_of(text)) if accounts.is_key(text) else None
         if who is None or who.key_id is None:
             raise ServiceError(
@@ -107,7 +107,7 @@ class Gate:
             )
         token = secrets.token_urlsafe(32)
         self._store.sign_in(who.key_id, accounts.digest_of(token), SESSION)
-        return who, token
+        return token
 
     def sign_out(self, request: Request) -> None:
         """End the session of a browser."""

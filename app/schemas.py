@@ -463,61 +463,18 @@ class Readiness(Model):
     sandbox: dict[str, bool] = Field(description="which measures confine what decodes photos")
 
 
-class VersionOut(Model):
-    """What runs here."""
-
-    name: str
-    version: str
-    api: str
-    schema_revision: str | None
-
-
-class FormatsOut(Model):
-    """What can be read and written, and the methods by name."""
-
-    read: list[str]
-    write: list[str]
-    color_spaces: list[str]
-    psf: list[str]
-    methods: list[str]
-    estimators: list[str]
-    selectors: list[str]
-
-
-class LimitsOut(Model):
-    """How much of everything."""
-
-    max_upload_bytes: int
-    max_megapixels: float
-    max_queued_photos: int
-    max_stored_bytes: int
-    max_psf_size: int
-    long_poll_seconds: float
-    keep_results_days: float
-
-
 class SignIn(Question):
     """The key with which a browser signs in."""
 
     key: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class Owner(Model):
-    """Who asks, and what he may; on a service of one owner without keys, that one."""
+class AccountOut(Model):
+    """Who asks, what he may and has, and may have."""
 
     owner: str
     scopes: list[Literal["read", "write", "admin"]]
-
-
-class SessionOut(Owner):
-    """Who is signed in."""
-
-    needed: bool = Field(description="whether one must sign in here at all")
-
-
-class AccountOut(Owner):
-    """What an owner has, and may have."""
-
+    signed_in: bool = Field(description="whether by a key: nobody needs one on a service of one owner")
     photos: int
     max_photos: int
     stored_bytes: int

@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Depends, Path, Response
+from fastapi.responses import StreamingResponse
 
 from app.blobs import tiles
 from app.blobs.storage import Storage
@@ -32,8 +33,17 @@ NOTHING: Final = (
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 
 
-def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
-    return Response(data, media_type=media_type, headers={"Cache-Control": "private, max-age=3600"})
+_KEPT: Final = {"Cache-Control": "private, max-age=3600"}
+
+
+def _picture(data: bytes) -> Response:
+    return Response(data, media_type="image/jpeg", headers=_KEPT)
+
+
+def _file(storage: Storage, key: str, media_type: str) -> Response:
+    """Send a file that a child has written, in pieces; FileNotFoundError where there is none."""
+    body = storage.stream(key, 0, storage.size(key))
+    return StreamingResponse(body, media_type=media_type, headers=_KEPT)
 
 
 @router.get("/ui/photos/{photo_id}/thumbnail.jpg")
@@ -41,7 +51,7 @@ def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
     """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
     folder = call.photo(photo_id).folder
     with suppress(FileNotFoundError):
-        return _picture(call.storage.get(f"{folder}{THUMBNAIL}"))
+        return _file(call.storage, f"{folder}{THUMBNAIL}", "image/jpeg")
     with suppress(NotReadyError):
         return _picture(tiles.whole(call.storage, f"{folder}{SHOWN}"))
     return Response(NOTHING, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
@@ -89,7 +99,7 @@ def correction_layer(
     """Show a part of a photo as the sliders of a preview mix it."""
     key = f"{_compared(call, correction_id).run_folder}{LAYER_FILES[name]}"
     try:
-        return _picture(call.storage.get(key), "image/png")
+        return _file(call.storage, key, "image/png")
     except FileNotFoundError as error:
         text = f"correction {correction_id} has no layer {name}: it is of a whole photo, or without layers"
         raise NotReadyError(text) from error

@@ -10,14 +10,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import BeforeValidator, Field
 
 from app.blobs import tiles
 from app.blobs.zipped import zipped
@@ -30,21 +30,17 @@ from app.routes.common import file_headers
 from app.routes.corrections import begin, list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
 from app.routes.photos import get_photo
-from app.schemas import Aperture, CalibrationOut, CorrectionIn, Id, PhotoOut, Region, Working, blank_is_none
+from app.schemas import Aperture, CorrectionIn, Id, PhotoOut, Region, Working, blank_is_none
 from app.store.database import new_id
 from app.store.tables import CorrectionRow, LensRow, PhotoRow
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
-from lensmodel.core.types import ZONES
 from lensmodel.correction.audit import HELD
 from lensmodel.photo.values import ENDINGS
-from lensmodel.report import LensReport, Side, Unit, caution, compare, sharpness
+from lensmodel.report import LensReport, Unit, caution, sharpness
 from lensmodel.report.tables import place_table
 from lensmodel.workflow.correcting import SEEN_DB
-
-if TYPE_CHECKING:
-    from lensmodel.report.plots import Chart
 
 STATIC: Final = Path(__file__).parent / "static"
 HEADERS: Final = {
@@ -288,7 +284,6 @@ def unused_name(name: str, used: set[str]) -> str:
 
 # --- lenses -------------------------------------------------------------------------------------------
 
-_APERTURE: Final = TypeAdapter[float](Aperture)
 ChosenAperture = Annotated[Aperture | None, BeforeValidator(blank_is_none), Query()]  # of a form
 
 
@@ -341,56 +336,26 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
         lens=lens,
         counting=shown.counting(call, lens_id),
         history=history,
-        curve=_error_history(history),
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         aspect=_aspect(call, row),
-        comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
         test=test,
-        **({} if test is None else _charts(test, None, "c/px")),
+        **({} if test is None else _charts(test)),
     )
 
 
 @router.get("/ui/lenses/{lens_id}/charts")
 def lens_charts(
-    lens_id: str,
-    call: CallDep,
-    aperture: ChosenAperture = None,
-    unit: Unit = "c/px",
-    against: Annotated[str, Query(max_length=60)] = "",
+    lens_id: str, call: CallDep, aperture: ChosenAperture = None, unit: Unit = "c/px"
 ) -> HTMLResponse:
-    """Show the charts of one aperture, or two lenses or apertures in one."""
-    from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
-
-    test = stored_report(call, call.lens(lens_id))
-    at = _APERTURE.validate_python(against.removeprefix("at ")) if against.startswith("at ") else None
-    if not against or (at is not None and at == aperture):
-        return page("_charts.html", **_charts(test, aperture, unit))
-    if at is not None:  # two apertures of one lens
-        sides = [Side(f"f/{number or 0:.3g}", test.at(number)) for number in (aperture, at)]
-    else:
-        other = stored_report(call, call.lens(against))
-        same = aperture if aperture in other.apertures else None
-        sides = [Side(test.name, test.at(aperture)), Side(other.name, other.at(same))]
-    comparison = compare(*sides)
-    return page("_charts.html", comparison=comparison, charts=comparison_charts(comparison))
+    """Show the charts of one aperture."""
+    return page("_charts.html", **_charts(stored_report(call, call.lens(lens_id)), aperture, unit))
 
 
-def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, Any]:
-    from lensmodel.report.plots import charts  # noqa: PLC0415 - as above
+def _charts(test: LensReport, aperture: float | None = None, unit: Unit = "c/px") -> dict[str, Any]:
+    from lensmodel.report.plots import charts  # noqa: PLC0415 - matplotlib is slow to import
 
     return {"charts": charts(test, aperture, unit), "table": place_table(test)}
-
-
-def _error_history(history: Sequence[CalibrationOut]) -> Chart | None:
-    """Draw the errors of versions that were measured; None where one point would be no curve."""
-    from lensmodel.report.plots import error_history  # noqa: PLC0415 - as above
-
-    measured = [(event.version, event.error) for event in history if event.error]
-    if len(measured) < 2:
-        return None
-    errors = {zone: [error.get(zone) for _, error in measured] for zone in ZONES}
-    return error_history([version for version, _ in measured], errors)
 
 
 def _test(call: Call, lens: LensRow) -> LensReport | None:

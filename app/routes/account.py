@@ -16,7 +16,7 @@ from app.http.middleware import host_name
 from app.routes.common import file_answer, file_headers
 from app.routes.photos import most
 from app.runtime.settings import LOOPBACK
-from app.schemas import AccountOut, SessionOut, SignIn
+from app.schemas import AccountOut, SignIn
 
 router = APIRouter(tags=["account"], route_class=OneSession)
 # Open to strangers, of whom one may be about to sign in
@@ -28,9 +28,9 @@ def get_account(call: CallDep) -> AccountOut:
     """Return what the owner has, and may have."""
     usage = call.store.accounts.usage(call.owner)
     max_bytes, max_photos = most(call.settings, usage)
-    most_of_it = {"max_photos": max_photos, "max_stored_bytes": max_bytes}
-    owner = {"owner": call.owner, "scopes": call.who.scopes}
-    return AccountOut.model_validate({**asdict(usage), **most_of_it, **owner})
+    told = asdict(usage) | {"max_photos": max_photos, "max_stored_bytes": max_bytes}
+    told |= {"owner": call.owner, "scopes": call.who.scopes, "signed_in": call.who.key_id is not None}
+    return AccountOut.model_validate(told)
 
 
 @router.get(
@@ -59,10 +59,10 @@ def erase_account(call: CallDep) -> None:
     call.response.delete_cookie(COOKIE)
 
 
-@sign_ins.post("/session", status_code=201)
-async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
+@sign_ins.post("/session", status_code=204)
+async def sign_in(credentials: SignIn, call: ProbeDep) -> None:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
-    who, token = await run_in_threadpool(call.gate.sign_in, credentials.key.strip())
+    token = await run_in_threadpool(call.gate.sign_in, credentials.key.strip())
     call.response.set_cookie(
         COOKIE,
         token,
@@ -71,14 +71,6 @@ async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
         samesite="strict",
         secure=must_be_secure(call.request),
     )
-    return SessionOut.model_validate({"owner": who.owner, "scopes": who.scopes, "needed": True})
-
-
-@sign_ins.get("/session")
-async def get_session(call: CallDep) -> SessionOut:
-    """Return who is signed in."""
-    needed = call.who.key_id is not None
-    return SessionOut.model_validate({"owner": call.owner, "scopes": call.who.scopes, "needed": needed})
 
 
 @sign_ins.delete("/session", status_code=204)

@@ -16,7 +16,7 @@ from app.routes.photos import GIB, MAX_UNFINISHED
 from app.routes.psf import MEDIA_TYPES
 from app.runtime import metrics
 from app.sandbox import confine
-from app.schemas import MAX_PSF_SIZE, ColorSpace, FormatsOut, LimitsOut, OutputFormat, Readiness, VersionOut
+from app.schemas import MAX_PSF_SIZE, ColorSpace, OutputFormat, Readiness
 from app.store import migrate
 from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
@@ -101,36 +101,36 @@ def get_metrics(call: CallDep) -> Response:
 
 
 @router.get("/version")
-def get_version(call: CallDep) -> VersionOut:
-    """Return what runs here."""
+def get_version(call: CallDep) -> dict[str, str | None]:
+    """Return what runs here, and which revision of the schema the database has."""
     revision = migrate.current(call.store.database)
-    return VersionOut(name="lensmodel", version=version("lensmodel"), api="v1", schema_revision=revision)
+    return {"name": "lensmodel", "version": version("lensmodel"), "api": "v1", "schema_revision": revision}
 
 
 @router.get("/formats")
-def get_formats() -> FormatsOut:
+def get_formats() -> dict[str, list[str]]:
     """Return what can be read and written, and the methods by name."""
-    return FormatsOut(
-        read=["raw", "dng", "tiff", "png", "jpeg"],
-        write=list(get_args(OutputFormat)),
-        color_spaces=list(get_args(ColorSpace)),
-        psf=list(MEDIA_TYPES),
-        methods=list(deconvolvers),
-        estimators=list(estimators),
-        selectors=list(selectors),
-    )
+    return {
+        "read": ["raw", "dng", "tiff", "png", "jpeg"],
+        "write": list(get_args(OutputFormat)),
+        "color_spaces": list(get_args(ColorSpace)),
+        "psf": list(MEDIA_TYPES),
+        "methods": list(deconvolvers),
+        "estimators": list(estimators),
+        "selectors": list(selectors),
+    }
 
 
 @router.get("/limits")
-def get_limits(call: CallDep) -> LimitsOut:
+def get_limits(call: CallDep) -> dict[str, int | float]:
     """Return how much of everything."""
     settings = call.settings
-    return LimitsOut(
-        max_upload_bytes=settings.max_upload_bytes,
-        max_megapixels=settings.max_megapixels,
-        max_queued_photos=MAX_UNFINISHED,
-        max_stored_bytes=int(settings.max_stored_gb * GIB),
-        max_psf_size=MAX_PSF_SIZE,
-        long_poll_seconds=LONG_POLL_S,
-        keep_results_days=settings.keep_results_days,
-    )
+    return {
+        "max_upload_bytes": settings.max_upload_bytes,
+        "max_megapixels": settings.max_megapixels,
+        "max_queued_photos": MAX_UNFINISHED,
+        "max_stored_bytes": int(settings.max_stored_gb * GIB),
+        "max_psf_size": MAX_PSF_SIZE,
+        "long_poll_seconds": LONG_POLL_S,
+        "keep_results_days": settings.keep_results_days,
+    }

@@ -122,7 +122,7 @@ export function setUpField() {
   showField();
 }
 
-// Charts of another aperture, in another unit, or beside another lens: drawn by the service.
+// Charts of another aperture, or in another unit: drawn by the service.
 export function setUpCharts() {
   const controls = byId("chart-controls");
   if (!controls) return;

@@ -14,7 +14,7 @@ function onward() {
 }
 
 async function known() {
-  const response = await fetch("/v1/session");
+  const response = await fetch("/v1/account");
   return response.ok ? response.json() : null;
 }
 
@@ -37,8 +37,8 @@ export async function setUpSignOut() {
   const button = byId("sign-out");
   if (!button) return;
   const session = byId("sign-in") ? null : await known();
-  button.hidden = !session?.needed;
-  if (session?.needed) button.title = `Signed in as ${session.owner}`;
+  button.hidden = !session?.signed_in;
+  if (session?.signed_in) button.title = `Signed in as ${session.owner}`;
   button.addEventListener("click", async () => {
     await fetch("/v1/session", { method: "DELETE" });
     location.assign("/sign-in");

@@ -245,15 +245,12 @@ def test_a_browser_signs_in_with_a_cookie_that_no_script_and_no_other_site_gets(
     token = re.search(r"lens_session=([^;]+)", cookie)[1]  # type: ignore[index]  # it is there, see above
     shown = {"Cookie": f"lens_session={token}", **at_home}
     guarded.cookies.clear()
-    assert guarded.get("/v1/session", headers=shown).json() == {
-        "owner": "anna",
-        "scopes": ["admin"],
-        "needed": True,
-    }
+    told = guarded.get("/v1/account", headers=shown).json()
+    assert (told["owner"], told["scopes"], told["signed_in"]) == ("anna", ["admin"], True)
     with store.database.reading() as session:
         assert token not in {row.token_hash for row in session.scalars(select(SessionRow))}
     assert guarded.delete("/v1/session", headers=shown).status_code == 204
-    assert guarded.get("/v1/session", headers=shown).status_code == 401
+    assert guarded.get("/v1/account", headers=shown).status_code == 401
 
 
 def test_keys_end_by_revoking_and_expiry(
@@ -306,10 +303,11 @@ def test_loopback_asks_nobody_until_there_is_a_key(
     monkeypatch.setattr("app.access.FRESH_S", 0.0)
     photo = steps.receive()
 
-    before = client.get("/v1/session").json()
+    before = client.get("/v1/account").json()
     key = key_of(store, "local")
 
-    assert before == {"owner": "local", "scopes": ["read", "write", "admin"], "needed": False}
+    assert (before["owner"], before["scopes"]) == ("local", ["read", "write", "admin"])
+    assert not before["signed_in"]
     assert client.get("/v1/photos").status_code == 401
     listed = client.get("/v1/photos", headers=key).json()["items"]
     assert [item["id"] for item in listed] == [photo.public_id]

@@ -22,7 +22,7 @@ from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
 from app.jobs.inspection import body_key
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import SHOWN, SIDES, THUMBNAIL
+from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
 from app.pages.pictures import in_sensor
 from app.pages.routes import templates, unused_name
@@ -30,6 +30,7 @@ from app.pages.shown import cell_px, grouped
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
+from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
@@ -569,17 +570,6 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
     assert "<td>0, 0, 77</td>" in page
 
 
-def test_two_measured_versions_make_a_curve(client: TestClient, steps: Steps, store: Store) -> None:
-    lens = steps.lens_id(steps.counted())
-    steps.counted()
-    curves = []
-    for version, error in ((1, 0.4), (2, 0.2)):
-        store.lenses.record_metrics(lens, version, {"error": {"center": error, "corner": None}})
-        curves.append('alt="Error after each version"' in client.get(f"/lenses/{lens}/tests").text)
-
-    assert curves == [False, True]
-
-
 def test_the_cells_of_a_map_are_as_small_as_the_blur_allows() -> None:
     sharp, soft, softest = (gaussian(31, np.eye(2) * sigma**2) for sigma in (0.8, 2.5, 6.0))
 
@@ -595,6 +585,37 @@ def test_a_lens_of_jpegs_is_said_to_look_sharper(client: TestClient, steps: Step
 
     assert [words in page for page in pages] == [False, True]
     assert "Learned from JPEG files (1 of 2 photos)" in pages[1]
+
+
+def test_the_versions_of_a_lens_have_their_errors(client: TestClient, steps: Steps, store: Store) -> None:
+    lens = steps.lens_id(steps.counted())
+    assert "<td>not yet known</td>" in client.get(f"/lenses/{lens}/tests").text
+
+    store.lenses.record_metrics(lens, 1, {"error": {"center": 0.4, "corner": None}})
+
+    assert "<td>40 %, not known, not known</td>" in client.get(f"/lenses/{lens}/tests").text
+
+
+def test_the_layer_of_a_preview_is_sent_in_pieces(
+    client: TestClient, steps: Steps, store: Store, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = steps.correct(steps.counted(), method="fast", output={"format": "png8"}, roi=None)
+    layer = f"/ui/corrections/{row.public_id}/layer/after"
+    run = store.jobs.start(row.public_id, row.epoch)
+    assert run is not None
+    made = {"key": "corrections/x/result", "etag": "e", "media_type": "image/png", "bytes": 8, "name": "o"}
+    assert store.jobs.finish(run, {}, **made)
+    missing = client.get(layer)
+    plan = store.jobs.get(row.public_id, ANY_OWNER)
+    assert plan is not None
+    large = bytes(9 << 20)
+    Storage(settings.storage).put(f"{plan.run_folder}{LAYER_FILES['after']}", large)
+    monkeypatch.delattr(Storage, "get")  # what would hold it whole
+
+    answer = client.get(layer)
+
+    assert (missing.status_code, missing.json()["code"]) == (409, "not_ready")
+    assert (answer.headers["content-type"], answer.content) == ("image/png", large)
 
 
 def test_a_photographer_reads_no_figures_in_a_verdict() -> None:

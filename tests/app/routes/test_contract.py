@@ -52,6 +52,55 @@ def things(steps: Steps, store: Store, settings: Settings) -> Things:
     return Things(photo.public_id, steps.lens_id(photo), row.public_id)
 
 
+# --- all endpoints ----------------------------------------------------------------------------------
+
+# What programs rely on: one that is missing here or there has come or gone unnoticed
+ENDPOINTS = """
+GET /healthz
+GET /readyz
+POST DELETE /v1/session
+GET DELETE /v1/account
+GET /v1/account/export
+GET /v1/version
+GET /v1/formats
+GET /v1/limits
+GET POST PATCH /v1/photos
+GET PATCH DELETE /v1/photos/{photo_id}
+GET /v1/photos/{photo_id}/patches
+GET /v1/jobs
+GET /v1/jobs/{job_id}
+POST /v1/jobs/{job_id}/cancel
+POST /v1/jobs/{job_id}/retry
+GET /v1/jobs/{job_id}/events
+GET POST /v1/lenses
+GET PATCH DELETE /v1/lenses/{lens_id}
+GET /v1/lenses/{lens_id}/calibrations
+GET /v1/lenses/{lens_id}/field.png
+GET /v1/lenses/{lens_id}/lateral-colour
+POST /v1/lenses/{lens_id}/measurements
+GET PUT /v1/lenses/{lens_id}/profile
+GET /v1/lenses/{lens_id}/psf
+GET /v1/lenses/{lens_id}/psf.{suffix}
+GET /v1/lenses/{lens_id}/report.{form}
+GET POST /v1/corrections
+GET DELETE /v1/corrections/{correction_id}
+GET /v1/corrections/{correction_id}/result
+"""
+
+
+def test_the_description_names_all_endpoints_and_no_others(client: TestClient) -> None:
+    listed = {
+        (method, path) for *methods, path in map(str.split, ENDPOINTS.split("\n")[1:-1]) for method in methods
+    }
+    described = {
+        (method.upper(), path)
+        for path, operations in client.get("/openapi.json").json()["paths"].items()
+        for method in operations
+    }
+
+    assert described == listed
+
+
 # --- lists ------------------------------------------------------------------------------------------
 
 

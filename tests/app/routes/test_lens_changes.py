@@ -221,7 +221,7 @@ def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) ->
     assert 'alt="MTF50 in cycles/pixel' in page
     charts = client.get(f"/ui/lenses/{reported}/charts", params={"unit": "lp/mm", "aperture": "1.4"})
     assert "MTF50 in line pairs per mm" in charts.text
-    for wrong in ({"aperture": ".."}, {"aperture": "x"}, {"against": "at x"}, {"against": "at -1"}):
+    for wrong in ({"aperture": ".."}, {"aperture": "x"}):
         answer = client.get(f"/ui/lenses/{reported}/charts", params=wrong)
         assert answer.status_code == 422, (wrong, answer.text)
     assert "PATCH" not in page

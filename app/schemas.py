@@ -266,6 +266,9 @@ class CorrectionIn(Question):
     output: OutputOptions = OutputOptions()
     roi: Region | None = None
     layers: bool = Field(default=False, description="of a roi: without texture and grain too, for a preview")
+    nonce: Id | None = Field(
+        None, description="any word: with another one, the request is another correction"
+    )
 
 
 class CorrectionOut(Model):

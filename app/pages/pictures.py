@@ -1,7 +1,4 @@
-"""Pictures for the pages, as children have made them: the API hands out their bytes and decodes none.
-
-A place of the upright picture and of the sensor are related by an EXIF orientation.
-"""
+"""Pictures for the pages, as children have made them: the API hands out their bytes and decodes none."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from app.blobs.storage import Storage
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
 from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
-from app.schemas import Region
 from app.store.tables import CorrectionRow
 
 Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
@@ -103,24 +99,6 @@ def correction_layer(
     except FileNotFoundError as error:
         text = f"correction {correction_id} has no layer {name}: it is of a whole photo, or without layers"
         raise NotReadyError(text) from error
-
-
-# Of each EXIF orientation: whether rows and columns change places, and which then count from the other end
-_TURNS: Final = {1: "", 2: "c", 3: "rc", 4: "r", 5: "t", 6: "tc", 7: "trc", 8: "tr"}
-
-
-def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:
-    """Return a part of the upright picture in the coordinates of the sensor, which has `height` x `width`."""
-    turn, x, y = _TURNS.get(orientation, ""), part.x, part.y
-    if "t" in turn:
-        height, width = width, height
-    if "r" in turn:
-        y = height - y - part.height
-    if "c" in turn:
-        x = width - x - part.width
-    if "t" in turn:
-        return Region(x=y, y=x, width=part.height, height=part.width)
-    return Region(x=x, y=y, width=part.width, height=part.height)
 
 
 def exists(storage: Storage, key: str) -> bool:

@@ -17,22 +17,21 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
 from app.blobs import tiles
 from app.blobs.zipped import zipped
-from app.errors import InvalidParameterError, NotReadyError
+from app.errors import NotReadyError
 from app.http import errors, views
 from app.http.dependencies import Call, CallDep, OneSession, call_of
 from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown
 from app.routes.common import file_headers
-from app.routes.corrections import begin, list_corrections
+from app.routes.corrections import list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
 from app.routes.photos import get_photo
-from app.schemas import Aperture, CorrectionIn, Id, PhotoOut, Region, Working, blank_is_none
-from app.store.database import new_id
-from app.store.tables import CorrectionRow, LensRow, PhotoRow
+from app.schemas import Aperture, Working, blank_is_none
+from app.store.tables import CorrectionRow, LensRow
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
@@ -52,8 +51,6 @@ HEADERS: Final = {
 }
 # Letters of a list of corrections (chosen): those of the photos of one page, and what addresses may have
 MAX_LENGTH: Final = 4000
-# Pixels of a preview at most (chosen): a second or two of work while the user waits
-MAX_PREVIEW_PIXELS: Final = 1_500_000
 SHOWN_VERSIONS: Final = 200  # Versions of the history on the page (chosen): the newest of them
 # Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm
 DEFAULT_ASPECT: Final = 1.5
@@ -146,13 +143,6 @@ def home(call: CallDep) -> HTMLResponse:
 # --- photos and corrections ---------------------------------------------------------------------------
 
 
-def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
-    """Return a photo with its size in upright orientation."""
-    if (row.orientation or 1) <= 4:
-        return photo
-    return photo.model_copy(update={"width": row.height, "height": row.width})
-
-
 @router.get("/photos/{photo_id}")
 def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
@@ -170,7 +160,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     better = done is not None and not (done.report or {}).get("nothing_to_correct")
     return page(
         "photo.html",
-        photo=_upright(photo, row),
+        photo=photo,
         can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
         row=row,
         used=sum(patch.state == "done" for patch in patches),
@@ -188,35 +178,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     )
 
 
-class PreviewIn(Region):
-    """A part of the upright photo, in its pixels; and the lens, where the photo does not say it.
-
-    With `layers` it is also wanted as the sliders of texture and grain need it.
-    """
-
-    method: str = Field(default="standard", max_length=40)
-    lens_id: Id | None = None
-    layers: bool = False
-
-
-@router.post("/ui/photos/{photo_id}/preview", status_code=202)
-def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
-    """Begin to correct a part of a photo."""
-    row = call.photo(photo_id)
-    if not row.width or not row.height:
-        raise InvalidParameterError("the photo is not read yet: wait a moment")
-    if part.width * part.height > MAX_PREVIEW_PIXELS:
-        raise InvalidParameterError("the part is too large for a preview: zoom in")
-    turned = pictures.in_sensor(part, row.height, row.width, row.orientation or 1)
-    asked = part.model_dump(include={"method", "lens_id", "layers"})
-    output = {"format": "png8", "color_space": "srgb"}
-    request = CorrectionIn.model_validate(
-        {"photo_id": photo_id, "roi": turned.model_dump(), "output": output, **asked}
-    )
-    # not shared: who asks deletes it, while the next page may be asking for the same already
-    return {"id": begin(request, call, look=new_id()).id}
-
-
 @router.get("/corrections/{correction_id}")
 def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
@@ -228,7 +189,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         "correction.html",
         correction=correction,
         job=views.job_out(plan),
-        photo=_upright(views.photo_out(row), row),
+        photo=views.photo_out(row),
         row=row,
         can_look=can_look,
         learned_from=0 if plan.lens is None else plan.lens.photo_count,

@@ -38,11 +38,6 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 )
 def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     """Correct a photo with the model of its lens, or of another; the same request is the same correction."""
-    return begin(options, call)
-
-
-def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
-    """Begin a correction, or find the same one; what is its `own` tells it from others."""
     photo = call.photo(options.photo_id)
     if options.method not in deconvolvers:
         raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
@@ -55,7 +50,7 @@ def begin(options: CorrectionIn, call: Call, **own: str) -> CorrectionOut:
     check_usage(call.settings, usage, usage.working_corrections, "corrections")
     asked = options.model_dump(mode="json", exclude={"photo_id", "lens_id", "lens_version", "any_lens"})
     # with other settings of the photo the same request is a new correction
-    params = asked | own | {"settings": stored_settings(photo)}
+    params = asked | {"settings": stored_settings(photo)}
     row, created = call.store.jobs.correct(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
     call.response.status_code = 200 if finished else 202

@@ -71,7 +71,11 @@ export function setUpPreview(viewer) {
   };
   const corrected = async ([region, method, layers], signal, say) => {
     const lens = fields.lens_id?.value;
-    const { id } = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, method, layers, ...(lens ? { lens_id: lens } : {}) });
+    // not shared: it is deleted below, while the next page may be asking for the same already
+    const nonce = crypto.getRandomValues(new Uint32Array(3)).join("-");
+    const wish = { photo_id: form.dataset.photo, method, layers, nonce, output: { format: "png8", color_space: "srgb" } };
+    const roi = inSensor(region, viewer, Number(form.dataset.orientation));
+    const { id } = await send("POST", "/v1/corrections", { ...wish, roi, ...(lens ? { lens_id: lens } : {}) });
     try {
       const report = await settled(id, signal, say);
       const names = layers ? ["before", "after", "smooth", "clean"] : ["before", "after"];
@@ -136,6 +140,17 @@ export function setUpPreview(viewer) {
   });
   window.addEventListener("pageshow", (event) => event.persisted && look()); // back from another page: it was stopped
   look();
+}
+
+// Of each EXIF orientation: whether rows and columns change places, and which then count from the other end.
+const TURNS = ["", "c", "rc", "r", "t", "tc", "trc", "tr"];
+
+// A part of the upright photo in the coordinates of the sensor.
+export function inSensor({ x, y, width, height }, upright, orientation) {
+  const turn = TURNS[orientation - 1];
+  const top = turn.includes("r") ? upright.height - y - height : y;
+  const left = turn.includes("c") ? upright.width - x - width : x;
+  return turn.includes("t") ? { x: top, y: left, width: height, height: width } : { x: left, y: top, width, height };
 }
 
 function covers({ region }, wanted) {

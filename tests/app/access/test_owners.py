@@ -75,7 +75,6 @@ def body_of(path: str, method: str, ids: dict[str, str]) -> dict[str, Any]:
     if method != "POST":
         return {}
     bodies: dict[str, dict[str, Any]] = {
-        "/ui/photos/{photo_id}/preview": {"json": {"x": 0, "y": 0, "width": 64, "height": 64}},
         "/v1/corrections": {"json": {"photo_id": ids["photo_id"]}},
         "/v1/photos": {
             "content": b"\xff\xd8\xff" + bytes(64),

@@ -28,6 +28,8 @@ from playwright.sync_api import (
 )
 from running import BRIEF, OWN_ACCOUNT, SMALL, Service, running, write_photo
 
+from lensmodel.photo import upright
+
 PATIENCE_MS = 120_000.0
 FLAGS = [
     "--headless=new",
@@ -430,13 +432,32 @@ def shown(page: Page) -> bytes:
     return now
 
 
+def test_a_part_of_a_photo_held_upright_is_asked_for_in_the_coordinates_of_its_sensor(page: Page) -> None:
+    page.goto("/docs")
+    sensor = np.arange(30 * 50).reshape(30, 50)
+    part = {"x": 7, "y": 11, "width": 9, "height": 5}
+    for orientation in range(1, 9):
+        turned = upright(sensor, orientation)
+        size = {"width": turned.shape[1], "height": turned.shape[0]}
+
+        found = page.evaluate(
+            "async (asked) => (await import('/static/preview.js')).inSensor(...asked)",
+            [part, size, orientation],
+        )
+
+        rows = slice(found["y"], found["y"] + found["height"])
+        columns = slice(found["x"], found["x"] + found["width"])
+        wanted = turned[11:16, 7:16]
+        assert sorted(sensor[rows, columns].ravel()) == sorted(wanted.ravel()), orientation
+
+
 def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effect_on_the_part_that_is_seen(
     page: Page, service: Service, learned: dict[str, Any]
 ) -> None:
     logged, deleted = len(service.log.read_text()), list[str]()
     page.on("request", lambda asked: deleted.append(asked.url) if asked.method == "DELETE" else None)
     page.goto(f"/photos/{learned['id']}")
-    with page.expect_response(lambda answer: answer.url.endswith("/preview")) as begun:
+    with page.expect_response(lambda answer: answer.url.endswith("/v1/corrections")) as begun:
         page.get_by_role("button", name="upper left").click()
     first = begun.value.json()["id"]
     page.get_by_role("button", name="lower right").click()
@@ -464,7 +485,7 @@ def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effec
     page.get_by_label("Strength").fill("0.5")
     assert shown(page) not in {none, full}
     assert asked == []  # mixed here, from what is there
-    with page.expect_request(lambda request: request.url.endswith("/preview")) as more:
+    with page.expect_request(lambda request: request.url.endswith("/v1/corrections")) as more:
         page.get_by_label("Noise reduction").fill("1")
     assert more.value.post_data_json["layers"] is True  # only now: they take as long again
     half = shown(page)

@@ -24,11 +24,9 @@ from app.jobs.inspection import body_key
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.main import create_app
-from app.pages.pictures import in_sensor
 from app.pages.routes import templates, unused_name
 from app.pages.shown import cell_px, grouped
 from app.runtime.settings import Settings
-from app.schemas import Region
 from app.store import LensName, Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
@@ -342,19 +340,6 @@ def test_files_of_one_name_have_two_in_an_archive() -> None:
         "b.tif",
         "a (3).tif",
     ]
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_part_of_the_upright_photo_is_found_on_the_sensor(orientation: int) -> None:
-    sensor = np.arange(30 * 50).reshape(30, 50)
-    turned = upright(sensor, orientation)
-    part = Region(x=7, y=11, width=9, height=5)
-
-    found = in_sensor(part, 30, 50, orientation)
-
-    crop = sensor[found.y : found.y + found.height, found.x : found.x + found.width]
-    wanted = turned[part.y : part.y + part.height, part.x : part.x + part.width]
-    assert sorted(crop.ravel()) == sorted(wanted.ravel())
 
 
 def test_a_photo_has_a_thumbnail_before_it_is_developed(

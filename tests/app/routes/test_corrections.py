@@ -153,27 +153,21 @@ def test_a_photo_of_another_lens_is_refused_until_its_owner_insists(client: Test
     lens_id, photo = steps.lens_id(steps.counted(serial="1")), steps.counted(serial="2")
 
     refused = post(client, photo_id=photo.public_id, lens_id=lens_id)
-    preview = client.post(
-        f"/ui/photos/{photo.public_id}/preview",
-        json={"x": 0, "y": 0, "width": 9, "height": 9, "lens_id": lens_id},
-    )
 
-    for answer in (refused, preview):
-        assert (answer.status_code, answer.json()["code"]) == (409, "other_lens")
-        assert "its serial number is 2, that of the lens 1" in answer.json()["detail"]
+    assert (refused.status_code, refused.json()["code"]) == (409, "other_lens")
+    assert "its serial number is 2, that of the lens 1" in refused.json()["detail"]
     assert post(client, photo_id=photo.public_id, lens_id=lens_id, any_lens=True).status_code == 202
 
 
 def test_a_preview_is_its_pages_own_which_deletes_it_while_another_asks(
     client: TestClient, steps: Steps
 ) -> None:
-    address = f"/ui/photos/{steps.counted().public_id}/preview"
-    left, opened = (
-        client.post(address, json={"x": 0, "y": 0, "width": 9, "height": 9}).json()["id"] for _ in range(2)
-    )
+    wish = {"photo_id": steps.counted().public_id, "roi": {"x": 0, "y": 0, "width": 9, "height": 9}}
+    left, opened, same = (post(client, **wish, nonce=word).json()["id"] for word in ("1-2", "3-4", "3-4"))
 
     assert client.delete(f"/v1/corrections/{left}").status_code == 204
     assert client.get(f"/v1/jobs/{opened}").status_code == 200
+    assert opened == same
 
 
 def test_a_photo_without_a_lens_must_be_told_one(client: TestClient, steps: Steps) -> None:

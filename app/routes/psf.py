@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections import Counter
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ from PIL import Image
 from app.errors import InvalidParameterError, ServiceError
 from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.model_cache import Fitted
-from app.routes.common import NOT_CHANGED, Answers, file_answer
+from app.routes.common import NOT_CHANGED, Answers, file_answer, file_headers
 from app.schemas import FieldQuery, KernelOut, PsfOut, PsfQuery, Setting, Support, Units
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.geometry import Frame
@@ -41,13 +40,7 @@ DIGITS: Final = 10  # decimals of kernels, whose sum is 1, in JSON (chosen): flo
 GAP_PX: Final = 2  # pixels between the kernels of a map (chosen for looks)
 HATCH_PX: Final = 7  # pixels between the strokes over a cell that is not known (chosen for looks)
 SCALE: Final = "X-PSF-Scale"
-ANSWERED_BY: Final = "X-PSF-Answered-By"
-# What headers say of pictures and arrays, which have no other room for it
-_TEXT: Final = {"schema": {"type": "string"}}
-_HEADERS: Final = {
-    SCALE: _TEXT | {"description": "of one PSF as PNG: the value of white, and the gamma"},
-    ANSWERED_BY: _TEXT | {"description": "as `support.answered_by`; of a map all, most places first"},
-}
+_HEADERS: Final = {SCALE: {"schema": {"type": "string"}, "description": "of PNG: value of white, and gamma"}}
 _FILES: Final = {name: {"schema": {"type": "string", "format": "binary"}} for name in MEDIA_TYPES.values()}
 _ANSWERS: Final[Answers] = {
     200: {
@@ -58,7 +51,7 @@ _ANSWERS: Final[Answers] = {
     },
     **NOT_CHANGED,
 }
-_MAP: Final = {200: file_answer("image/png", "Map")[200] | {"headers": _HEADERS}, **NOT_CHANGED}
+_MAP: Final = {**file_answer("image/png", "Map"), **NOT_CHANGED}
 _PROPERTIES: Final = PsfQuery.model_json_schema()["properties"]
 # Read by the route itself: for so many parameters FastAPI takes a third of the time of a request
 _QUERY: Final = {
@@ -107,7 +100,7 @@ def get_psf_as(lens_id: str, suffix: Format, call: CallDep) -> Response:
         units=Units(pixel_pitch_um=at.pixel_pitch_um or fitted.model.pitch_um),
     )
     body, more = encoded(suffix, answer.kernel, told)
-    return Response(body, media_type=MEDIA_TYPES[suffix], headers={**headers, **more})
+    return Response(body, media_type=MEDIA_TYPES[suffix], headers={**more, **headers})
 
 
 def accepted(header: str) -> Format:
@@ -132,10 +125,10 @@ def encoded(form: Format, kernel: Kernel, told: PsfOut) -> tuple[bytes, dict[str
         values = np.round(kernel, DIGITS).tolist()
         full = told.model_copy(update={"psf": told.psf.model_copy(update={"data": values})})
         return full.model_dump_json().encode(), {}
-    at, headers, buffer = told.query, {ANSWERED_BY: told.support.answered_by}, io.BytesIO()
+    at, buffer = told.query, io.BytesIO()
     aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
     name = f"psf-v{told.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{form}"
-    headers["Content-Disposition"] = f'inline; filename="{name}"'
+    headers = file_headers(name, inline=True)
     if form == "npy":
         np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
     elif form == "tiff":
@@ -185,17 +178,14 @@ def get_field_map(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDe
     sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
     # where too little is known the cell is hatched, as in reports
     hatched = np.where(np.add.outer(np.arange(at.size), np.arange(at.size)) % HATCH_PX < 2, 110, 40)
-    made: Counter[str] = Counter()
     for row, column in np.ndindex(rows, columns):
         down, across = (row + 0.5) / rows, (column + 0.5) / columns
         place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
         answer = fitted.model.query(place, setting, at.size)
-        made[answer.answered_by] += 1
         top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
         known = answer.predicted_error < UNKNOWN and not answer.extrapolated
         bright = np.round(np.sqrt(answer.kernel / answer.kernel.max()) * 255)
         sheet[top : top + at.size, left : left + at.size] = bright if known else hatched
     buffer = io.BytesIO()
     Image.fromarray(sheet).save(buffer, "PNG")
-    headers[ANSWERED_BY] = "; ".join(name for name, _ in made.most_common())
     return Response(buffer.getvalue(), media_type="image/png", headers=headers)

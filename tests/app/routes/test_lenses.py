@@ -95,25 +95,6 @@ def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None
     assert [r.headers["content-type"] for r in (tiff, png)] == ["image/tiff", "image/png"]
 
 
-def test_formats_without_room_for_words_say_in_headers_what_made_the_answer(
-    client: TestClient, lens: str
-) -> None:
-    query = {"r": 0.5, "aperture": 1.4, "size": 21}
-    support = client.get(f"{lens}/psf.json", params=query).json()["support"]
-    answers = [client.get(f"{lens}/psf.{form}", params=query) for form in ("npy", "png", "tiff")]
-    answers += [
-        client.get(f"{lens}/field.png?aperture=1.4&grid=3x2&size=21") for _ in range(2)
-    ]  # drawn, kept
-
-    assert support["answered_by"] == "regression"
-    for answer in answers:
-        assert answer.headers["x-psf-answered-by"] == "regression"
-    paths = client.get("/openapi.json").json()["paths"]
-    for name in ("psf", "psf.{suffix}", "field.png"):
-        described = paths[f"/v1/lenses/{{lens_id}}/{name}"]["get"]["responses"]["200"]["headers"]
-        assert "X-PSF-Answered-By" in described
-
-
 @pytest.mark.parametrize(
     ("accept", "form"),
     [

@@ -7,8 +7,9 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, TypeVar
 
 import httpx2
 import numpy as np
@@ -54,7 +55,7 @@ class JobPatienceError(LensModelError):
     """A job took longer than its caller would wait."""
 
 
-class Client:
+class Client(AbstractContextManager["Client"]):
     """Speaks with one service.
 
     Parameters
@@ -82,10 +83,6 @@ class Client:
             http = httpx2.Client(base_url=url, timeout=ANSWER_SECONDS, headers=headers, transport=transport)
         self._http = http
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Close the connections."""
         self._http.close()
@@ -104,13 +101,6 @@ class Client:
         own: `change_photo` corrects one that says them wrongly. With `kind` it was made to measure the lens;
         of a pair it is the open photo, and `reference_id` is the closed one, sent before with
         `calibrate=False`.
-
-        Raises
-        ------
-        ServiceProblemError
-            If the service refuses it.
-        OSError
-            If the file cannot be read.
         """
         given = s.UploadFields.model_validate(fields).model_dump(mode="json", exclude_unset=True)
         with Path(path).open("rb") as file:
@@ -263,10 +253,7 @@ class Client:
     def save_report(self, lens_id: str, path: str | Path) -> Path:
         """Save the test report of a lens in the form that `path` ends with: `.json`, `.csv` or `.pdf`.
 
-        Raises
-        ------
-        ServiceProblemError
-            With the code `not_ready` while a worker has yet to make it.
+        ServiceProblemError has the code `not_ready` while a worker has yet to make it.
         """
         target = Path(path)
         return self._save(f"/v1/lenses/{lens_id}/report{target.suffix.lower()}", target)

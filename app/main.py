@@ -17,7 +17,7 @@ from app.access import Gate
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.dependencies import Fresh, Services, call_of
-from app.http.middleware import Guard, RequestLog
+from app.http.middleware import Guard
 from app.http.model_cache import ModelCache
 from app.routes import account, corrections, health, jobs, lenses, photos, psf
 from app.routes.common import PROBLEMS
@@ -60,7 +60,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
     )
     app.add_middleware(Guard, allowed=chosen.hosts, max_upload_mb=chosen.max_upload_mb)
-    app.add_middleware(RequestLog)  # the last is the outermost
     for kind in errors.KINDS:
         app.add_exception_handler(kind, pages.refusal)
     app.router.routes.extend(_routes())

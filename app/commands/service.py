@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,19 +95,14 @@ def worker(data: Data = None) -> None:
     supervisor.run_worker(settings_from(data))
 
 
-def config(
-    data: Data = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the settings as JSON.")] = False,
-) -> None:
+def config(data: Data = None) -> None:
     """Print the effective settings as environment variables; secrets are masked.
 
     The last lines tell which measures of this machine's kernel confine the processes that decode photos.
 
-    Examples:
+    Example:
 
         lensmodel config
-
-        lensmodel config --json
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
@@ -116,14 +110,8 @@ def config(
 
     settings = settings_from(data)
     # up to the last @: a password may hold any sign, and need not be quoted everywhere
-    shown = {
-        name: re.sub(r"(://[^:/@]*):.*@", r"\1:********@", value) if isinstance(value, str) else value
-        for name, value in sorted(settings.model_dump(mode="json").items())
-    }
-    if json_output:
-        typer.echo(json.dumps({f"{PREFIX}{name.upper()}": value for name, value in shown.items()}, indent=2))
-        return
-    for name, value in shown.items():
-        typer.echo(f"# {described()[name]}\n{PREFIX}{name.upper()}={value}")
+    for name, value in sorted(settings.model_dump(mode="json").items()):
+        shown = re.sub(r"(://[^:/@]*):.*@", r"\1:********@", str(value))
+        typer.echo(f"# {described()[name]}\n{PREFIX}{name.upper()}={shown}")
     for name, in_force in confine.available(settings.task_user, settings.data_dir).items():
         typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not available here'}")

@@ -42,42 +42,6 @@ _PROFILE: Final = re.compile(r"/v1/lenses/[^/]+/profile")
 _ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 
 
-class RequestLog:
-    """Gives each request an id, logs its outcome, and sets the headers of every response."""
-
-    # The query is not logged: it may hold a serial, which is personal data
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        clear_contextvars()  # a keep-alive connection runs in the context of its first request
-        sent = Headers(scope=scope).get(REQUEST_ID, "")
-        request_id = sent if _ACCEPTED.fullmatch(sent) else new_id()
-        scope.setdefault("state", {})["request_id"] = request_id
-        began, status = time.perf_counter(), 500
-
-        async def answer(message: Message) -> None:
-            nonlocal status
-            if message["type"] == "http.response.start":
-                status = message["status"]
-                headers = MutableHeaders(scope=message)
-                headers[REQUEST_ID] = request_id
-                for name, value in HEADERS.items():
-                    headers.setdefault(name, value)
-            await send(message)
-
-        try:
-            with bound_contextvars(request_id=request_id):
-                await self._app(scope, receive, answer)
-        finally:
-            _record(scope, status, time.perf_counter() - began, request_id)
-
-
 def _record(scope: Scope, status: int, seconds: float, request_id: str) -> None:
     route: str = getattr(scope.get("route"), "path", "none")  # with names in place of ids
     if scope["path"].startswith("/v1/") and route.startswith("/"):
@@ -105,11 +69,13 @@ class BodyError(HTTPException):
 
 
 class Guard:
-    """Refuses foreign host names, changes that pages of other sites ask for, and bodies that are too long.
+    """Gives each request an id, logs its outcome, and sets the headers of every response.
 
-    A foreign page may let its own name resolve to this machine (DNS rebinding), but cannot own an address or
-    a local name. A browser sends its requests with the user's permissions, and states the origin of each
-    (Fetch Metadata, W3C; Origin, RFC 6454), which a page cannot forge.
+    It refuses foreign host names, changes that pages of other sites ask for, and bodies that are too long. A
+    foreign page may let its own name resolve to this machine (DNS rebinding), but cannot own an address or a
+    local name. A browser sends its requests with the user's permissions, and states the origin of each (Fetch
+    Metadata, W3C; Origin, RFC 6454), which a page cannot forge. The query is not logged: it may hold a
+    serial, which is personal data.
     """
 
     def __init__(self, app: ASGIApp, allowed: frozenset[str], max_upload_mb: int) -> None:
@@ -120,7 +86,11 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers, changes, received = Headers(scope=scope), scope["method"] not in SAFE, 0
+        clear_contextvars()  # a keep-alive connection runs in the context of its first request
+        headers, began, status, received = Headers(scope=scope), time.perf_counter(), 500, 0
+        sent = headers.get(REQUEST_ID, "")
+        request_id = sent if _ACCEPTED.fullmatch(sent) else new_id()
+        scope.setdefault("state", {})["request_id"] = request_id
         most, too_long = self._limit(scope)
 
         async def counted() -> Message:
@@ -131,16 +101,29 @@ class Guard:
                 raise too_long
             return message
 
+        async def answer(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID] = request_id
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        app, changes = self._app, scope["method"] not in SAFE
         try:
             self._check_host(headers)
             if changes:
                 self._check_site(headers)
                 self._check_body(headers, most, too_long)
         except BodyError as refusal:
-            answer = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
-            await answer(scope, receive, send)
-        else:
-            await self._app(scope, counted if changes else receive, send)
+            app = respond(Request(scope), refusal.status_code, refusal.code, refusal.detail, headers=CLOSE)
+        try:
+            with bound_contextvars(request_id=request_id):
+                await app(scope, counted if changes else receive, answer)
+        finally:
+            _record(scope, status, time.perf_counter() - began, request_id)
 
     def _check_host(self, headers: Headers) -> None:
         host = headers.get("host", "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 import zipfile
 from collections import Counter
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Final, Literal, get_args
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
@@ -19,7 +18,6 @@ from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
 from pydantic import BeforeValidator
 
-from app.blobs import tiles
 from app.blobs.zipped import zipped
 from app.errors import NotReadyError
 from app.http import errors, views
@@ -54,13 +52,6 @@ MAX_LENGTH: Final = 4000
 SHOWN_VERSIONS: Final = 200  # Versions of the history on the page (chosen): the newest of them
 # Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm
 DEFAULT_ASPECT: Final = 1.5
-# Names of the nine places of a picture, with their rows and columns
-NAMES: Final = (
-    *("upper left", "upper middle", "upper right"),
-    *("left", "centre", "right"),
-    *("lower left", "lower middle", "lower right"),
-)
-PLACES: Final = tuple((name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True))
 router = APIRouter(include_in_schema=False, route_class=OneSession)
 # What whoever is not signed in yet may see
 strangers = APIRouter(include_in_schema=False, route_class=OneSession)
@@ -97,18 +88,12 @@ async def refusal(request: Request, error: Exception) -> Response:
     if status in {401, 404} and "hx-request" in request.headers:
         seen = quote(request.headers.get("hx-current-url", "/"), safe="/")
         plain.headers["HX-Redirect"] = f"/sign-in?next={seen}" if status == 401 else "/"
-    if not _wants_page(request):
+    wanted = request.method == "GET" and "text/html" in request.headers.get("accept", "")
+    if not wanted or request.url.path.startswith(("/v1/", "/ui/", "/static/")):
         return plain
     if status == 401:
         return RedirectResponse(f"/sign-in?next={quote(request.url.path, safe='/')}", 303)
     return page("missing.html", status, status_code=status, detail=str(error))
-
-
-def _wants_page(request: Request) -> bool:
-    wanted = "text/html" in request.headers.get("accept", "")
-    return (
-        request.method == "GET" and wanted and not request.url.path.startswith(("/v1/", "/ui/", "/static/"))
-    )
 
 
 def page(name: str, status: int = 200, **values: Any) -> HTMLResponse:  # noqa: ANN401 - what the template shows
@@ -156,8 +141,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     corrections = list_corrections(call, limit=50, photo_id=photo_id).items
     corrections = [correction for correction in corrections if correction.roi is None]
     done = next((correction for correction in corrections if correction.state == "succeeded"), None)
-    shown_by = f"/ui/photos/{photo_id}/tiles" if done is None else f"/ui/corrections/{done.id}/tiles"
-    better = done is not None and not (done.report or {}).get("nothing_to_correct")
     return page(
         "photo.html",
         photo=photo,
@@ -172,9 +155,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         corrections=corrections,
         done=done,
         least=SEEN_DB,
-        before=f"{shown_by}/before",
-        after=f"{shown_by}/after" if better else None,
-        places=PLACES,
     )
 
 
@@ -193,7 +173,6 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         row=row,
         can_look=can_look,
         learned_from=0 if plan.lens is None else plan.lens.photo_count,
-        places=PLACES,
     )
 
 
@@ -257,16 +236,6 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
     apertures = lens.apertures if test is None else [number for number in test.apertures if number]
     chosen = aperture or (apertures[0] if apertures else None)
     found = None if test is None else test.at(chosen)
-    question = {
-        "size": shown.cell_px([] if found is None else [spot.kernel for spot in found.spots]),
-        "aspect": aspect,
-    } | ({} if chosen is None else {"aperture": chosen})
-
-    def map_of(cells: int) -> str:
-        rows = max(2, round(math.sqrt(cells / aspect)))
-        grid = f"{max(2, round(rows * aspect))}x{rows}"
-        return f"/v1/lenses/{lens_id}/field.png?{urlencode({'grid': grid, **question})}"
-
     return page(
         "lens.html",
         lens=lens,
@@ -277,7 +246,7 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
         aspect=aspect,
         apertures=apertures,
         aperture=chosen,
-        map_of=map_of,
+        cell=shown.cell_px([] if found is None else [spot.kernel for spot in found.spots]),
         test=test,
         found=found,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections import defaultdict
 from collections.abc import Sequence
@@ -42,17 +41,12 @@ def photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool
     return page.items, page.next is not None
 
 
-def lenses(call: Call) -> list[LensOut]:
-    """Return the newest lenses."""
-    return lens_routes.list_lenses(call, limit=PHOTOS).items
-
-
 def lenses_with_photos(call: Call) -> list[LensOut]:
     """Return the newest lenses, except those without samples whose photos all failed or are gone.
 
     A lens that was given its name before any photo is none of these.
     """
-    listed = lenses(call)
+    listed = lens_routes.list_lenses(call, limit=PHOTOS).items
     unknown = [lens.id for lens in listed if not lens.samples]
     hopeful = call.store.lenses.with_photos_beyond(HOPELESS, unknown)
     tried = call.store.lenses.with_photos_beyond(frozenset(), unknown)
@@ -121,13 +115,6 @@ class WaitingGroup:
             maker = self.camera.split()[0] if self.camera else None
             return full_name(maker, self.lens_model) if self.lens_model[0].isdigit() else self.lens_model
         return ", ".join(filter(None, (self.camera, *self.told)))
-
-    @property
-    def key(self) -> str:
-        """A key that stays the same while photos join and leave."""
-        first = self.photos[0]
-        identity = f"{self.camera}|{first.body_key}|{self.focal_mm}|{self.lens_model}"
-        return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
 def has_own_lens(row: PhotoRow) -> bool:

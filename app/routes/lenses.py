@@ -16,7 +16,7 @@ from app.http import upload, views
 from app.http.dependencies import Call, CallDep, OneSession
 from app.routes import common
 from app.routes.common import Cursor, Limit, OnlyName
-from app.routes.photos import receiving, recorded
+from app.routes.photos import MAX_PHOTOS, receiving, recorded
 from app.schemas import MAX_VERSION, CalibrationOut, JobOut, LateralOut, LensChange, LensOut, NewLens, Page
 from app.store.lenses import report_key
 from app.store.tables import LensRow
@@ -29,7 +29,6 @@ from lensmodel.report.tables import to_csv
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 
-_PAGE: Final = 200  # photos that are read at once (chosen): bounds the memory that a large lens takes
 _PROFILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
 # Photos whose names a report looks at, at most (chosen): it lists some, and says how many more there are
 _NAMED: Final = 1000
@@ -151,24 +150,14 @@ def get_lens_profile(lens_id: str, call: CallDep) -> Response:
     model = call.models.get(lens_id).model
     named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
     identity = {name: value for name, value in named.items() if value}
-    photos = _filenames(call, lens_id, {sample.photo for sample in model.samples})
+    rows = call.store.photos.page(call.owner, before=None, limit=MAX_PHOTOS, lens_id=lens_id)
+    learned = {sample.photo for sample in model.samples}
+    photos = {row.public_id: row.filename for row in rows if row.public_id in learned}
     out = io.BytesIO()
     write_profile(out, LensProfile(model, identity, photos))
     name = lens.label or full_name(lens.maker, lens.model) or "lens"
     headers = common.file_headers(f"{name}.lensprofile")
     return Response(out.getvalue(), media_type="application/zip", headers=headers)
-
-
-def _filenames(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
-    """Return the file names of the photos that a lens learned from, by id."""
-    filenames: dict[str, str] = {}
-    before = None
-    while True:
-        rows = call.store.photos.page(call.owner, before=before, limit=_PAGE, lens_id=lens_id)
-        filenames |= {row.public_id: row.filename for row in rows if row.public_id in wanted}
-        if len(rows) < _PAGE:
-            return filenames
-        before = rows[-1].public_id
 
 
 @router.put(
@@ -228,15 +217,10 @@ def get_lens_report(lens_id: str, form: Form, call: CallDep) -> Response:
     photos = call.store.photos.page(call.owner, before=None, limit=_NAMED, lens_id=lens_id, state="counted")
     cameras = [camera_name(photo.camera_maker, photo.camera_model) for photo in photos]
     details = provenance(lens.serial, cameras, [photo.filename for photo in photos])
-    body = _written(replace(test, details=details), form)
-    return Response(body, media_type=FORMS[form], headers=headers)
+    test = replace(test, details=details)
+    if form == "pdf":
+        from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
 
-
-def _written(test: LensReport, form: Form) -> bytes:
-    if form == "json":
-        return json.dumps(to_json(test)).encode()
-    if form == "csv":
-        return to_csv(test).encode()
-    from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
-
-    return to_pdf(pages(test))
+        return Response(to_pdf(pages(test)), media_type=FORMS[form], headers=headers)
+    text = to_csv(test) if form == "csv" else json.dumps(to_json(test))
+    return Response(text, media_type=FORMS[form], headers=headers)

@@ -148,13 +148,13 @@ NOT_RUN = {
 QUICK = {
     "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
     "export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json",
-    "config --json",
+    "config",
     "doctor --deep --json",
     "backup my-backup",
 }
 """One of each command that takes a second at most; the others are run among the slow tests."""
 
-ALONE = {"config --json"}
+ALONE = {"config"}
 """Of the quick ones, those that have a process of their own, as all slow ones do: it takes a second."""
 
 

@@ -9,7 +9,6 @@ from functools import cache
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
-from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 
 from app import pages
@@ -66,18 +65,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _operation(route: APIRoute) -> str:
-    """Name an operation by its function: `getPhoto` for `get_photo`."""
-    first, *more = route.name.split("_")
-    return first + "".join(map(str.capitalize, more))
-
-
 @cache
 def _routes() -> tuple[BaseRoute, ...]:
     """All routes, the same for each application of a process."""
     # What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
     # most requests, and need not be done again for an application with other settings
-    router = APIRouter(generate_unique_id_function=_operation)
+    router = APIRouter(generate_unique_id_function=lambda route: route.name)
     router.include_router(health.probes)
     router.include_router(account.sign_ins, prefix="/v1", responses=PROBLEMS)
     resources = (

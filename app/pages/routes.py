@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -28,7 +28,7 @@ from app.routes.common import file_headers
 from app.routes.corrections import list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
 from app.routes.photos import get_photo
-from app.schemas import Aperture, Working, blank_is_none
+from app.schemas import Aperture, blank_is_none
 from app.store.tables import CorrectionRow, LensRow
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
@@ -110,19 +110,13 @@ async def sign_in() -> HTMLResponse:
 @router.get("/docs")
 def interface(request: Request) -> HTMLResponse:
     """Show what programs can ask, from the same description that programs read; nothing is loaded for it."""
-    paths = request.app.openapi()["paths"]
-    operations = [
-        {"path": path, "method": method, **entry}
-        for path, methods in paths.items()
-        for method, entry in methods.items()
-    ]
-    return page("docs.html", operations=operations)
+    return page("docs.html", paths=request.app.openapi()["paths"])
 
 
 @router.get("/")
 def home(call: CallDep) -> HTMLResponse:
     """Show where photos are given and what became of them."""
-    return page("home.html", **_home(call)[1])
+    return page("home.html", **_home(call))
 
 
 # --- photos and corrections ---------------------------------------------------------------------------
@@ -139,8 +133,6 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     candidates = [] if lens else shown.lenses_with_photos(call)
     candidates = [each for each in candidates if each.samples or photo.state == "needs_lens"]
     corrections = list_corrections(call, limit=50, photo_id=photo_id).items
-    corrections = [correction for correction in corrections if correction.roi is None]
-    done = next((correction for correction in corrections if correction.state == "succeeded"), None)
     return page(
         "photo.html",
         photo=photo,
@@ -149,11 +141,9 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
-        known=lens.samples > 0 if lens else bool(candidates),
         group=shown.grouped([row])[0],
         lens=lens,
-        corrections=corrections,
-        done=done,
+        corrections=[correction for correction in corrections if correction.roi is None],
         least=SEEN_DB,
     )
 
@@ -162,17 +152,15 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
 def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
     plan = call.correction(correction_id)
-    correction, row = views.correction_out(plan), plan.photo
-    looked = correction.roi is None and not (plan.report or {}).get("nothing_to_correct")
+    looked = plan.params["roi"] is None and not (plan.report or {}).get("nothing_to_correct")
     can_look = looked and pictures.exists(call.storage, f"{plan.run_folder}{SIDES['after']}")
     return page(
         "correction.html",
-        correction=correction,
-        job=views.job_out(plan),
-        photo=views.photo_out(row),
-        row=row,
+        photo=views.photo_out(plan.photo),
+        row=plan.photo,
         can_look=can_look,
         learned_from=0 if plan.lens is None else plan.lens.photo_count,
+        **_correction(call, correction_id),
     )
 
 
@@ -184,7 +172,7 @@ Ids = Annotated[str, Query(max_length=MAX_LENGTH)]
 @router.get("/batch")
 def batch_page(ids: Ids, call: CallDep) -> HTMLResponse:
     """Show how far the corrections are whose ids have commas between them."""
-    return page("batch.html", **_batch(call, ids)[1])
+    return page("batch.html", **_batch(call, ids))
 
 
 @router.get("/batch.zip")
@@ -260,13 +248,11 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     history = list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, _ = shown.photos(call, lens_id)
     test = _test(call, row)
-    gone = max((event.version for event in history if event.kind != "photo_added"), default=0)
     return page(
         "lens_tests.html",
         lens=lens,
         counting=shown.counting(call, lens_id),
         history=history,
-        versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         aspect=_aspect(call, row),
         test=test,
@@ -304,72 +290,46 @@ def _aspect(call: Call, lens: LensRow) -> float:
 # --- parts that change: htmx asks for them while there is work to wait for ----------------------------
 
 Open = Literal["home", "photo", "correction", "batch", "lens"]
-# Template, what it shows, and whether the page has to be made anew
-Part = tuple[str, Mapping[str, Any], bool]
 
 
 @router.get("/ui/parts")
 def parts(call: CallDep, page: Open = "home", id: Ids = "") -> Response:  # noqa: A002
     """Return the part of a page as it is now, 304 where the browser has it; at the end ask for all."""
-    template, values, settled = _PARTS[page](call, id)
-    body = templates.get_template(template).render(**values).encode()
+    body = templates.get_template(f"_{page}_state.html").render(**_STATES[page](call, id)).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if settled:
+    if b"hx-get" not in body:  # it asks no more
         headers["HX-Refresh"] = "true"
     elif call.knows(tag):
         return Response(status_code=304, headers=headers)
     return Response(body, media_type="text/html", headers=headers)
 
 
-def _home(call: Call, _: str = "") -> Part:
+def _home(call: Call, _: str = "") -> dict[str, Any]:
     """Return what is shown of all photos and lenses."""
     photos, more = shown.photos(call)
     lenses = shown.lenses_with_photos(call)
-    values = {
-        "photos": photos,
-        "more": more,
-        "lenses": lenses,
-        "groups": shown.waiting(call),
-        "next": shown.next_step(call, photos, lenses),
-    }
-    return "_home.html", values, False
+    steps = {"groups": shown.waiting(call), "next": shown.next_step(call, photos, lenses)}
+    return {"photos": photos, "more": more, "lenses": lenses, **steps}
 
 
-def _photo(call: Call, photo_id: str) -> Part:
-    photo = get_photo(photo_id, call)
-    return "_photo_state.html", {"photo": photo}, photo.state not in get_args(Working)
-
-
-def _correction(call: Call, correction_id: str) -> Part:
+def _correction(call: Call, correction_id: str) -> dict[str, Any]:
     plan = call.correction(correction_id)
-    values = {"correction": views.correction_out(plan), "job": views.job_out(plan)}
-    return "_correction_state.html", values, plan.state not in {"queued", "running"}
+    return {"correction": views.correction_out(plan), "job": views.job_out(plan)}
 
 
-def _batch(call: Call, ids: str) -> Part:
+def _batch(call: Call, ids: str) -> dict[str, Any]:
     plans = _plans(call, ids)
-    left = [plan for plan in plans if plan.state in {"queued", "running"}]
-    part_done = sum(plan.progress_done / max(plan.progress_total, 1) for plan in left)
-    values = {
-        "rows": [(plan.photo.filename, views.correction_out(plan)) for plan in plans],
-        "left": len(left),
-        "share": len(plans) - len(left) + part_done,
-        "done": sum(plan.state == "succeeded" for plan in plans),
-        "ids": ids,
-    }
-    return "_batch.html", values, False
+    return {"plans": plans, "corrections": [views.correction_out(plan) for plan in plans], "ids": ids}
 
 
-def _lens(call: Call, lens_id: str) -> Part:
-    counting = shown.counting(call, lens_id)
-    return "_lens_state.html", {"lens": get_lens(lens_id, call), "counting": counting}, not counting
-
-
-_PARTS: Final[Mapping[Open, Callable[[Call, str], Part]]] = {
+_STATES: Final[Mapping[Open, Callable[[Call, str], dict[str, Any]]]] = {
     "home": _home,
-    "photo": _photo,
+    "photo": lambda call, photo_id: {"photo": get_photo(photo_id, call)},
     "correction": _correction,
     "batch": _batch,
-    "lens": _lens,
+    "lens": lambda call, lens_id: {
+        "lens": get_lens(lens_id, call),
+        "counting": shown.counting(call, lens_id),
+    },
 }

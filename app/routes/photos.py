@@ -108,7 +108,9 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
             call.lens(fields.lens_id)
         received = recorded(call, public_id, key, uploaded)
     except ServiceError:
-        call.storage.delete(_folder(key))  # refused before there was a photo; afterwards nothing is refused
+        call.storage.delete(
+            f"photos/{public_id}/"
+        )  # refused before there was a photo; afterwards nothing is refused
         raise
     call.response.status_code = 202 if received.fresh else 200
     call.response.headers["Location"] = f"{V1}/photos/{received.photo.public_id}"
@@ -191,14 +193,10 @@ def recorded(call: Call, public_id: str, key: str, file: upload.Uploaded, **more
             kept = f"{received.photo.folder}original-{public_id}"
             call.storage.rename(key, kept)
             call.store.photos.restore_file(received.photo.public_id, kept, again=received.fresh)
-        call.storage.delete(_folder(key))  # the same bytes are stored already
+        call.storage.delete(f"photos/{public_id}/")  # the same bytes are stored already
     # another request may have deleted it meanwhile: then it is told as it was received
     photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo
     return replace(received, photo=photo)
-
-
-def _folder(key: str) -> str:
-    return f"{key.rpartition('/')[0]}/"
 
 
 @router.get("/photos")

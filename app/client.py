@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import httpx2
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from app import schemas as s
@@ -214,12 +212,6 @@ class Client(AbstractContextManager["Client"]):
     def psf(self, /, lens_id: str, **query: str | float | None) -> s.PsfOut:
         """Return the PSF of a lens at one place and setting, with what it rests on: fields of `PsfQuery`."""
         return _read(s.PsfOut, self._ask("GET", f"/v1/lenses/{lens_id}/psf.json", query))
-
-    def kernel(self, /, lens_id: str, **query: str | float | None) -> NDArray[np.float32]:
-        """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
-        answer = self._ask("GET", f"/v1/lenses/{lens_id}/psf.npy", query)
-        kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
-        return kernel
 
     def change_lens(self, /, lens_id: str, **change: object) -> s.LensOut:
         """Rename a lens by `label`, or let it become a part of another by `merge_into`, which is returned.

@@ -8,20 +8,21 @@ from contextlib import asynccontextmanager
 from functools import cache
 from importlib.metadata import version
 
-from fastapi import APIRouter, Depends, FastAPI
+from fastapi import APIRouter, Depends, FastAPI, Security
 from starlette.routing import BaseRoute
 
 from app import pages
 from app.access import Gate
 from app.blobs.storage import Storage
 from app.http import errors
-from app.http.dependencies import Fresh, Services, call_of
+from app.http.dependencies import BEARER, Fresh, Services, call_of
 from app.http.middleware import Guard
 from app.http.model_cache import ModelCache
 from app.routes import account, corrections, health, jobs, lenses, photos, psf
 from app.routes.common import PROBLEMS
 from app.runtime.outage import missable
 from app.runtime.settings import Settings
+from app.schemas import Readiness
 from app.store import Store
 
 
@@ -37,16 +38,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
             storage.settle(store.photos.newest_file)
-        cache = ModelCache(store)
-        app.state.services = Services(
-            chosen,
-            store,
-            storage,
-            cache,
-            asyncio.Semaphore(photos.MAX_UPLOADS),
-            Gate(chosen, store.accounts),
-            Fresh(health.FRESH_S),
-        )
+        uploads, gate = asyncio.Semaphore(photos.MAX_UPLOADS), Gate(chosen, store.accounts)
+        cache, readiness = ModelCache(store), Fresh[Readiness](health.FRESH_S)
+        app.state.services = Services(chosen, store, storage, cache, uploads, gate, readiness)
         yield
         store.close()
 
@@ -73,22 +67,10 @@ def _routes() -> tuple[BaseRoute, ...]:
     router = APIRouter(generate_unique_id_function=lambda route: route.name)
     router.include_router(health.probes)
     router.include_router(account.sign_ins, prefix="/v1", responses=PROBLEMS)
-    resources = (
-        psf,  # first: routes are tried in their order, and this one is asked for most often
-        photos,
-        jobs,
-        lenses,
-        corrections,
-        account,
-        health,
-    )
-    for resource in resources:
-        # also here, not only in each route: a route without it would be open to all
-        router.include_router(
-            resource.router,
-            prefix="/v1",
-            dependencies=[Depends(call_of)],
-            responses=PROBLEMS,
-        )
+    # also here, not only in each route: a route without it would be open to all
+    known = [Depends(call_of), Security(BEARER)]
+    # PSFs first: routes are tried in their order, and these are asked for most often
+    for resource in (psf, photos, jobs, lenses, corrections, account, health):
+        router.include_router(resource.router, prefix="/v1", dependencies=known, responses=PROBLEMS)
     pages.include(router)
     return tuple(router.routes)

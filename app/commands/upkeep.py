@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -53,7 +54,6 @@ def backup(
         Path, typer.Argument(metavar="FOLDER", help="Folder of the backup; an older one there is updated.")
     ],
     data: Data = None,
-    json_output: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Copy all rows and blobs of an installation into a folder, even while it runs.
@@ -66,21 +66,16 @@ def backup(
 
         lensmodel backup my-backup
 
-        lensmodel backup my-backup --data lensmodel-data --json
+        lensmodel backup my-backup --data lensmodel-data
 
     Exit status: 0 there is a new backup, 1 there is none, 2 wrong usage.
     """
     from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
 
-    shown = Display.of(context, quiet=quiet, as_json=json_output)
+    shown = Display.of(context, quiet=quiet)
     with opened(data, existing=True) as (_, store, storage), shown.progress() as bars:
-        task = bars.add_task("blobs", total=None)
-
-        def show(done: int, total: int) -> None:
-            bars.update(task, completed=done, total=total)
-
-        result = copies.backup(store.database, storage, folder, show)
-    if json_output:
-        shown.document(asdict(result))
-    else:
-        shown.result(f"{folder}: {result.photos} photos and {result.blobs} blobs of {result.made_at}")
+        update = partial(bars.update, bars.add_task("blobs", total=None))
+        result = copies.backup(
+            store.database, storage, folder, lambda done, total: update(completed=done, total=total)
+        )
+    shown.result(f"{folder}: {result.photos} photos and {result.blobs} blobs of {result.made_at}")

@@ -13,9 +13,9 @@ from operator import attrgetter
 from typing import Annotated, Any, Generic, TypeVar
 from urllib.parse import urlencode
 
-from fastapi import Depends, Request, Response, Security
+from fastapi import Depends, Request, Response
 from fastapi.routing import APIRoute
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import HTTPBearer
 from starlette.concurrency import run_in_threadpool
 
 from app.access import Gate, Who
@@ -124,13 +124,8 @@ BEARER = HTTPBearer(auto_error=False, description="A key that `lensmodel keys cr
 NOBODY = Who("", ())
 
 
-async def call_of(
-    request: Request,
-    response: Response,
-    described: Annotated[HTTPAuthorizationCredentials | None, Security(BEARER)] = None,
-) -> Call:
+async def call_of(request: Request, response: Response) -> Call:
     """Return the `Call` of a route, after checking who asks."""
-    del described
     services: Services = request.app.state.services
     # async: a plain function would run in a thread for each request, which only unknown keys need
     who = services.gate.quick(request)

@@ -5,12 +5,9 @@ Clients that are slow on purpose are left to a proxy in front: docs/topics/opera
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import re
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import Final
 from urllib.parse import quote, urlsplit
 
@@ -20,7 +17,6 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars, clear_contextvars
 
-from app.errors import ServiceError
 from app.http.errors import HEADERS, REQUEST_ID, respond
 from app.runtime import logs, metrics
 from app.store.database import new_id
@@ -185,16 +181,3 @@ def host_name(host: str) -> str:
         return (urlsplit(f"//{host}").hostname or "").lower()
     except ValueError:
         return MALFORMED
-
-
-@asynccontextmanager
-async def within(seconds: float) -> AsyncIterator[None]:
-    """Bound the time in which an upload comes."""
-    try:
-        async with asyncio.timeout(seconds) as limit:
-            yield
-    except TimeoutError as error:
-        if not limit.expired():
-            raise
-        text = f"the body did not come within {seconds:g} s: send it again over a faster connection"
-        raise ServiceError(text, headers=CLOSE, code="too_slow") from error

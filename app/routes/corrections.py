@@ -121,11 +121,7 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
     call.storage.delete(found("correction", correction_id, prefix))
 
 
-@router.get(
-    "/corrections/{correction_id}/result",
-    response_class=Response,
-    responses=_RESULT,
-)
+@router.get("/corrections/{correction_id}/result", response_class=Response, responses=_RESULT)
 def get_correction_result(correction_id: str, call: CallDep) -> Response:
     """Return the corrected photo, whole or in part."""
     row = call.correction(correction_id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -88,8 +89,14 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
         bind_contextvars(photo_id=public_id)
         prefix, span = f"photos/{public_id}/", timedelta(seconds=UPLOAD_S)
         await run_in_threadpool(call.store.photos.expect, prefix, within=span)
-        async with middleware.within(UPLOAD_S):
-            yield public_id, f"{prefix}original"
+        try:
+            async with asyncio.timeout(UPLOAD_S) as limit:
+                yield public_id, f"{prefix}original"
+        except TimeoutError as error:
+            if not limit.expired():
+                raise
+            text = f"the body did not come within {UPLOAD_S:g} s: send it again over a faster connection"
+            raise ServiceError(text, headers=CLOSE, code="too_slow") from error
 
 
 async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:

@@ -162,11 +162,12 @@ def test_the_fine_detail_of_an_xtrans_photo_is_no_damage(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_defects_of_xtrans_cost_the_whole_chain_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("xtrans", [False, True])
+def test_defects_cost_the_whole_chain_nothing(xtrans: bool, tmp_path: Path) -> None:
     camera = simulate.SimulatedCamera(height=576, width=720, full_well_electrons=20_000.0)
     lens = simulate.draw_lens(1001)
     settings = LensSettings(aperture=lens.widest())
-    filters = colours_of(XTRANS, (576, 720)).astype(np.intp)[None]
+    filters = colours_of(XTRANS if xtrans else BAYER, (576, 720)).astype(np.intp)[None]
     balance = np.reshape(camera.white_balance, (3, 1, 1))
     shots = [
         simulate.photograph(simulate.demo_scene(scene)[:, 40:680, 100:884], lens, settings, camera, None)
@@ -182,7 +183,8 @@ def test_defects_of_xtrans_cost_the_whole_chain_nothing(tmp_path: Path) -> None:
             light = light + np.sqrt(camera.noise.variance(light)) * rng.standard_normal(light.shape)
             seen = np.clip(CAMERA.black + RANGE * light, 0, CAMERA.white).astype(np.uint16)
             hot = np.random.default_rng(0).permutation(seen.size)[:count]
-            paths.append(write_xtrans(tmp_path / f"{count}-{number}.dng", defective(seen, hot)))
+            save = write_xtrans if xtrans else write
+            paths.append(save(tmp_path / f"{count}-{number}.dng", defective(seen, hot)))
         known = calibrate(paths[:2], aperture=settings.aperture, workers=1)
         developed = photo.develop(paths[2], siblings=paths)
         corrected = correct(developed, known, aperture=settings.aperture, workers=1)

@@ -6,6 +6,7 @@ too wide, and one traced through a published design.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ pytestmark = pytest.mark.slow
 CAMERA = simulate.SimulatedCamera(height=640, width=960, full_well_electrons=20_000.0)
 GRID = Path(__file__).parents[1] / "data" / "traced-heliar-f3.5.npz"
 NEARLY_PERFECT = 6
+CROP_LENS = simulate.draw_lens(1001)
 MARGIN = 64
 LEAST_SHARE = 0.3
 """Of what the true PSF gains, which is the most that a correction can; the forecast tells how sure it is."""
@@ -94,3 +96,33 @@ def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(
     assert_better_and_nowhere_worse(found, possible)
     with pytest.raises(AssertionError):  # a correction that does nothing
         assert_better_and_nowhere_worse(nothing, possible)
+
+
+@pytest.fixture(scope="module")
+def cropped(tmp_path_factory: pytest.TempPathFactory) -> tuple[LensModel, Path, Planes]:
+    """A lens known from a whole frame, a photo of the middle of another one, and the truth of that."""
+    folder = tmp_path_factory.mktemp("cropped")
+    known, asked = (shot(CROP_LENS, CROP_LENS.widest(), scene) for scene in ("city", "colosseum"))
+    middle = slice(106, 534), slice(160, 800)  # the smaller of two usual sensors, as crop mode cuts it
+    simulate.write_photo(folder / "known.dng", known)
+    part = replace(asked, mosaic=np.ascontiguousarray(asked.mosaic[middle]))
+    simulate.write_photo(folder / "asked.dng", part)
+    model = LensModel.fit(sampling.samples_of_photo(folder / "known.dng", workers=1))
+    return model, folder / "asked.dng", np.ascontiguousarray(asked.sharp[:, *middle])
+
+
+@pytest.mark.parametrize(("method", "least_db"), [("standard", 2.2), ("fast", 0.6)])
+def test_a_frame_in_crop_mode_gains_in_every_zone_by_the_kernels_of_its_place(
+    method: str, least_db: float, cropped: tuple[LensModel, Path, Planes]
+) -> None:
+    """As if the picture's corners were the lens's, it gains 2.04 and 0.52 dB, and a block loses 0.47."""
+    model, path, truth = cropped
+    developed = photo.develop(path)
+
+    settings, lateral = LensSettings(aperture=CROP_LENS.widest()), correcting.lateral_of(developed)
+    made = correcting.correct_photo(developed, model, settings, method=method, lateral=lateral).planes
+
+    found = gains(*map(shown, (developed.planes, made, truth)))
+    assert found is not None
+    assert min(found.zones.values()) > least_db
+    assert found.worst_db > -0.25

@@ -78,7 +78,12 @@ def _originals(paths: Iterable[Path]) -> list[Path]:
 def _pattern(path: Path) -> str:
     """Take the part of a pattern that is there, such as a folder "[2024] trip", by its letters."""
     there = next(parent for parent in (path, *path.parents) if parent.is_dir() or parent == parent.parent)
-    rest = path.relative_to(there)
+    rest = str(path.relative_to(there))
+    if path.suffix.lower() in ENDINGS:  # cameras write them in capitals, people in small letters
+        ending = (
+            f"[{letter.lower()}{letter.upper()}]" if letter.isalpha() else letter for letter in path.suffix
+        )
+        rest = rest.removesuffix(path.suffix) + "".join(ending)
     return str(Path(glob.escape(str(there))) / rest)
 
 

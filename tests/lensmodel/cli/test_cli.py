@@ -289,6 +289,15 @@ def test_patterns_find_their_files_in_folders_whose_names_look_like_patterns(
     assert [path.name for path in files.photos([pattern])] == ["a.dng"]
 
 
+@pytest.mark.parametrize("pattern", ["*.dng", "*.DNG", "IMG_?.Dng", "**/*.dng", "IMG_[12].dng"])
+def test_patterns_take_the_endings_of_photos_in_any_letters(pattern: str, tmp_path: Path) -> None:
+    names = ["IMG_1.DNG", "IMG_2.dng"]
+    for name in (*names, "IMG_3.dngx"):
+        (tmp_path / name).touch()
+
+    assert sorted(path.name for path in files.photos([str(tmp_path / pattern)])) == names
+
+
 def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
     words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
     here(*words, "-o", "plain", "--strength", "0")

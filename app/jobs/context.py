@@ -61,7 +61,7 @@ Wanted: TypeAlias = Callable[[], bool]
 class Needs:
     """What a task needs of the machine, and what it answers."""
 
-    part: int = 1  # which part of `LENS_TASK_SECONDS` it may take, such as 90: a 90th
+    part: int = 1  # which part of `LENS_TASK_SECONDS` it may compute, such as 90: a 90th
     answer: Answer | None = None
     pixel_bytes: int = 0  # address space for each pixel of its photo (chosen, by counting), beside `spare_mb`
     spare_mb: int = SPARE_MB
@@ -156,15 +156,14 @@ class JobContext:
 
     def limits(self, task: str, photo: PhotoRow | None) -> TaskLimits:
         """Return the limits of a task, which grow with its photo."""
-        needs, seconds = NEEDS[task], self.settings.task_seconds / NEEDS[task].part
+        needs, seconds = NEEDS[task], self.settings.task_seconds
         pixels = 0 if photo is None else (photo.width or 0) * (photo.height or 0)
         memory = needs.spare_mb + needs.pixel_bytes * pixels // (1 << 20)
-        limits = TaskLimits(min(memory, max(self.sandbox.budget.memory_mb, needs.spare_mb)), seconds)
-        if not needs.threads:
-            return limits
-        slots = self.settings.worker_slots
-        return replace(
-            limits, memory_mb=limits.memory_mb + THREAD_MB * slots, cpu_s=math.ceil(seconds) * slots
+        memory = min(memory, max(self.sandbox.budget.memory_mb, needs.spare_mb))
+        threads = self.settings.worker_slots if needs.threads else 0
+        # the wall time of a part may be long on a busy machine; it bounds a task that waits for nothing
+        return TaskLimits(
+            memory + THREAD_MB * threads, seconds, cpu_s=math.ceil(seconds / needs.part) * max(threads, 1)
         )
 
     @contextmanager

@@ -77,8 +77,8 @@ class Settings(BaseSettings):
     lease_seconds: PositiveFloat = 20.0
     """A worker silent for this long is taken for dead."""
     task_seconds: PositiveFloat = 3600.0
-    """Longest that correcting a photo may take; reading its header a 90th of it, developing a 20th,
-    estimating in one cell a 6th."""
+    """Longest that a task may last, and the processor time of correcting a photo in each slot; reading its
+    header may take a 90th of that, developing a 20th, estimating in one cell a 6th."""
     patches: int = Field(default=0, ge=0, le=1000)
     """Patches used from one photo; 0: as many as the estimator needs."""
     estimator: str = "default"

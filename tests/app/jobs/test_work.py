@@ -208,6 +208,21 @@ def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
     assert sandbox.seen["select"]["selector"] == taken
 
 
+def test_a_busy_machine_that_makes_a_step_last_takes_nothing_from_its_time(
+    context: JobContext, photo: PhotoRow
+) -> None:
+    limits = context.limits("develop", photo)
+
+    assert limits.processor_s == context.settings.task_seconds / 20
+    assert limits.wall_s == context.settings.task_seconds
+
+
+def test_correcting_may_compute_in_every_slot(context: JobContext, photo: PhotoRow) -> None:
+    seconds, slots = context.settings.task_seconds, context.settings.worker_slots
+
+    assert context.limits("correct", photo).processor_s == seconds * slots
+
+
 @pytest.mark.parametrize(("more", "kept"), [(0, True), (1, False)])
 def test_no_picture_is_kept_that_is_larger_than_may_be_read_at_once(
     work: Handler, context: JobContext, sandbox: Scripted, photo: PhotoRow, more: int, kept: bool

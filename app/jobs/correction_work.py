@@ -128,7 +128,7 @@ def measure(context: JobContext, lens_id: str, version: int) -> None:
     state, samples = _samples(context, lens_id, version)
     height, width = lenses.shape_of(lens) or (2, 3)
     about = {
-        "name": _name(lens, "Unnamed lens"),
+        "name": _name(lens, "Unknown lens"),
         "aspect": width / height,
         "height_px": height if height > 2 else None,
         "lateral": lenses.lateral_of(lens),

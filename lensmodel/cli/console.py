@@ -15,6 +15,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any, Final
 
 import typer
@@ -208,15 +209,20 @@ def clock(seconds: float) -> str:
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Container[int] = ()) -> str:
-    """Write rows under a head, columns two blanks apart; those in `numbers` are set to the right."""
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    lines = [head, ["-" * width for width in widths], *rows]
+    """Write rows under a head, columns two blanks apart; those in `numbers` are set to the right.
+
+    A cell may have several lines.
+    """
+    cells = [[cell.split("\n") for cell in row] for row in (head, *rows)]
+    widths = [max(len(line) for row in cells for line in row[i]) for i in range(len(head))]
+    cells.insert(1, [["-" * width] for width in widths])
     return "\n".join(
         "  ".join(
             cell.rjust(width) if i in numbers else cell.ljust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
-        for line in lines
+        for row in cells
+        for line in zip_longest(*row, fillvalue="")
     )
 
 

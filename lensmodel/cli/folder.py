@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ from lensmodel.workflow.sampling import CalibrationEvent, Config
 # Photos that a group is learned from: five are the advice (docs/guide.md), three more for other apertures
 # (chosen); each takes about a minute
 LEARN_FROM: Final = 8
+# Columns for the names of a group (chosen): with them the table fits a terminal of 80
+_LENS_WIDTH: Final = 27
 PROFILES: Final = "lenses"
 ENDING: Final = ".lensprofile"
 
@@ -135,7 +138,7 @@ def _row(
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = [
         [
-            *(row[name] for name in ("camera", "lens", "focal_length")),
+            textwrap.fill(", ".join(row[name] for name in ("camera", "lens", "focal_length")), _LENS_WIDTH),
             *(str(row[name]) for name in ("photos", "learned_from")),
             str(row["corrected"] + row["corrected_before"]),
             *(str(row[name]) for name in ("left", "failed")),
@@ -143,8 +146,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    head = ("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed")
-    return aligned([*head, "expected gain"], lines, numbers=range(3, 9))
+    head = ("camera, lens, focal length", "photos", "learned\nfrom", "corrected", "left", "failed")
+    return aligned([*head, "expected\ngain"], lines, numbers=range(1, 7))
 
 
 def _say_more(
@@ -228,14 +231,14 @@ class PhotoGroup:
         """The lens in words; its serial shortened, as tables are shown around."""
         said = self.shots[0].metadata.lens
         serial = f" #{said.serial[-4:]}" if said.serial else ""
-        return f"{said.model or 'lens not named'}{serial}"
+        return f"{said.model or 'unknown lens'}{serial}"
 
     @property
     def focal(self) -> str:
         """The focal length in words."""
         known = [shot.metadata.focal_mm for shot in self.shots if shot.metadata.focal_mm]
         if not known:
-            return "unknown"
+            return "unknown focal length"
         low, high = f"{min(known):.3g}", f"{max(known):.3g}"
         return f"{low} mm" if low == high else f"{low}-{high} mm"
 

@@ -32,6 +32,19 @@ def test_columns_are_in_line_and_numbers_to_the_right() -> None:
     ]
 
 
+def test_a_cell_may_have_several_lines() -> None:
+    text = aligned(["lens", "learned\nfrom"], [["a long\nname", "7"], ["b", "12"]], numbers={1})
+
+    assert text.splitlines() == [
+        "lens    learned",
+        "           from",
+        "------  -------",
+        "a long        7",
+        "name",
+        "b            12",
+    ]
+
+
 def test_without_a_terminal_progress_is_told_in_lines() -> None:
     said: list[str] = []
     with PacedProgress(say=said.append, every_s=0.0, disable=True) as lines:

@@ -19,7 +19,7 @@ from PIL.TiffImagePlugin import IFDRational
 from running import SMALL, write_photo
 
 from lensmodel.cli.console import PacedProgress
-from lensmodel.cli.folder import Shot, groups
+from lensmodel.cli.folder import Shot, _table, groups
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -76,12 +76,34 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def test_each_lens_has_a_line_in_the_table(journey: Path) -> None:
-    head, _, *lines = (journey / "said.txt").read_text().splitlines()
+    text = (journey / "said.txt").read_text()
+    lines = text.splitlines()
+    names = lines[2].index(" ")  # width of the first column, by the rule under the head
 
-    assert head.split()[:2] == ["camera", "lens"]
-    assert [line.split("#")[1].split()[0] for line in lines] == ["L-42", "L-43"]
-    figures = [line.split("mm")[-1].split() for line in lines]
+    assert lines[0].startswith("camera, lens, focal length  photos")
+    assert re.findall(r"#(\S+),", text) == ["L-42", "L-43"]
+    figures = [row for line in lines[3:] if (row := line[names:].split())]
     assert [row[:5] for row in figures] == [["2", "2", "2", "0", "0"], ["1", "0", "0", "1", "0"]]
+
+
+def test_the_table_fits_a_terminal_of_80_columns() -> None:
+    row = {
+        "camera": "Canon EOS R5 Mark II, unknown camera",
+        "lens": "RF100-400mm F5.6-8 IS USM #1234",
+        "focal_length": "100-118 mm",
+        "photos": 12345,
+        "learned_from": 8,
+        "corrected": 9876,
+        "corrected_before": 3,
+        "left": 1000,
+        "failed": 99,
+        "expected_gain_db": 0.0,
+    }
+
+    text = _table([row, row | {"focal_length": "400 mm", "expected_gain_db": None}])
+
+    assert max(map(len, text.splitlines())) <= 80
+    assert "400 mm" in text
 
 
 def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> None:
@@ -206,7 +228,7 @@ def at(focal: float | None) -> PhotoMetadata:
 def test_focal_lengths_of_a_zoom_are_groups_of_one_profile() -> None:
     found = groups(shots(at(24.0), at(26.0), at(70.0), at(None)))
 
-    assert [group.focal for group in found] == ["unknown", "24-26 mm", "70 mm"]
+    assert [group.focal for group in found] == ["unknown focal length", "24-26 mm", "70 mm"]
     assert len({group.name for group in found}) == 1
 
 

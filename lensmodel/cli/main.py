@@ -39,7 +39,10 @@ COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
         "serve": ("app.commands.service", "Run the whole service: the API and a worker."),
     },
     "Research": {
-        "target": ("lensmodel.cli.measure", "Write the page to print for `lensmodel measure target`."),
+        "target": (
+            "lensmodel.cli.measure",
+            "Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.",
+        ),
         "psf": (
             "lensmodel.cli.psf",
             "Show what the lens makes of a point of light at one place in the picture.",

@@ -36,7 +36,7 @@ from lensmodel.workflow.calibrating import Admit, Calibration
 
 KINDS: Final = ("target", "pair", "points", "edges")
 EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
-PAPERS: Final = ("a2", "a3", "a4")
+PAPERS: Final = ("a2", "a3", "a4", "letter", "tabloid")
 # Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
 USUAL_DETAIL: Final = 4000
 
@@ -191,7 +191,12 @@ def _developed(
 
 def target(
     context: typer.Context,
-    output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf or .png.")],
+    output: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Name ending in .pdf; without --edges also .png.")
+    ],
+    edges: Annotated[
+        bool, typer.Option("--edges", help="35 dark squares, for `lensmodel measure edges`.")
+    ] = False,
     paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")] = "a3",
     detail: Annotated[
         int,
@@ -205,7 +210,7 @@ def target(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Write the page to print for `lensmodel measure target`.
+    """Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.
 
     Print it at full size on matte paper, in grey, without sharpening; fix it flat.
 
@@ -215,16 +220,22 @@ def target(
 
         lensmodel target target.png --paper a4 --detail 2800
 
+        lensmodel target squares.pdf --edges --paper letter
+
     Exit status: 0 written, 1 failed, 2 wrong usage.
     """
-    from lensmodel.measured import DETAILS, TargetPage, print_target  # noqa: PLC0415 - takes long, as above
+    # take long, as above
+    from lensmodel.measured import DETAILS, TargetPage, print_chart, print_target  # noqa: PLC0415
 
     shown = Display.of(context, quiet=quiet, verbose=verbose)
     if detail not in DETAILS:
         raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
     if output.is_dir():
-        raise UsageError(f"{output} is a folder; name a file ending in .pdf or .png")
+        raise UsageError(f"{output} is a folder; name a file ending in .pdf{'' if edges else ' or .png'}")
     files.refuse_existing(output, force=force)
     with files.as_usage():
-        print_target(output, TargetPage(detail), paper=paper)
+        if edges:
+            print_chart(output, paper=paper)
+        else:
+            print_target(output, TargetPage(detail), paper=paper)
     shown.result(str(output))

@@ -3,6 +3,7 @@
 from typing import Final
 
 from lensmodel.core.registry import Registry
+from lensmodel.measured.chart import print_chart
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.measured.measurer import MeasuredPsf, Measurer, estimator_of, is_measured, samples_of
 from lensmodel.measured.page import DETAILS, PAPERS, TargetPage, print_target
@@ -23,6 +24,7 @@ __all__ = [
     "estimator_of",
     "is_measured",
     "methods",
+    "print_chart",
     "print_target",
     "samples_of",
 ]

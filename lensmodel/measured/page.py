@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageOps
 from scipy import ndimage, signal
 
 from lensmodel.core.errors import InvalidInputError
@@ -154,8 +154,14 @@ def _finer(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     return samples
 
 
-# Width and height in millimetres, lying (ISO 216)
-PAPERS: Final = {"a2": (594.0, 420.0), "a3": (420.0, 297.0), "a4": (297.0, 210.0)}
+# Width and height in millimetres, lying (ISO 216, ANSI/ASME Y14.1)
+PAPERS: Final = {
+    "a2": (594.0, 420.0),
+    "a3": (420.0, 297.0),
+    "a4": (297.0, 210.0),
+    "letter": (279.4, 215.9),
+    "tabloid": (431.8, 279.4),
+}
 SUFFIXES: Final = (".pdf", ".png")
 _GREYS: Final = 64  # levels of print: finer than a printer renders, and a small file (chosen)
 
@@ -163,17 +169,32 @@ _GREYS: Final = 64  # levels of print: finer than a printer renders, and a small
 def print_target(path: str | Path, page: TargetPage, *, paper: str = "a3") -> None:
     """Write a page to print on a paper of `PAPERS`, as a file whose suffix is one of `SUFFIXES`."""
     path = Path(path)
-    if paper not in PAPERS:
-        raise InvalidInputError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
+    width, height = require_paper(paper)
     if path.suffix.lower() not in SUFFIXES:
         raise InvalidInputError(f"{path.name}: a target is written as {', '.join(SUFFIXES)}")
-    picture = _greys(page, paper)
-    dpi = picture.width / (PAPERS[paper][0] / 25.4)
+    picture = _on_paper(_greys(page, paper), width / height)
+    dpi = picture.width / (width / 25.4)
     with atomic(path) as file:
         if path.suffix.lower() == ".png":
             picture.save(file, "PNG", dpi=(dpi, dpi))
         else:  # at its best JPEG errs by one of 255 levels, a quarter of the distance between two greys
             picture.save(file, "PDF", resolution=dpi, quality=100, title=_name(page, paper))
+
+
+def require_paper(paper: str) -> tuple[float, float]:
+    """Return width and height of a paper of `PAPERS`, lying, in millimetres; refuse an unknown one."""
+    if paper not in PAPERS:
+        raise InvalidInputError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
+    return PAPERS[paper]
+
+
+def _on_paper(picture: Image.Image, aspect: float) -> Image.Image:
+    """Put white at two sides of a page where the paper is not of its shape."""
+    if abs(aspect / ASPECT - 1.0) < 0.01:
+        return picture
+    width, height = picture.size
+    size = max(width, round(height * aspect)), max(height, round(width / aspect))
+    return ImageOps.pad(picture, size, color=255)
 
 
 def _name(page: TargetPage, paper: str) -> str:

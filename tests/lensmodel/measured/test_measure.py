@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
-from scipy import signal
+from PIL import Image, ImageDraw
+from scipy import ndimage, signal
 
 from lab import targets
 from lensmodel import measured as measure
@@ -19,8 +19,8 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel
-from lensmodel.measured.edges import SlantedEdges
-from lensmodel.measured.page import TargetPage
+from lensmodel.measured.edges import SlantedEdges, squares_of
+from lensmodel.measured.page import PAPERS, TargetPage
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
 from lensmodel.measured.registration import homography_of, match
@@ -29,6 +29,7 @@ from lensmodel.measured.target import PlacedPage, Target
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
+from lensmodel.quality import find_edges
 from lensmodel.workflow.calibrating import joined
 from lensmodel.workflow.measuring import samples_of_developed
 
@@ -163,8 +164,67 @@ def test_a_target_is_written_to_print(tmp_path: Path, suffix: str) -> None:
 def test_a_target_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="pdf"):
         measure.print_target(tmp_path / "target.gif", TargetPage(300))
-    with pytest.raises(InvalidInputError, match="a2, a3, a4"):
-        measure.print_target(tmp_path / "target.png", TargetPage(300), paper="letter")
+    with pytest.raises(InvalidInputError, match="a2, a3, a4, letter"):
+        measure.print_target(tmp_path / "target.png", TargetPage(300), paper="legal")
+
+
+@pytest.mark.parametrize("paper", ["letter", "tabloid"])
+def test_a_target_lies_in_the_middle_of_paper_of_another_shape(tmp_path: Path, paper: str) -> None:
+    path, page = tmp_path / "target.png", TargetPage(300)
+    measure.print_target(path, page, paper=paper)
+
+    with Image.open(path) as picture:
+        rows, cols = page.raster.shape
+        width, height = (side * 25.4 / picture.info["dpi"][0] for side in picture.size)
+        greys = np.asarray(picture, dtype=float) / 255.0
+    assert (width, height) == pytest.approx(PAPERS[paper], rel=0.01)
+    top, left = round((greys.shape[0] - rows) / 2), round((greys.shape[1] - cols) / 2)
+    inner = greys[top : top + rows, left : left + cols]
+    assert np.abs(inner - page.raster)[page.border * 2 : -page.border * 2].max() < 0.02
+
+
+# --- the chart of edges -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("paper", ["a4", "letter"])
+def test_a_chart_is_written_whose_squares_are_found_when_it_is_photographed(
+    tmp_path: Path, paper: str
+) -> None:
+    path = tmp_path / "squares.pdf"
+    measure.print_chart(path, paper=paper)
+    text = path.read_text("ascii")
+
+    number = r"(\d+\.\d+)"
+    width, height = map(float, re.findall(rf"MediaBox \[ 0 0 {number} {number} \]", text)[0])
+    assert (width, height) == pytest.approx([side / 25.4 * 72 for side in PAPERS[paper]], abs=0.01)
+    drawn = re.findall(rf"^{number} {number} m ((?:{number} {number} l )+)h f$", text, re.MULTILINE)
+    assert len(drawn) == 35
+    scale, fine = 3.0, 4  # pixels a point, and points drawn for each along an axis
+    picture = Image.new("L", (round(width * scale * fine), round(height * scale * fine)), 200)
+    for start in re.findall(r"^(.*) h f$", text, re.MULTILINE):
+        xy = np.array(re.findall(number, start), dtype=float).reshape(4, 2)
+        ImageDraw.Draw(picture).polygon([(x * scale * fine, (height - y) * scale * fine) for x, y in xy], 20)
+    photo = np.asarray(picture.reduce(fine), dtype=np.float32) / 255.0
+    squares = squares_of(find_edges(ndimage.gaussian_filter(photo, 1.0)))
+    assert len(squares) == 35
+    assert all(len(square) == 4 for square in squares)
+
+
+def test_the_table_of_a_charts_file_says_where_its_objects_begin(tmp_path: Path) -> None:
+    path = tmp_path / "squares.pdf"
+    measure.print_chart(path)
+    data = path.read_bytes()
+
+    table = int(data.rsplit(b"startxref\n", 1)[1].split()[0])
+    assert data[table:].startswith(b"xref\n0 6\n")
+    places = [int(row[:10]) for row in data[table:].splitlines()[3:8]]
+    assert [data[at : at + 7] for at in places] == [b"%d 0 obj" % number for number in range(1, 6)]
+    assert b"/Length %d " % len(data.split(b"stream\n")[1].removesuffix(b"\nend")) in data
+
+
+def test_a_chart_is_no_picture(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="pdf"):
+        measure.print_chart(tmp_path / "squares.png")
 
 
 # --- registration -------------------------------------------------------------------------------

@@ -117,7 +117,8 @@ def measure(
     with shown.progress() as bars:
         task = bars.add_task("", total=len(groups))
         for number, group in enumerate(groups):
-            bars.update(task, description=f"{group[0].name}: measuring")
+            # the pace of a single photo is that of its places: reading it and finding the chart has another
+            bars.update(task, description=f"{group[0].name}: measuring", more=len(groups) == 1)
             method = partial(
                 measuring.samples_of_developed,
                 kind,

@@ -6,11 +6,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from in_process import lensmodel
+from running import SMALL, write_photo
 
 from lensmodel.cli import console
 from lensmodel.cli.console import Pace, PacedProgress, aligned, clock, mtf50_words
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import StepHook
 
 
 @pytest.mark.parametrize(
@@ -93,6 +99,26 @@ def test_no_time_left_is_told_before_it_is_right_within_a_factor_of_two(pace: st
 
     assert all(0.5 <= ratio <= 2.0 for ratio in told)
     assert told or pace == "two photos"
+
+
+def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [0.0]
+
+    def measure(*_: Any, on_step: StepHook, **given: Any) -> list[PsfSample]:
+        now_s[0] = 60.0  # the page was found
+        for place in range(1, 11):
+            now_s[0] += 2.0
+            on_step(place, 40)
+        raise NotEnoughEvidenceError("no more of it is needed")
+
+    write_photo(tmp_path / "page.dng", 1, shape=SMALL)
+    monkeypatch.setattr(console.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr("lensmodel.workflow.measuring.samples_of_developed", measure)
+    done = lensmodel("measure", "target", "page.dng", "--profile", "a.lensprofile", cwd=tmp_path)
+
+    assert "[1:12]  15 % page.dng: measuring, about 1:08 left" in done.stderr.splitlines()
 
 
 def test_quick_work_says_nothing() -> None:

@@ -18,16 +18,19 @@ _PAGE: Final = Template("""<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>$name: lens report</title>
 <style>
-body { font: 1rem/1.5 system-ui, sans-serif; color: #191a1c; max-width: 76rem; margin: 0 auto;
-  padding: 1rem 1.5rem; }
+:root { color-scheme: light dark; background: light-dark(#fff, #131416); }
+body { font: 1rem/1.5 system-ui, sans-serif; color: light-dark(#191a1c, #eeeeec); max-width: 76rem;
+  margin: 0 auto; padding: 1rem 1.5rem; }
 .charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 34rem), 1fr)); }
 figure { margin: 0; }
 img { width: 100%; min-width: 34rem; height: auto; }
 figure, .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .2rem .8rem .2rem 0; text-align: left; border-bottom: 1px solid #dcdcd8; }
-.notes { color: #55585d; font-size: .9rem; }
-@media print { img { break-inside: avoid; } }
+th, td { padding: .2rem .8rem .2rem 0; text-align: left;
+  border-bottom: 1px solid light-dark(#dcdcd8, #363a3f); }
+.notes { color: light-dark(#55585d, #b1b4b9); font-size: .9rem; }
+@media screen and (prefers-color-scheme: dark) { figure { filter: invert(.92) hue-rotate(180deg); } }
+@media print { :root { color-scheme: light; } img { break-inside: avoid; } }
 </style>
 </head>
 <body>

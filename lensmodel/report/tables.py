@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterator
 from typing import Final, TypeAlias
 
+from lensmodel.report.centring import EDGE_R, Centring
 from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
 
 _HEAD: Final = (
@@ -38,7 +40,7 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
 
 
 def to_csv(report: LensReport) -> str:
-    """Write a report as CSV: MTF50 over the picture, contrast by radius, lateral colour; a line a figure."""
+    """Write a report as CSV: MTF50 over the picture, contrast by radius, centring, lateral colour."""
     out = io.StringIO()
     writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
     writer.writeheader()
@@ -77,3 +79,20 @@ def _rows(found: ApertureReport) -> Iterator[_Row]:
         for direction, values in (("tangential", curve.tangential), ("sagittal", curve.sagittal)):
             for r, value in zip(found.radii, values, strict=True):
                 yield own | {"direction": direction, "r": r, "value": value}
+    yield from _centring_rows(found.centring, known)
+
+
+def _centring_rows(found: Centring, known: _Row) -> Iterator[_Row]:
+    """The verdict as 0 or 1, and both signs of a fault with two standard errors; `phi` is their direction."""
+    decentred = int(found.verdict == "decentred")
+    yield known | {"quantity": "decentred", "value": decentred, "unknown": int(found.verdict == "unknown")}
+    if (softer := found.softer) is not None:
+        value, low, high = (math.exp(softer.amount + k * softer.error) for k in (0.0, -2.0, 2.0))
+        yield known | {"quantity": "width of blur, softer side over opposite side", "unit": "ratio"} | {
+            "r": EDGE_R, "phi": softer.direction, "value": value, "low": low, "high": high
+        }  # fmt: skip
+    if (coma := found.coma) is not None:
+        value, low, high = (max(coma.amount + k * coma.error, 0.0) for k in (0.0, -2.0, 2.0))
+        yield known | {"quantity": "coma in the middle of the picture", "unit": "cubed widths of blur"} | {
+            "r": 0.0, "phi": coma.direction, "value": value, "low": low, "high": high
+        }  # fmt: skip

@@ -288,6 +288,29 @@ def test_all_documents_hold_the_same_figures(soft: LensReport) -> None:
     )
 
 
+def test_the_csv_says_whether_the_lens_is_centred(soft: LensReport) -> None:
+    signs = Asymmetry(0.2, 0.7, 0.05, significant=True), Asymmetry(0.1, -0.4, 0.08, significant=False)
+    found = replace(soft.tested[0], centring=Centring("decentred", "", *signs))
+
+    rows = list(csv.DictReader(io.StringIO(to_csv(replace(soft, tested=(found,))))))
+    decentred, softer, coma = rows[-3:]
+
+    assert (decentred["quantity"], decentred["value"], decentred["unknown"]) == ("decentred", "1", "0")
+    columns = ("value", "low", "high", "phi")
+    assert [float(softer[name]) for name in columns] == pytest.approx(
+        [*np.exp([0.2, 0.1, 0.3]), 0.7], rel=1e-5
+    )
+    assert [float(coma[name]) for name in columns] == pytest.approx([0.1, 0.0, 0.26, -0.4], rel=1e-5)
+
+
+def test_the_page_has_a_dark_scheme_and_prints_on_white(soft: LensReport) -> None:
+    page = to_html(soft).decode()
+
+    assert "color-scheme: light dark" in page
+    assert "@media screen and (prefers-color-scheme: dark) { figure { filter: invert(" in page
+    assert "@media print { :root { color-scheme: light; }" in page
+
+
 def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensReport) -> None:
     first, second = to_pdf(pages(soft)), to_pdf(pages(soft))
     assert first.startswith(b"%PDF-")

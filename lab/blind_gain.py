@@ -164,7 +164,7 @@ def main() -> None:
         traced = GridLens.read(path)
         own = replace(camera, pitch_um=traced.grid.pitch_um)
         lenses.append(KnownLens(path.stem, traced, 2000 + number, own, wanted.hot))
-    print("| lens | n | gain center / mid / corner, dB | expected | PSF error (expected) | lost | worst |")
+    print("| lens | n | gain centre / mid / corner, dB | expected | PSF error (expected) | lost | worst |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses:

@@ -213,7 +213,7 @@ def correct(
     Returns
     -------
     Corrected
-        `.planes`, float32 of shape (3, height, width) in linear light; `.zones`, the expected gain in center,
+        `.planes`, float32 of shape (3, height, width) in linear light; `.zones`, the expected gain in centre,
         mid and corner; `.audit`, what was held back and why.
 
     Raises

@@ -1,6 +1,6 @@
 """Windows of a large frame, photographed through lenses with known PSFs.
 
-A frame of 6 megapixels is photographed only where it is looked at: a window in the center, one half
+A frame of 6 megapixels is photographed only where it is looked at: a window in the centre, one half
 way out and one in a corner, where the kernels are those of the whole field.
 """
 

@@ -2,7 +2,7 @@
 
     python -m lab.correction.judge [--scenes lamps text] [--widths 1 1.2] [--method standard]
 
-Prints a table: gain in PSNR of the picture as shown in center, mid and corner, overshoot beside edges and
+Prints a table: gain in PSNR of the picture as shown in centre, mid and corner, overshoot beside edges and
 grain over the original's, isolated dots, hue flips, share of the correction that was held back, CPU seconds
 a megapixel. Widths other than 1 hand over kernels so many times as wide, with the error that they have.
 """

@@ -31,7 +31,7 @@ def places(
     after: Rendered,
     named: Sequence[tuple[str, Sequence[int] | None]] = (),
 ) -> list[Place]:
-    """Center, corners, and the three places where most was changed."""
+    """Centre, corners, and the three places where most was changed."""
     height, width = before.shape[:2]
     side = side_of(before)
     found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]

@@ -50,7 +50,7 @@ def patch_places(rng: np.random.Generator) -> list[FieldPosition]:
 
 
 def asked_places() -> list[FieldPosition]:
-    """Places of the questions, all inside the frame: 12 at the center, 8 mid, 12 in the corners."""
+    """Places of the questions, all inside the frame: 12 at the centre, 8 mid, 12 in the corners."""
     rings: list[tuple[tuple[float, ...], tuple[float, ...]]] = [
         ((0.05, 0.15, 0.27), (-2.2, -0.6, 1.1, 2.6)),
         ((0.4, 0.6), (-2.7, -0.5, 0.4, 2.5)),

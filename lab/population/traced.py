@@ -40,7 +40,7 @@ _WORST_PX: Final = 8.0  # r.m.s. spot at 0.9 of the half diagonal that a copy ma
 _EDGE: Final = 0.9
 _WORST_COLOUR_PX: Final = 10.0  # lateral colour between the ends of `_COLOURS_UM`
 _WORST_MISFIT_UM: Final = 0.1  # r.m.s.: beyond it the terms do not hold the traced wavefront
-_SOFT_PX: Final = (1.5, 5.0)  # r.m.s. spots in the center of copies that are opened beyond their design
+_SOFT_PX: Final = (1.5, 5.0)  # r.m.s. spots in the centre of copies that are opened beyond their design
 _COLOURS_UM: Final = (0.45, 0.54, 0.63)
 _TRIES: Final = 60
 
@@ -310,7 +310,7 @@ class TracedLens:
 def draw(rng: np.random.Generator, designs: Sequence[str], *, opened: bool = False) -> TracedLens:
     """Draw a copy of one of the designs that `forms_image`.
 
-    With `opened` it opens one to two stops beyond its design, and is soft in the center: such lenses are rare
+    With `opened` it opens one to two stops beyond its design, and is soft in the centre: such lenses are rare
     among the others, and hardest to tell.
     """
     for _ in range(_TRIES * (1 + opened)):

@@ -13,7 +13,7 @@ from lensmodel.core.types import CHANNELS, ZONES
 COUNTS: Final = ("1", "2", "5")
 """Numbers of photos that bars are of."""
 
-# What is asked (chosen): of 1, 2 and 5 photos, and of those in center, mid and corner.
+# What is asked (chosen): of 1, 2 and 5 photos, and of those in centre, mid and corner.
 _PSF: Final = ((0.12, 0.18, 0.38), (0.10, 0.15, 0.32), (0.08, 0.11, 0.27))
 _COLOURS: Final = (1.6, 1.4, 1.3)
 _KEPT: Final = ((0.75, 0.70, 0.55), (0.80, 0.75, 0.65), (0.85, 0.80, 0.70))

@@ -106,7 +106,7 @@ def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
     page.table(head, [[_shown(state), *_edge_cells(row)] for state, row in found["mtf"].items()])
     page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
     page.table(["", *ZONES], _rows({f"n = {n}": row for n, row in found["share"].items()}, 2))
-    page.text("The paper, Canon EF 24mm f/1.4 (center, corner), for comparison of shares, not of values:")
+    page.text("The paper, Canon EF 24mm f/1.4 (centre, corner), for comparison of shares, not of values:")
     page.table(["", "center", "corner"], _PAPER)
 
 
@@ -303,7 +303,7 @@ def _before_after(page: Page, result: Mapping[str, Any]) -> None:
     """Crops of the photo never learned from."""
     page.title("Figs. 5 and 6: before and after")
     page.text(
-        "1:1 crops of the photo never used for calibration: center, upper left, upper right, lower left, "
+        "1:1 crops of the photo never used for calibration: centre, upper left, upper right, lower left, "
         "lower right."
     )
     for case in result["cases"]:

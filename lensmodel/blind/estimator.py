@@ -88,7 +88,7 @@ class PsfEstimator(Protocol):
         Returns
         -------
         PsfEstimate
-            Its kernel is float64 of shape (size, size), with sum 1 and its center of mass in the middle.
+            Its kernel is float64 of shape (size, size), with sum 1 and its centre of mass in the middle.
 
         Raises
         ------

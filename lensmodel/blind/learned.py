@@ -39,7 +39,7 @@ _DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)
 _HELD: Final = 0.999  # share of its light that the array of a sample's kernel holds (chosen)
 _LEAST_SIDE: Final = 15  # pixels: of a sample's kernel (chosen)
 _ANYWHERE: Final = FieldPosition(0.5, 0.6)
-"""Place of patches of which nobody says where they lie (chosen: between center and corner)."""
+"""Place of patches of which nobody says where they lie (chosen: between centre and corner)."""
 
 
 @dataclass(frozen=True, slots=True)

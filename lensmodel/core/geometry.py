@@ -22,7 +22,7 @@ CORNER_ZONE_R = 0.75  # zone "corner" lies above this r
 
 
 def zone_of(r: float) -> Zone:
-    """Name the zone of the field that `r` lies in: center r < 0.3, corner r > 0.75, else mid."""
+    """Name the zone of the field that `r` lies in: centre r < 0.3, corner r > 0.75, else mid."""
     if r < CENTER_ZONE_R:
         return "center"
     return "corner" if r > CORNER_ZONE_R else "mid"
@@ -81,7 +81,7 @@ class Frame:
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centers of equal cells of a picture.
+    """Return the field positions of the centres of equal cells of a picture.
 
     Parameters
     ----------

@@ -257,7 +257,7 @@ class PsfSample:
         k odd; finite, not negative and not all zero, on the sensor's pixel grid in sensor orientation. It is
         copied, normalized and read-only here.
     position : FieldPosition
-        Center of the patch that it was seen in.
+        Centre of the patch that it was seen in.
     settings : LensSettings
         Aperture, focal length, focus distance and channel of the photo.
     weight : float

@@ -50,7 +50,7 @@ class FieldPosition:
     Parameters
     ----------
     r : float
-        Distance to the image center over the half diagonal: 0 center, 1 corner.
+        Distance to the image centre over the half diagonal: 0 centre, 1 corner.
     phi : float
         Angle in radians, counter-clockwise from the right: 0 right, +pi/2 towards row 0.
         Stored wrapped into (-pi, pi].

@@ -77,7 +77,7 @@ class PsfAnswer:
     Parameters
     ----------
     kernel : Kernel, float64, shape (size, size)
-        In the image frame, centered, sum 1.
+        In the image frame, centred, sum 1.
     predicted_error : float
         Expected relative L2 of the kernel, 0..1.
     effective_samples : float

@@ -249,11 +249,11 @@ LEAST_PATCHES: Final = 6
 LEAST_PARTS: Final = 3
 """Parts of the picture that they lie in: three places off one line determine a plane over the field."""
 
-PARTS: Final = 9  # the center, the four quarters of the picture around it, and the outer end of each
+PARTS: Final = 9  # the centre, the four quarters of the picture around it, and the outer end of each
 
 
 def part_of(position: FieldPosition) -> int:
-    """Number of the part of the picture that a place lies in, 0 to `PARTS` - 1, the center first."""
+    """Number of the part of the picture that a place lies in, 0 to `PARTS` - 1, the centre first."""
     zone = zone_of(position.r)
     if zone == "center":
         return 0
@@ -282,7 +282,7 @@ def require_enough(patches: Sequence[Patch], *, least: int = LEAST_PATCHES) -> N
         )
     if parts < min(LEAST_PARTS, least):
         raise NoUsablePatchesError(
-            f"fine detail in focus was found in only {parts} of {PARTS} parts of the picture (the center, "
+            f"fine detail in focus was found in only {parts} of {PARTS} parts of the picture (the centre, "
             f"four quarters and their outer ends), and a photo counts from {LEAST_PARTS} on; take "
             "a scene with detail all over"
         )

@@ -41,8 +41,8 @@ class Lens:
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
     The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
-    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the center over
-    the half diagonal (0 center, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
+    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the centre over
+    the half diagonal (0 centre, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
     sensor orientation. Kernels are float64, of odd side, not negative, of sum 1, on the pixel grid of the
     sensor that the lens was calibrated on.
 
@@ -81,7 +81,7 @@ class Lens:
         Parameters
         ----------
         kernels : array_like of float, shape (n, k, k)
-            k odd; not negative, on the pixel grid of the sensor. Each is normalized, and its center of mass
+            k odd; not negative, on the pixel grid of the sensor. Each is normalized, and its centre of mass
             moved to the middle pixel.
         r, phi : array_like of float, shape (n,)
             Field positions: half diagonals 0..1, and radians.
@@ -284,7 +284,7 @@ class Lens:
         Parameters
         ----------
         rows, cols : int
-            Equal cells of the picture; each value is that of its cell's center.
+            Equal cells of the picture; each value is that of its cell's centre.
         aspect : float
             Width over height of the picture.
         **settings
@@ -319,7 +319,7 @@ class Lens:
         Parameters
         ----------
         rows, cols : int
-            Equal cells of the picture; each kernel is that of its cell's center.
+            Equal cells of the picture; each kernel is that of its cell's centre.
         aspect : float
             Width over height of the picture.
         aperture, size

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 from lensmodel.core.errors import LensModelError
+
+OTHER_LENS_REMEDY: Final = "choose its own lens, or send any_lens=true if it is the same"
 
 
 class ServiceError(LensModelError):

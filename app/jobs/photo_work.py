@@ -17,11 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from app.errors import OTHER_LENS_REMEDY
 from app.jobs import inspection
 from app.jobs.answers import JobFailedError, NotWantedError
 from app.jobs.context import MAX_UNPACKED, JobContext
 from app.jobs.sample_files import DAMAGED, returned_samples
-from app.other_lens import REMEDY, Described, difference
 from app.presets import configured_preset
 from app.store.owners import ANY_OWNER, now
 from app.store.photos import stored_settings
@@ -32,6 +32,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
+from lensmodel.workflow.identity import Identity, difference
 
 log = logging.getLogger(__name__)
 
@@ -326,11 +327,11 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
         raise JobFailedError("conflict", f"{text}: use it on the command line")
     if not file.given.get("any_lens"):
         focals = store.lenses.coverage_of([lens])[lens.id][1]
-        named = {name: read["lens"].get(name) for name in ("maker", "model", "serial")}
-        other = Described(**named, focals_mm={s.settings.focal_mm for s in samples if s.settings.focal_mm})
-        why = difference(Described(lens.maker, lens.model, lens.serial, focals_mm=focals), other)
+        own = {s.settings.focal_mm for s in samples if s.settings.focal_mm}
+        why = difference(Identity(lens.names, focals_mm=focals), Identity(read["lens"], focals_mm=own))
         if why is not None:
-            raise JobFailedError("other_lens", f"the profile seems to be of another lens: {why}; {REMEDY}")
+            text = f"the profile seems to be of another lens: {why}; {OTHER_LENS_REMEDY}"
+            raise JobFailedError("other_lens", text)
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
     if not store.photos.take_in(file, samples, names):
         raise NotWantedError

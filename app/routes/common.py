@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, Final, TypeAlias
 from urllib.parse import quote
 
 from fastapi import Query
 
-from app.errors import ConflictError
+from app.errors import OTHER_LENS_REMEDY, ConflictError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
-from app.other_lens import REMEDY, Described, difference
 from app.schemas import OptionalName, Problem
 from app.store.tables import LensRow, PhotoRow
-from lensmodel.core.names import camera_name
+from lensmodel.model import Camera
+from lensmodel.workflow.identity import Identity, difference
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 _ID: Final = "^[A-Za-z0-9]{1,40}$"
@@ -50,17 +51,20 @@ def file_headers(name: str, *, inline: bool = False, cache: str = "private, no-c
 
 def check_same_lens(call: Call, lens: LensRow, other: LensRow | PhotoRow, what: str) -> None:
     """Refuse a photo, or a lens, that seems to be of another lens, as the command line does."""
-    why = difference(_described(call, lens), _described(call, other))
+    why = difference(_identity(call, lens), _identity(call, other))
     if why is not None:
-        raise ConflictError(f"{what}: {why}; {REMEDY}", code="other_lens")
+        raise ConflictError(f"{what}: {why}; {OTHER_LENS_REMEDY}", code="other_lens")
 
 
-def _described(call: Call, it: LensRow | PhotoRow) -> Described:
+def _identity(call: Call, it: LensRow | PhotoRow) -> Identity:
     """Return what is known of a lens by itself and its newest photos, or what a photo says of its lens."""
+    photos: Sequence[PhotoRow]
     if isinstance(it, PhotoRow):
-        maker, model, serial, photos = it.lens_maker, it.lens_model, it.lens_serial, [it]
+        said = {"maker": it.lens_maker, "model": it.lens_model, "serial": it.lens_serial}
+        names, photos = {key: name for key, name in said.items() if name}, [it]
     else:
-        maker, model, serial = it.maker, it.model, it.serial
         photos = call.store.photos.page(call.owner, before=None, limit=200, lens_id=it.public_id)
-    cameras = {camera_name(row.camera_maker, row.camera_model) for row in photos if row.camera_model}
-    return Described(maker, model, serial, cameras, [row.focal_mm for row in photos if row.focal_mm])
+        names = it.names
+    cameras = {Camera(row.camera_maker, row.camera_model, row.body_key) for row in photos if row.camera_model}
+    focals = {row.focal_mm for row in photos if row.focal_mm}
+    return Identity(names, cameras, focals)

@@ -148,13 +148,11 @@ def get_lens_profile(lens_id: str, call: CallDep) -> Response:
     """Return all that was learned of a lens as one file, which the command line reads too."""
     lens = call.lens(lens_id)
     model = call.models.get(lens_id).model
-    named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
-    identity = {name: value for name, value in named.items() if value}
     rows = call.store.photos.page(call.owner, before=None, limit=MAX_PHOTOS, lens_id=lens_id)
     learned = {sample.photo for sample in model.samples}
     photos = {row.public_id: row.filename for row in rows if row.public_id in learned}
     out = io.BytesIO()
-    write_profile(out, LensProfile(model, identity, photos))
+    write_profile(out, LensProfile(model, lens.names, photos))
     name = lens.label or full_name(lens.maker, lens.model) or "lens"
     headers = common.file_headers(f"{name}.lensprofile")
     return Response(out.getvalue(), media_type="application/zip", headers=headers)

@@ -161,6 +161,12 @@ class LensRow(Owned, Base):
     sample_count: Mapped[Count]
     created_at: Mapped[datetime]
 
+    @property
+    def names(self) -> dict[str, str]:
+        """What is known of its name: maker, model, serial, label."""
+        names = {"maker": self.maker, "model": self.model, "serial": self.serial, "label": self.label}
+        return {key: name for key, name in names.items() if name}
+
     def complete(self, maker: str | None, model: str | None) -> None:
         """Fill in the maker and the model where they are not known yet."""
         self.maker, self.model = self.maker or maker, self.model or model

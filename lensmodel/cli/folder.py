@@ -23,7 +23,8 @@ from lensmodel.core.names import camera_name, name_key, serial_key
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow.calibrating import Calibration, Identity
+from lensmodel.workflow.calibrating import Calibration
+from lensmodel.workflow.identity import SAME_FOCAL, Identity
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import CalibrationEvent, Config
 
@@ -169,9 +170,6 @@ def _say_more(
         display.note(f"corrected photos are in {where}, lens profiles in {profiles}")
 
 
-# Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
-# (`focal_octaves` in `lensmodel.model.variables`)
-SAME_FOCAL: Final = 1.19
 # Photos at the same settings that follow each other within this time show the same (chosen)
 BURST: Final = timedelta(seconds=2)
 # Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some

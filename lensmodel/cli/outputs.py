@@ -27,8 +27,8 @@ from lensmodel.core.types import ZONE_WORDS, StepHook
 from lensmodel.correction.audit import HELD
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.values import CORRECTED, PhotoMetadata
-from lensmodel.workflow.calibrating import Identity, difference
 from lensmodel.workflow.correcting import SEEN_DB
+from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 
 EXTENSION: Final[dict[OutputFormat | None, str]] = {None: ".tif", "tiff32": ".tif", "png8": ".png"} | {
@@ -179,11 +179,15 @@ class Correction:
     def _require_lens(self, path: Path, said: PhotoMetadata, lens: Lens) -> None:
         """Refuse a photo of another lens, unless it is asked for; tell what the photo does not say."""
         identity = Identity.of(said)
-        why = difference(lens.profile.lens, lens.profile.cameras, identity)
+        why = difference(Identity.of_profile(lens.profile), identity)
         if why is not None and not (self.any_lens or self.force):
-            raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
+            raise InvalidInputError(
+                f"it seems to be of another lens: {why}; use the profile of its own lens, or add --any-lens"
+            )
         if why is not None:
-            self.display.note(f"{path}: {why}; it is corrected all the same, as you asked")
+            self.display.note(
+                f"{path}: it seems to be of another lens: {why}; it is corrected all the same, as you asked"
+            )
         elif not identity.names_lens and not self.sorted:  # else it was sorted by its camera
             self.display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
         if self.options["aperture"] is None and said.aperture is None:

@@ -6,9 +6,8 @@ photo, photo, ... -> samples of each (`sampling`) -> added to the model
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -16,12 +15,12 @@ from typing import Any, Final
 from lensmodel import photo
 from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
-from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.psf import PsfSample
 from lensmodel.measured import is_measured
-from lensmodel.model import Camera, LensModel, LensProfile, ModelSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings
 from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
+from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.sampling import (
     CalibrationEvent,
@@ -40,87 +39,7 @@ AHEAD: Final = 32
 SAME_STOPS: Final = 1.0 / 3.0
 """Apertures nearer than this are one setting: cameras set thirds of a stop."""
 
-_SAME_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """What a photo says of its lens and of its camera."""
-
-    lens: Mapping[str, str] = field(default_factory=dict)  # maker, model, serial, as far as they are known
-    camera: Camera | None = None  # the body; `None` where the photo does not name its model
-
-    @classmethod
-    def of(cls, metadata: PhotoMetadata) -> Identity:
-        """Take from a photo's metadata what tells of its lens and its camera."""
-        lens = metadata.lens
-        named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial}
-        camera = Camera(metadata.camera_maker, metadata.camera_model, metadata.body_serial)
-        return cls({name: value for name, value in named.items() if value}, camera if camera.model else None)
-
-    @property
-    def names_lens(self) -> bool:
-        """Whether there is more than a maker, which says nothing of the lens."""
-        return _names_lens(self.lens)
-
-
-def difference(known: Mapping[str, str], cameras: Iterable[Camera], identity: Identity) -> str | None:
-    """Say why a photo cannot be, or need not be, of the lens of a profile.
-
-    - What both name of the lens must agree.
-    - A lens that is part of a camera, and names itself after it, is as unique as the body: the serials of
-      both must agree.
-    - Where the photo names no lens, its camera must be one that the profile's photos were taken with: the
-      lens of a compact is part of it, and two models of camera have two lenses. On the same body an
-      unnamed lens may be any that was screwed on; that is for the owner to know.
-    - Where only the photo names its lens, its camera recorded more than for the profile's photos, so
-      nothing says that they are of one lens, unless the owner gave the profile a label.
-    """
-    for name, value in identity.lens.items():
-        key = serial_key if name == "serial" else name_key
-        if key(known.get(name, value)) != key(value):
-            return (
-                f"it was taken with another lens, {name} {value}, and the profile is of {name} {known[name]}"
-            )
-    bodies = list(cameras)
-    if identity.names_lens and not _names_lens(known) and not known.get("label"):
-        return f"it names its lens, {_lens_words(identity.lens)}, and the profile's photos name none"
-    if identity.camera is None or not bodies:
-        return None
-    alike = [body for body in bodies if _same_model(body, identity.camera)]
-    if not identity.names_lens and not alike:
-        return (
-            f"it names no lens and was taken with another camera, {identity.camera.model}, "
-            f"and the profile's photos with {', '.join(body.model or 'an unknown camera' for body in bodies)}"
-        )
-    built_in = not _names_lens(known) if not identity.names_lens else _is_built_in(identity)
-    serials = {serial_key(body.serial) for body in alike if body.serial}
-    serial = identity.camera.serial
-    if built_in and serial and serials and serial_key(serial) not in serials:
-        return (
-            f"it was taken with another copy of the camera, serial {serial}, and nothing "
-            "says that the lens is the same"
-        )
-    return None
-
-
-def _names_lens(lens: Mapping[str, str]) -> bool:
-    return bool(lens.get("model") or lens.get("serial"))
-
-
-def _is_built_in(identity: Identity) -> bool:
-    camera = "" if identity.camera is None else name_key(identity.camera.model)
-    return bool(camera) and camera in name_key(identity.lens.get("model")) and not identity.lens.get("serial")
-
-
-def _same_model(one: Camera, other: Camera) -> bool:
-    # makers write their name into the model or not, and in more than one way; models are not shared
-    a, b = name_key(one.model), name_key(other.model)
-    return bool(a) and bool(b) and (a.endswith(b) or b.endswith(a))
-
-
-def _lens_words(lens: Mapping[str, str]) -> str:
-    return " ".join(lens[name] for name in ("model", "serial") if lens.get(name))
+_ONE_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
 
 
 class LensStore:
@@ -235,10 +154,10 @@ class Calibration:
         else:
             model = joined(lens.model, samples, replace=self._replace)
             known = dataclasses.replace(lens.profile, model=model)
-        names, camera = known.lens, identity.camera
+        names = known.lens
         if lens is None or not self._any_lens:  # a photo that may be of another lens does not name this one
-            names = {**identity.lens, **names}
-        cameras = known.cameras if camera is None or camera in known.cameras else (*known.cameras, camera)
+            names = {**identity.names, **names}
+        cameras = tuple(dict.fromkeys([*known.cameras, *identity.cameras]))
         photos = {**known.photos, key: path.name}
         if self._replace:  # which may have taken all samples of a photo
             left = {sample.photo for sample in known.model.samples}
@@ -292,10 +211,11 @@ class Calibration:
         """Refuse a photo of another lens."""
         if lens is None or self._any_lens:
             return
-        why = difference(lens.profile.lens, lens.profile.cameras, identity)
+        why = difference(Identity.of_profile(lens.profile), identity)
         if why is not None:
             raise InvalidInputError(
-                f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
+                f"it seems to be of another lens: {why}; give it a profile of its own, or allow it "
+                "(--any-lens, any_lens=True)"
             )
 
 
@@ -313,4 +233,4 @@ def _alike(old: PsfSample, new: PsfSample) -> bool:
     if a is not None and b is not None and abs(a - b) >= SAME_STOPS:
         return False
     f, g = old.settings.focal_mm, new.settings.focal_mm
-    return f is None or g is None or abs(f - g) < _SAME_FOCAL * g
+    return f is None or g is None or abs(f - g) < _ONE_FOCAL * g

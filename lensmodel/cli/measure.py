@@ -138,7 +138,7 @@ def measure(
         if result["state"] == "measured":
             shown.result(
                 f"{target}: {result['places']} places measured on {Path(result['photos'][0]).name} "
-                f"({result['estimator']}), usual error {result['error']:.2f}"
+                f"({result['estimator']}), expected error of a PSF {result['error']:.2f}"
             )
         elif result["state"] == "known":
             shown.note(f"{result['photos'][0]}: the profile has it already")

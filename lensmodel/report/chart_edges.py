@@ -22,6 +22,7 @@ try:
     import matplotlib as mpl
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import Normal, Stroke
 except ModuleNotFoundError as error:
     raise InvalidInputError("drawing needs matplotlib: pip install 'lensmodel[report]'") from error
 
@@ -29,6 +30,10 @@ _INKS: Final[dict[Direction, str]] = {"tangential": "#b45309", "sagittal": "#0b6
 _COLUMNS, _ROWS = 4, 6  # edges on a page (chosen: curves are still read in print)
 _PAGE: Final = (11.69, 8.27)  # inches: A4, lying
 _WIDE: Final = 1600  # pixels of the chart on the page (chosen)
+_AXES: Final = (
+    "Left of each pair: light over the distance from the edge in pixels. "
+    "Right: contrast (SFR) over the frequency in cycles/pixel."
+)
 _APART_PX: Final = 32.0  # between the middles of edges of two rows: half the smallest square (chosen)
 _PROFILE_PX: Final = 8.0  # pixels of a profile on each side: where its curve is (chosen)
 
@@ -55,6 +60,7 @@ def edge_pages(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> list[Figure]:
             place = number % (_COLUMNS * _ROWS)
             if place == 0:
                 pages.append(Figure(figsize=_PAGE, layout="constrained"))
+                pages[-1].supxlabel(_AXES, fontsize=7.0)
             _edge(pages[-1], place, f"{number + 1}: {direction}", edge, _INKS[direction])
     return pages
 
@@ -104,12 +110,16 @@ def _chart(photo: LinearPhoto, edges: Sequence[FoundEdge], directions: Sequence[
     for number, (edge, direction) in enumerate(zip(edges, directions, strict=True), start=1):
         (row, col, height, width), ink = edge.box, _INKS[direction]
         ax.add_patch(Rectangle((col, row), width, height, fill=False, edgecolor=ink, lw=0.8))
-        ax.text(*edge.middle[::-1], f"{number}", color=ink, ha="center", va="center", weight="bold")
-    ax.set(xticks=[], yticks=[])
+        around = [Stroke(linewidth=1.5, foreground="white"), Normal()]  # legible on paper and ink
+        ax.text(
+            *edge.middle[::-1], f"{number}",
+            color=ink, ha="center", va="center", weight="bold", path_effects=around,
+        )  # fmt: skip
+    ax.set_axis_off()
     counts = {name: directions.count(name) for name in _INKS}
     ax.set_title(
         f"{len(edges)} edges measured: {counts['tangential']} tangential (brown), "
-        f"{counts['sagittal']} sagittal (blue), {counts['oblique']} between the two (green)",
+        f"{counts['sagittal']} sagittal (blue), {counts['oblique']} oblique (green)",
         loc="left",
     )
     return page

@@ -191,11 +191,11 @@ def _line(lens: CameraLens, found: Sequence[Sharpness], pitch_um: float) -> str:
         off = np.median(np.abs(seen / true - 1.0))
         ranges = [one.ranges[way] for one in found if one.ranges is not None]
         held = [min(low, 0.5) <= value <= high for value, (low, high) in zip(true, ranges, strict=False)]
-        own = [f"{median / truth - 1.0:+.0%}", f"places {off:.0%}"]
-        own += [f"ranges hold {np.mean(held):.0%}"] if held else []
+        own = [f"{round(median / truth - 1.0, 2) + 0.0:+.0%}", f"places {off:.0%}"]
+        own += [f"ranges hold {sum(held)} of {len(held)}"] if held else []
         words.append(f"{name} {median:.3f} truth {truth:.3f} ({', '.join(own)})")
-    guessed = sum(one.guessed for one in found) / len(found)
-    return ", ".join([*words, *([f"hatched {guessed:.0%}"] if guessed else [])])
+    guessed = sum(one.guessed for one in found)
+    return ", ".join([*words, *([f"hatched {guessed} of {len(found)}"] if guessed else [])])
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store = Store(chosen)
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
-            storage.settle(store.photos.newest_file)
+            storage.settle(store.photos.have_files)
         uploads, gate = asyncio.Semaphore(photos.MAX_UPLOADS), Gate(chosen, store.accounts)
         cache, readiness = ModelCache(store), Fresh[Readiness](health.FRESH_S)
         app.state.services = Services(chosen, store, storage, cache, uploads, gate, readiness)

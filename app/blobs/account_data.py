@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,7 +11,6 @@ from datetime import datetime
 from typing import Any, Final
 
 from app.blobs.storage import Storage
-from app.blobs.zipped import packed, zipped
 from app.store import Store
 from app.store.accounts import Accounts
 from app.store.tables import Base, CorrectionRow, EventRow, KeyRow, LensRow, PatchRow, PhotoRow, SampleRow
@@ -30,11 +30,44 @@ README: Final = """What lensmodel keeps of one owner.
 
 *.jsonl        one JSON object a line, as in the tables; `photo_id`, `lens_id` and `patch_id` name the `id` of
                photos.jsonl, lenses.jsonl and patches.jsonl; `public_id` is the id of the HTTP interface.
-samples.jsonl  `psf`: base64 of little-endian float32, size x size, row by row.
+samples.jsonl  `psf`: base64 of little-endian float32, row by row, as many rows as `size` in `entry`.
 patches.jsonl  `encoded`: base64 of the format of lensmodel.core.psf.EncodedPatch.
 originals/     the photos as they are stored: without the place where they were taken, once they were read.
 corrections/   corrected photos.
 """
+
+
+class _Pipe(io.RawIOBase):
+    """Keeps what a ZIP file writes until it is fetched."""
+
+    kept = b""
+
+    def write(self, data: Any) -> int:  # noqa: ANN401 - bytes of any kind
+        self.kept += bytes(data)
+        return len(data)
+
+    def fetch(self) -> bytes:
+        fetched, self.kept = self.kept, b""
+        return fetched
+
+
+def zipped(files: Iterable[tuple[zipfile.ZipInfo, Iterable[bytes]]]) -> Iterator[bytes]:
+    """Yield a ZIP file of files that come in pieces."""
+    pipe = _Pipe()
+    with zipfile.ZipFile(pipe, "w") as archive:
+        for entry, pieces in files:
+            with archive.open(entry, "w", force_zip64=True) as file:
+                for piece in pieces:
+                    file.write(piece)
+                    yield pipe.fetch()
+    yield pipe.fetch()
+
+
+def packed(name: str) -> zipfile.ZipInfo:
+    """Return an entry that is compressed; a plain `ZipInfo` is stored as it is."""
+    entry = zipfile.ZipInfo(name)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
 
 
 def exported(store: Store, storage: Storage, owner: str) -> Iterator[bytes]:

@@ -55,9 +55,8 @@ class Storage:
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
         parts = urlsplit(url)
         self.folder = Path(unquote(parts.path)) if parts.scheme == "file" else None
-        self._opened: ObjectStore | None = None
         if self.folder is None:
-            self._opened = from_url(
+            self._bucket: ObjectStore = from_url(
                 url,
                 client_options=_client_options(patience_s),
                 retry_config={"max_retries": 1, "retry_timeout": timedelta(seconds=patience_s)},
@@ -71,18 +70,12 @@ class Storage:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / MARK).write_text("Without this file the folder counts as not mounted.\n")
 
-    def settle(self, newest: Callable[[], str | None]) -> None:
-        """Create the folder if it is new; leave one whose disk is only unmounted as it is."""
-        # It is new as long as no row names a file; `newest` returns the key of the file of the newest photo,
-        # by which a folder is recognised that is older than the mark
-        if self.folder is None or self.is_there:
-            return
-        try:
-            key = newest()
-        except (OperationalError, ProgrammingError):
-            return  # the tables are missing or away: nothing is decided, and /readyz says so
-        if key is None or (self.folder / key).is_file():
-            self.create()
+    def settle(self, is_used: Callable[[], bool]) -> None:
+        """Create the folder if no row names a file yet; leave one whose disk is only unmounted as it is."""
+        # where the tables are missing or away nothing is decided, and /readyz says so
+        with contextlib.suppress(OperationalError, ProgrammingError):
+            if self.folder is not None and not self.is_there and not is_used():
+                self.create()
 
     @property
     def is_there(self) -> bool:
@@ -93,15 +86,19 @@ class Storage:
     def _store(self) -> ObjectStore:
         """The blobs."""
         self._require_folder()
-        if self._opened is None:
-            assert self.folder is not None
-            self._opened = LocalStore(prefix=self.folder)
-        return self._opened
+        return self._bucket if self.folder is None else LocalStore(prefix=self.folder)
 
     def _require_folder(self) -> None:
         """Raise OSError if the folder is away; a write meanwhile may have made another in its place."""
         if not self.is_there:
             raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
+
+    def _require_bucket(self) -> None:
+        """Raise OSError if the bucket is away, which is reported as if a blob were missing."""
+        try:
+            next(iter(obstore.list(self._store, chunk_size=1)), None)
+        except FileNotFoundError as error:
+            raise OSError(errno.ENODEV, "the bucket of the blobs is away") from error
 
     def put(self, key: str, data: bytes | Path) -> None:
         """Store bytes, or a file, under a key, replacing what was there."""
@@ -114,10 +111,6 @@ class Storage:
         async with obstore.open_writer_async(self._store, key, buffer_size=8 * CHUNK) as sink:
             yield sink
         self._require_folder()
-
-    def rename(self, key: str, to: str) -> None:
-        """Give a blob another key, on which there is none yet; raises as `get`."""
-        obstore.rename(self._store, key, to)
 
     def remove(self, key: str) -> None:
         """Delete one blob; a missing one is no error."""
@@ -149,11 +142,8 @@ class Storage:
             return
         try:
             blob = obstore.get(store, key)
-        except FileNotFoundError as error:  # which is how a missing bucket is reported too
-            try:
-                next(iter(obstore.list(store, chunk_size=1)), None)
-            except FileNotFoundError:
-                raise OSError(errno.ENODEV, "the bucket of the blobs is away") from error
+        except FileNotFoundError:
+            self._require_bucket()
             raise
         copy = scratch / new_id()
         with copy.open("wb") as out:
@@ -182,7 +172,7 @@ class Storage:
     def check_usable(self) -> None:
         """Raise an error if folder or bucket is away, or a folder cannot take more; nothing is written."""
         if self.folder is None:
-            next(iter(obstore.list(self._store, chunk_size=1)), None)
+            self._require_bucket()
         elif not self.free_bytes():
             raise OSError(errno.ENODEV, "the folder of the blobs is away, or full", str(self.folder))
         elif not os.access(self.folder, os.W_OK):

@@ -49,14 +49,14 @@ def settings_from(data: Path | None, host: str | None = None, port: int | None =
 def opened(data: Path | None, *, existing: bool = False) -> Iterator[tuple[Settings, Store, Storage]]:
     """Open an installation, its schema brought up to date; or an `existing` one, which must have it."""
     from app.blobs.storage import Storage  # noqa: PLC0415 - the list of commands does not wait for it
-    from app.store import Store, migrate  # noqa: PLC0415 - same
+    from app.store import Store, database  # noqa: PLC0415 - same
 
     settings = settings_from(data)
     if existing and not settings.database_url and not (settings.data_dir / "app.db").is_file():
         raise UsageError(f"{settings.data_dir} holds no installation; give its folder by --data")
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Store(settings)) as store:
-        (migrate.check if existing else migrate.upgrade)(store.database)
+        (database.check if existing else database.upgrade)(store.database)
         yield settings, store, Storage(settings.storage, patience_s=settings.storage_seconds, create=False)
 
 

@@ -37,14 +37,14 @@ def doctor(
 
     shown = Display.of(context, quiet=quiet, as_json=json_output)
     with opened(data, existing=True) as (settings, store, storage):
-        report = examine(settings, store, storage, deep=deep)
+        findings = examine(settings, store, storage, deep=deep)
     if json_output:
-        shown.document(asdict(report))
+        shown.document({"findings": [asdict(finding) for finding in findings]})
     else:
-        for finding in report.findings:
+        for finding in findings:
             shown.result(f"{finding.check}: {finding.subject}: {finding.says}; {finding.remedy}")
-        shown.result(f"{len(report.checks)} checks, {len(report.findings)} findings")
-    if report.findings:
+        shown.result(f"{len(findings)} findings")
+    if findings:
         raise typer.Exit(1)
 
 
@@ -78,4 +78,4 @@ def backup(
         result = copies.backup(
             store.database, storage, folder, lambda done, total: update(completed=done, total=total)
         )
-    shown.result(f"{folder}: {result.photos} photos and {result.blobs} blobs of {result.made_at}")
+    shown.result(f"{folder}: {result['photos']} photos and {result['blobs']} blobs of {result['made_at']}")

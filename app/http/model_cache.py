@@ -16,8 +16,8 @@ from typing import Final, TypeAlias
 from app.errors import ConflictError, UnknownError
 from app.runtime import metrics
 from app.store import Store
+from app.store.lenses import LensState
 from app.store.owners import ANY_OWNER
-from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import LensModel

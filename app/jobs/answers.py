@@ -1,15 +1,43 @@
-"""What tasks answer, checked as untrusted input: a hostile photo may have taken the child over.
+"""What workers and their tasks exchange: names of files, and answers.
 
-Numbers are bounded by what columns and pages can hold, texts are cut, and lists bounded; further fields are
-dropped. Kernels are checked by `app.jobs.sample_files`.
+Answers are checked as untrusted input: a hostile photo may have taken the child over. Numbers are bounded by
+what columns and pages can hold, texts are cut, and lists bounded; further fields are dropped. Kernels are
+checked by `app.jobs.sample_files`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import GenericAlias
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import Annotated, Any, Final, Literal, TypeAlias, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
+
+KERNELS: Final = "kernels.npy"  # kernels, one a row: `(n, k, k)`
+SAMPLES: Final = "samples.json"  # position, settings, weight and origin of each kernel
+ENCODED: Final = "encoded.npy"  # what patches say without a kernel, one a row
+CLEANED: Final = "cleaned"  # the file of a photo without the place where it was taken
+REPORT: Final = "report.json"  # the report of a lens test
+# Small picture of a photo before it is developed; stored ones too
+THUMBNAIL: Final = "glance.jpg"
+SHOWN: Final = "shown.tiles"  # the developed photo in full size, by `app.blobs.tiles`
+# A whole photo before and after its correction, by `app.blobs.tiles`
+SIDES: Final[Mapping[str, str]] = {"before": "before.tiles", "after": "after.tiles"}
+# A part of a photo before and after its correction; for sliders also without texture or grain
+LAYER_FILES: Final[Mapping[str, str]] = {
+    "before": "before.png",
+    "after": "after.png",
+    "smooth": "smooth.png",
+    "clean": "clean.png",
+}
+# Ending of a corrected file, by its format
+SUFFIX: Final[Mapping[str, str]] = {
+    "tiff16": ".tif",
+    "png16": ".png",
+    "png8": ".png",
+    "jpeg": ".jpg",
+    "dng": ".dng",
+}
 
 Text = Annotated[str, BeforeValidator(lambda text: text[:200] if isinstance(text, str) else text)]
 Quantity = Annotated[float, Field(ge=0, le=1e9)]

@@ -13,21 +13,19 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from app.blobs.storage import Storage
 from app.jobs import answers
-from app.jobs.answers import Answer, JobFailedError, NotWantedError, checked
+from app.jobs.answers import SHOWN, Answer, JobFailedError, NotWantedError, checked
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
-from app.sandbox.child import ProgressHook
-from app.sandbox.outcome import MAX_RESULT, Outcome, TaskLimits
+from app.sandbox.child import MAX_RESULT, Outcome, ProgressHook, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.tables import PhotoRow
@@ -83,25 +81,20 @@ NEEDS: Final[Mapping[str, Needs]] = {
 }
 
 
-@dataclass
 class JobContext:
     """What the jobs of one worker share: settings, rows, files, and a sandbox for their tasks."""
 
-    settings: Settings
-    store: Store
-    storage: Storage
-    sandbox: Sandbox
-    warmed: threading.Event = field(default_factory=threading.Event)  # whether loops are compiled
-    _locks: defaultdict[str, threading.Lock] = field(init=False)
+    def __init__(self, settings: Settings, store: Store, storage: Storage, sandbox: Sandbox) -> None:
+        self.settings, self.store, self.storage, self.sandbox = settings, store, storage, sandbox
+        self.warmed, self._locks = threading.Event(), defaultdict[str, threading.Lock](threading.Lock)
+        self._copied = sandbox.account is not None  # another account reads copies, not the blobs
+        self.warmed.set()  # unless the worker says that it compiles the loops
+        self.cells = ThreadPoolExecutor(settings.worker_slots + 1)  # one more waits for the next slot
+        self.cache = settings.data_dir.resolve() / "developed"  # developed photos, of this machine alone
 
-    def __post_init__(self) -> None:
-        self._locks = defaultdict(threading.Lock)
-        self.warmed.set()  # unless the worker says that it compiles them
-        self.cells = ThreadPoolExecutor(self.settings.worker_slots + 1)  # one more waits for the next slot
-        self.cache = self.settings.data_dir.resolve() / "developed"  # developed photos, of this machine alone
-
-    def wants(self, photo: PhotoRow) -> Wanted:
+    def wants(self, photo: PhotoRow | None) -> Wanted:
         """Return what tells whether the work on a photo, begun as the row says, is still wanted."""
+        assert photo is not None
         return partial(self.store.photos.is_live, photo.public_id, photo.epoch)
 
     @contextmanager
@@ -109,8 +102,8 @@ class JobContext:
         self,
         name: str,
         photo: PhotoRow | None,
-        wanted: Wanted,
         /,
+        wanted: Wanted | None = None,
         *,
         reads: Sequence[Path] = (),
         samples: Sequence[PsfSample] = (),
@@ -118,7 +111,8 @@ class JobContext:
         **arguments: Any,  # noqa: ANN401 - JSON of any shape
     ) -> Iterator[tuple[Any, Path]]:
         """Run a task in a folder of its own, with `samples`; give its answer, checked, and the folder."""
-        needs, limits, wanted = NEEDS[name], self.limits(name, photo), _patient(wanted)
+        # `wanted` tells whether to go on; unless given, as long as the photo is being worked on
+        needs, limits, wanted = NEEDS[name], self.limits(name, photo), _patient(wanted or self.wants(photo))
         if needs.compiled:
             self.warmed.wait()  # else it would compile the same at the same time
         with self.sandbox.folder() as folder:
@@ -126,11 +120,11 @@ class JobContext:
                 write_samples(folder, samples)
             around: dict[str, Any] = {"folder": folder, "reads": reads, "on_progress": on_progress}
             answer = self._attempt(
-                partial(self.sandbox.run, name, arguments, wanted=wanted, **around), name, limits, wanted
+                partial(self.sandbox.run, name, arguments, wanted=wanted, **around), name, limits
             )
             yield answer if needs.answer is None else checked(needs.answer, answer), folder
 
-    def _attempt(self, run: Callable[..., Outcome], task: str, limits: TaskLimits, wanted: Wanted) -> Any:  # noqa: ANN401 - JSON of any shape
+    def _attempt(self, run: Callable[..., Outcome], task: str, limits: TaskLimits) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task, with retries where they can help; return its result."""
         # After a death by signal the task is retried after a pause, after too little memory once with twice
         # as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
@@ -150,7 +144,11 @@ class JobContext:
                 enlarged, limits = True, replace(limits, memory_mb=doubled_mb)
             elif outcome.code == "crashed":
                 crashes += 1
-                _pause_after(outcome, task, crashes, wanted)
+                log.warning("task %s: %s (%d of %d)", task, outcome.detail, crashes, CRASHES)
+                if crashes == CRASHES:
+                    detail = f"{outcome.detail}; tried {crashes} times; report the file to the developers"
+                    raise JobFailedError("crashed_repeatedly", detail)
+                time.sleep(BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5))  # noqa: S311
             else:
                 raise JobFailedError(outcome.code, outcome.detail)
 
@@ -171,9 +169,7 @@ class JobContext:
         """Provide the file of a photo."""
         with self.sandbox.folder() as folder:
             try:
-                # another account reads a copy, not the blob
-                copied = self.sandbox.account is not None
-                with self.storage.as_file(photo.blob_key, folder, copied=copied) as path:
+                with self.storage.as_file(photo.blob_key, folder, copied=self._copied) as path:
                     yield path
             except FileNotFoundError as error:
                 with suppress(FileNotFoundError):  # OSError while the folder is away
@@ -182,12 +178,12 @@ class JobContext:
                 text = f"the file of photo {photo.public_id} is no longer stored; upload it again"
                 raise JobFailedError("unknown_photo", text) from error
 
-    def developed(self, photo: PhotoRow, wanted: Wanted) -> Path:
+    def developed(self, photo: PhotoRow, wanted: Wanted | None = None) -> Path:
         """Return the folder of the developed photo; develop it if it is not there."""
         target = self.cache / photo.public_id
         with self._locks[photo.public_id], ExitStack() as files:
             if (target / "planes.npy").is_file():
-                (target / "planes.npy").touch()  # the cache drops the least recently used
+                target.touch()  # the cache drops the least recently used
                 return target
             target.parent.mkdir(parents=True, exist_ok=True)
             path = files.enter_context(self.original(photo))
@@ -219,21 +215,9 @@ class JobContext:
         folder, paths = files.enter_context(self.sandbox.folder()), list[Path]()
         for row in rows:
             with suppress(OSError):  # deleted meanwhile
-                copied = self.sandbox.account is not None
-                paths.append(files.enter_context(self.storage.as_file(row.blob_key, folder, copied=copied)))
+                file = self.storage.as_file(row.blob_key, folder, copied=self._copied)
+                paths.append(files.enter_context(file))
         return paths
-
-
-def _pause_after(outcome: Outcome, task: str, crashes: int, wanted: Wanted) -> None:
-    log.warning("task %s: %s (%d of %d)", task, outcome.detail, crashes, CRASHES)
-    if crashes == CRASHES:
-        detail = f"{outcome.detail}; tried {crashes} times; please report the file to the developers"
-        raise JobFailedError("crashed_repeatedly", detail)
-    end = time.monotonic() + BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5)  # noqa: S311
-    while time.monotonic() < end:
-        if not wanted():
-            raise NotWantedError
-        time.sleep(0.05)
 
 
 def _patient(wanted: Wanted) -> Wanted:
@@ -243,28 +227,21 @@ def _patient(wanted: Wanted) -> Wanted:
         try:
             return wanted()
         except Exception as error:
-            if not is_outage(error):
-                raise
-            return True
+            if is_outage(error):
+                return True
+            raise
 
     return ask
 
 
 def drop_developed(base: Path, existing: Callable[[Iterable[str]], set[str]], idle_s: float) -> None:
-    """Bound the cache in `base`; developed photos whose photo was deleted are removed first."""
-    folders = [path for path in base.iterdir() if path.is_dir()] if base.is_dir() else []
+    """Bound the cache in `base`; developed photos whose photo was deleted are removed too."""
+    folders = sorted(base.glob("*/"), key=lambda path: path.stat().st_mtime)  # the least recently used first
     known = existing(path.name for path in folders)
     sizes = {path: sum(file.stat().st_size for file in path.glob("*")) for path in folders}
-    free = shutil.disk_usage(base).free if folders else 0
-    room = min(KEEP_BYTES, free // 2) if free else 0
-    total = sum(sizes.values())
-    for last, path in sorted((_used(path), path) for path in folders):
-        idle = time.time() - last > idle_s
+    total, room = sum(sizes.values()), min(KEEP_BYTES, shutil.disk_usage(base).free // 2) if folders else 0
+    for path in folders:
+        idle = time.time() - path.stat().st_mtime > idle_s
         if path.name not in known or (total > room and idle):
             total -= sizes[path]
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _used(folder: Path) -> float:
-    planes = folder / "planes.npy"
-    return planes.stat().st_mtime if planes.exists() else 0.0

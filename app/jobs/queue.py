@@ -1,34 +1,37 @@
-"""The durable queue: every job that is enqueued is run, even after a crash.
+"""The durable queue: every job that is enqueued is run, even after a crash, until it is done or cannot be.
 
-The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. No other
-module uses it. A job is a name with a few ids and numbers; what it did is recorded in our own
-tables, so that running a job twice is harmless and the engine can be replaced, or its database
-lost, without losing a photo. The library itself starts the jobs of a dead process again only where that
-process starts again; here others resume them, once the tables say that its lease has expired.
+The engine is DBOS Transact; no other module uses it. What a job did is recorded in our own tables, so that
+running it twice is harmless, and the engine's database may be lost. The library starts the jobs of a dead
+process again only where that process starts again; here others resume them, once its lease has expired.
 """
 
 from __future__ import annotations
 
 import contextvars
-import json
 import logging
-import sqlite3
-from collections.abc import Callable, Mapping
+import math
+from collections import Counter
+from collections.abc import Callable, Container, Mapping
 from contextlib import closing
 from datetime import datetime
+from functools import partial
+from random import uniform
+from time import monotonic, sleep
 from typing import Any, Final, Literal, ParamSpec, TypeAlias, TypeVar
 
-from dbos import DBOS, DBOSConfig, EnqueueOptions
-from dbos import Serializer as DBOSSerializer
-from sqlalchemy import make_url
+from dbos import DBOS, DBOSConfig, DBOSPortableJSONSerializer, EnqueueOptions
+from structlog.contextvars import bound_contextvars
 
-from app.store.database import SERVER_DEADLINES
+from app.jobs.answers import JobFailedError, NotWantedError
+from app.runtime import metrics
+from app.runtime.outage import CODE, is_outage
+from app.store import Store
+from app.store.database import SERVER_DEADLINES, Database
 from app.store.jobs import Job, Kind
 
 log = logging.getLogger(__name__)
 
 JOB_PROTOCOL: Final = 1  # raised when jobs of an older program can no longer be finished by this one
-Status: TypeAlias = Literal["unknown", "waiting", "done", "lost"]
 Handler: TypeAlias = Callable[..., None]
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -40,19 +43,21 @@ _DEATHS: Final = "deaths"  # attribute of a job: how many workers have died of i
 # Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core
 POLL_S: Final = 0.2
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
-
-
-class _Json(DBOSSerializer):
-    """JSON rather than pickle: a manipulated row of the engine's tables must not run code here."""
-
-    def serialize(self, data: object) -> str:
-        return json.dumps(data, default=repr)
-
-    def deserialize(self, serialized_data: str) -> object:
-        return json.loads(serialized_data)
-
-    def name(self) -> str:
-        return "json"
+# How long a job waits for a database, a storage or a disk before it fails (chosen): a night
+OUTAGE_S: Final = 12 * 3600.0
+# Longest pause before a retry (chosen): after a long outage work goes on within a minute
+LONGEST_PAUSE_S: Final = 60.0
+# Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
+# fault is reported soon
+BUGS: Final = 3
+OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
+IN_VAIN: Final = "waited in vain for what the service needs ({}): retry once its operator has mended that"
+# What the first argument of a job is, for the log
+_SUBJECT: Final[Mapping[Kind, str]] = {
+    "photo": "photo_id",
+    "correction": "correction_id",
+    "measure": "lens_id",
+}
 
 
 class DbosEngine:
@@ -67,13 +72,16 @@ class DbosEngine:
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
         """Open the tables, declare the queues, start running jobs: `handlers[kind](*arguments)`."""
-        _switch_on_wal(self._url)
+        # the library does not let readers and one writer of SQLite work at once; the file keeps what ours set
+        with closing(Database(self._url)) as tables, tables.reader.connect():
+            pass
         config: DBOSConfig = {
             "name": "lensmodel",
             "system_database_url": self._url,
             "application_version": str(JOB_PROTOCOL),
             "executor_id": self._executor_id,
-            "serializer": _Json(),
+            # JSON rather than pickle: a manipulated row of the engine's tables must not run code here
+            "serializer": DBOSPortableJSONSerializer(),
             "log_level": "WARNING",
             "enable_otlp": False,
         }
@@ -106,7 +114,7 @@ class DbosEngine:
         _outside(DBOS.enqueue_workflow_with_options, options, *job.arguments)
         self._enqueued.add(job.id)
 
-    def status(self, job: Job) -> Status:
+    def status(self, job: Job) -> Literal["unknown", "waiting", "done", "lost"]:
         """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
         record = _outside(DBOS.get_workflow_status, job.id)
         if record is None:
@@ -116,22 +124,21 @@ class DbosEngine:
             return "waiting"
         return "lost" if record.status == "CANCELLED" else "done"
 
-    def take_over(self, executor_id: str) -> None:
-        """Resume the running jobs of a dead worker in their queues."""
+    def take_over(self, living: Callable[[], Container[str]]) -> None:
+        """Resume the running jobs of all workers but the living in their queues."""
         # Interrupted, it can be done again. Should two workers do it at once, a job may run twice: the tables
-        # count what it did once.
-        for row in _listed(status="PENDING", executor_id=executor_id, app_version=str(JOB_PROTOCOL)):
+        # count what it did once. The living are asked last: a worker has its row before it runs anything
+        running = _listed(status="PENDING", app_version=str(JOB_PROTOCOL))
+        alive = living()
+        for row in running:
+            if row.executor_id in alive:
+                continue
             deaths = (row.attributes or {}).get(_DEATHS, 0) + 1
             if deaths > MAX_DEATHS[row.name]:
                 _outside(DBOS.cancel_workflow, row.workflow_id)
             else:
                 _outside(DBOS.update_workflow_attributes, row.workflow_id, {_DEATHS: deaths})
                 _outside(DBOS.resume_workflow, row.workflow_id, queue_name=row.queue_name)
-
-    def holders(self) -> set[str]:
-        """Return the workers that run jobs, as far as the engine knows."""
-        running = _listed(status="PENDING", app_version=str(JOB_PROTOCOL))
-        return {row.executor_id for row in running if row.executor_id is not None}
 
     def forget(self, before: datetime) -> int:
         """Delete the records of jobs that ended before a time; return how many."""
@@ -143,10 +150,6 @@ class DbosEngine:
             _outside(DBOS.delete_workflows, ids)
         self._enqueued.difference_update(ids)
         return len(ids)
-
-    def stop(self) -> None:
-        """Run no more jobs, without waiting for those that are running."""
-        DBOS.destroy(destroy_registry=True)
 
 
 def _listed(**which: Any) -> list[Any]:  # noqa: ANN401 - of `DBOS.list_workflows`
@@ -160,9 +163,60 @@ def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T
     return contextvars.Context().run(call, *arguments, **options)
 
 
-def _switch_on_wal(url: str) -> None:
-    """Let readers and one writer work at once (WAL): the library does not set it, and the file keeps it."""
-    parsed = make_url(url)
-    if parsed.get_backend_name() == "sqlite" and parsed.database:
-        with closing(sqlite3.connect(parsed.database, timeout=30)) as connection:
-            connection.execute("PRAGMA journal_mode=WAL")
+def durable(kind: Kind, handler: Handler, give_up: Callable[[Job, JobFailedError], object]) -> Handler:
+    """Wrap a job: failures are retried, and one that cannot be done is given up with a reason."""
+
+    def run(*arguments: str | int) -> None:
+        job, began, how = Job(kind, arguments), monotonic(), "done"
+        with bound_contextvars(job_id=job.id, **{_SUBJECT[kind]: str(arguments[0])}):
+            try:
+                insist(partial(handler, *arguments), OUTAGE_S, kind)
+            except NotWantedError:
+                log.info("not wanted any more")
+            except JobFailedError as reason:
+                insist(partial(give_up, job, reason))
+            except Exception as error:  # noqa: BLE001 - whatever it is, it has been logged
+                how, why = "internal_error", OURS
+                if is_outage(error):
+                    how, why = CODE, IN_VAIN.format(type(error).__name__)
+                insist(partial(give_up, job, JobFailedError(how, why)))
+        metrics.JOB_SECONDS.labels(kind, how).observe(monotonic() - began)
+
+    return run
+
+
+def insist(call: Callable[[], object], outage_s: float = math.inf, kind: Kind | None = None) -> None:
+    """Do something again until it succeeds; raise its error after a few bugs, or an outage of that time."""
+    failures, began = Counter[str](), None
+    while True:
+        try:
+            call()
+        except (JobFailedError, NotWantedError):
+            raise
+        except Exception as error:
+            outage = is_outage(error)
+            log.warning("%s: %s", type(error).__name__, error, exc_info=None if outage else error)
+            cause, moment = ("outage" if outage else "unforeseen"), monotonic()
+            failures[cause] += 1
+            began = moment if began is None else began
+            if moment - began > outage_s if outage else failures[cause] == BUGS:
+                raise
+            if kind is not None:
+                metrics.RETRIES.labels(kind, cause).inc()
+            # drawn: jobs that failed together do not come back together
+            sleep(uniform(1.0, min(2.0 ** min(failures[cause], 6), LONGEST_PAUSE_S)))  # noqa: S311
+        else:
+            return
+
+
+def end_job(store: Store, job: Job, reason: JobFailedError) -> None:
+    """End the work of a job with a reason; changes nothing where that has ended meanwhile."""
+    log.info("job %s: %s: %s", job.id, reason.code, reason.detail)
+    subject, number = str(job.arguments[0]), int(job.arguments[1])
+    if job.kind == "measure":
+        store.lenses.record_metrics(
+            subject, number, {"error": None, "coverage": None, "problem": reason.code}
+        )
+    else:
+        works = store.photos if job.kind == "photo" else store.jobs
+        works.fail(subject, number, reason.code, reason.detail)

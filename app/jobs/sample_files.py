@@ -9,14 +9,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.lib.format import open_memmap
-from numpy.typing import NDArray
 
-from app.jobs.task_files import ENCODED, KERNELS, SAMPLES
-from app.sandbox.outcome import MAX_RESULT
+from app.jobs.answers import ENCODED, KERNELS, SAMPLES
+from app.sandbox.child import MAX_RESULT
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
@@ -68,10 +67,6 @@ def returned_samples(folder: Path, *, count: int) -> list[PsfSample]:
 def _packed(folder: Path) -> PackedSamples:
     entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
     path = folder / ENCODED
-    encoded = _mapped(path) if path.is_file() else np.empty((0, 0), dtype=np.uint8)
-    return PackedSamples(entries, _mapped(folder / KERNELS), encoded)
-
-
-def _mapped(path: Path) -> NDArray[Any]:
-    """Map an npy file, since its header may claim any size; never an archive or a pickle in its place."""
-    return open_memmap(path, mode="r")
+    # mapped, since a header may claim any size; never an archive or a pickle in its place
+    encoded = open_memmap(path, mode="r") if path.is_file() else np.empty((0, 0), dtype=np.uint8)
+    return PackedSamples(entries, open_memmap(folder / KERNELS, mode="r"), encoded)

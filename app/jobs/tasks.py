@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import json
 import logging
 import math
@@ -20,12 +21,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import rawpy
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
 
 from app import distances
-from app.blobs import small_pictures
 from app.blobs.tiles import write_tiles
+from app.jobs.answers import CLEANED, LAYER_FILES, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
 from app.jobs.sample_files import read_samples, write_samples
-from app.jobs.task_files import CLEANED, LAYER_FILES, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
 from app.sandbox.child import ProgressHook, Task
 from lensmodel import correction, photo
 from lensmodel import measured as lens_measure
@@ -45,6 +49,8 @@ from lensmodel.workflow import correcting, sampling
 
 log = logging.getLogger(__name__)
 
+# Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen
+THUMBNAIL_SIDE: Final = 480
 CIFF: Final = b"HEAPCCDR"  # signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS
 # What the library imports where it is used: here the fork server does it once, not each of its children
 LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
@@ -89,7 +95,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     path = Path(arguments["path"])
     info = photo.inspect(path, photo.Limits(max_megapixels=arguments["max_megapixels"]))
     try:
-        picture = small_pictures.thumbnail(path, info.kind, info.metadata.orientation or 1)
+        picture = thumbnail(path, info.kind, info.metadata.orientation or 1)
     except Exception as error:  # noqa: BLE001 - decoders of hostile files raise all kinds; the photo goes on without
         log.warning("no small picture: %s: %s", type(error).__name__, error)
     else:
@@ -99,7 +105,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return header
 
 
-def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     """Develop `path` to linear planes in the folder."""
     del progress
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
@@ -107,7 +113,6 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     developed = photo.develop(Path(arguments["path"]), limits=limits, siblings=siblings)
     sampling.save_developed(developed, folder)
     _show(folder / SHOWN, developed.planes, developed)
-    return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 
 
 def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -159,8 +164,8 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     developed = sampling.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
-    output = arguments["output"]
-    roi = arguments["roi"]
+    params = arguments["params"]
+    output, roi = params["output"], params.get("roi")
     model = LensModel.fit(read_samples(folder))
     settings = _settings(arguments["settings"])
     bounds = correction.Bounds(**arguments["bounds"])
@@ -169,11 +174,11 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         developed,
         model,
         settings,
-        method=arguments["method"],
+        method=params["method"],
         photo=arguments["photo"],
-        strength=arguments["strength"],
+        strength=params["strength"],
         bounds=bounds,
-        layers=extremes if arguments.get("layers") else (),
+        layers=extremes if params.get("layers") else (),
         lateral=lateral,
         roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
         least_gain_db=correcting.SEEN_DB if developed.lossy and roi is None else None,
@@ -281,17 +286,8 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return {"mode": read.model.settings.mode, "samples": len(samples), **named}
 
 
-TASKS: Final[Mapping[str, Task]] = {
-    "locate": locate,
-    "inspect": inspect,
-    "develop": develop,
-    "select": select,
-    "estimate": estimate,
-    "correct": correct,
-    "measure": measure,
-    "measure-lens": measure_lens,
-    "profile": profile,
-}
+_NAMED: Final = (locate, inspect, develop, select, estimate, correct, measure, measure_lens, profile)
+TASKS: Final[Mapping[str, Task]] = {task.__name__.replace("_", "-"): task for task in _NAMED}
 
 for _registry in (estimators, selectors, correction.deconvolvers):
     _registry.load_installed()  # in the fork server: a confined child may no longer read their files
@@ -301,6 +297,36 @@ FieldNetwork.load()  # nor the weights, which all children share
 def _window(window: Patch | Rejection, place: FieldPosition) -> dict[str, Any]:
     square = {"row": window.row, "col": window.col, "size": window.size}
     return {**square, "r": place.r, "phi": place.phi}
+
+
+def thumbnail(path: Path, kind: str, orientation: int) -> bytes:
+    """Render a photo file as a small upright JPEG."""
+    if kind in {"jpeg", "png"}:
+        with Image.open(path) as image:
+            image.draft("RGB", (2 * THUMBNAIL_SIDE, 2 * THUMBNAIL_SIDE))
+            shown = ImageOps.exif_transpose(image).convert("RGB")
+    elif kind == "tiff":
+        pixels = tifffile.imread(path)
+        step = max(1, max(pixels.shape[:2]) // THUMBNAIL_SIDE)
+        shown = Image.fromarray(photo.upright(_eight_bits(pixels[::step, ::step]), orientation)).convert(
+            "RGB"
+        )
+    else:
+        with rawpy.imread(str(path)) as raw:
+            shown = Image.fromarray(raw.postprocess(half_size=True, use_camera_wb=True, output_bps=8))
+    shown.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+    out = io.BytesIO()
+    shown.save(out, "JPEG", quality=82)
+    return out.getvalue()
+
+
+def _eight_bits(pixels: np.ndarray) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels, dtype=np.uint8)
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    light = np.clip(np.nan_to_num(pixels.astype(np.float64)), 0.0, 1.0)
+    return np.rint(255.0 * light ** (1 / 2.2)).astype(np.uint8)
 
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
@@ -318,12 +344,7 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:
-    return LensSettings(
-        aperture=stored["aperture"],
-        focal_mm=stored["focal_mm"],
-        focus_m=distances.read(stored["focus_m"]),
-        channel=stored.get("channel", "g"),
-    )
+    return LensSettings(**{**stored, "focus_m": distances.read(stored["focus_m"])})
 
 
 def _numbers(value: Any) -> Any:  # noqa: ANN401 - JSON of any shape

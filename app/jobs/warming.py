@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from app.runtime.processes import end_with_parent
+from app.sandbox import confine
 from app.sandbox.child import give_way
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
@@ -62,7 +62,7 @@ def _learn_and_correct(developed: photo.LinearPhoto) -> None:
 
 
 if __name__ == "__main__":
-    end_with_parent()
+    confine.end_with_parent()
     give_way(int(sys.argv[1]))
     with tempfile.TemporaryDirectory() as scratch:
         warm(Path(scratch))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
+import fcntl
 import hashlib
 import logging
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib.metadata import version
@@ -22,24 +22,19 @@ from typing import Any, Final
 import lensmodel
 from app.blobs.account_data import erase
 from app.blobs.storage import Storage
-from app.jobs.answers import JobFailedError
+from app.jobs.answers import SHOWN, THUMBNAIL, JobFailedError
 from app.jobs.context import JobContext, drop_developed
-from app.jobs.correction_work import correct, measure
-from app.jobs.inspection import remove_location
-from app.jobs.photo_work import work_on
-from app.jobs.queue import DbosEngine
-from app.jobs.running import OURS, durable, end_job, insist
-from app.jobs.task_files import SHOWN, THUMBNAIL
+from app.jobs.queue import OURS, DbosEngine, durable, end_job, insist
+from app.jobs.work import correct, measure, remove_location, work_on
 from app.runtime import logs, metrics
 from app.runtime.outage import is_outage
-from app.runtime.processes import PARENT, end_with_parent, is_running, started_at
 from app.runtime.settings import Settings
 from app.sandbox import account, confine
 from app.sandbox.child import clean_environment
 from app.sandbox.runner import Budget, Sandbox
 from app.store import Store
 from app.store.database import new_id
-from app.store.jobs import Job, Kind
+from app.store.jobs import Kind
 from app.store.owners import ANY_OWNER
 from lensmodel.cli import ending
 from lensmodel.cli.ending import InterruptedByUser
@@ -88,16 +83,17 @@ class Worker:
             self._sandbox,
         )
         self._engine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
-        self._host, self._last_beat = socket.gethostname(), monotonic()
+        self._last_beat = monotonic()
+        # locked as long as this process lives, however it ends
+        self._alive = os.open(self._scratch / f"{self.id}.alive", os.O_CREAT | os.O_RDWR)
+        fcntl.flock(self._alive, fcntl.LOCK_EX)
         database = self._store.database
         self._file = database.path if database.is_sqlite else Path()
         self._identity = _identity(self._file)
 
     def _task_account(self, data: Path) -> account.SystemAccount | None:
         """Return the account that children change to, with access to their folders and to nothing else."""
-        if "account" not in self._confined:
-            return None
-        task_account = account.find(self._settings.task_user)
+        task_account = account.find(self._settings.task_user) if "account" in self._confined else None
         if task_account is not None:
             folders = [data / "developed", self._scratch, data / "cache"]
             account.close_to_others(data, {path.name for path in folders})
@@ -118,33 +114,25 @@ class Worker:
 
     def _begin(self) -> None:
         log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
-        about: dict[str, Any] = {
-            "host": self._host,
-            "pid": os.getpid(),
-            "pid_started": started_at(os.getpid()),
-        }
-        insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined), **about))
+        insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined)))
         self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         self._start_thread(beat_s, self._keep_lease)
-        insist(lambda: self._context.storage.settle(self._store.photos.newest_file))
+        insist(lambda: self._context.storage.settle(self._store.photos.have_files))
         self._context.warmed.clear()
         threading.Thread(target=self._do, args=(self._warm,), daemon=True).start()
-        end = partial(end_job, self._store)
-        self._engine.start(
-            {kind: durable(kind, partial(job, self._context), end) for kind, job in JOBS.items()}
-        )
+        context, end = self._context, partial(end_job, self._store)
+        self._engine.start({kind: durable(kind, partial(job, context), end) for kind, job in JOBS.items()})
         self._start_thread(beat_s, self._take_over_dead)
         self._start_thread(SWEEP_S, self._sweep)
-        self._start_thread(RECONCILE_S, self._reconcile, first_s=RECONCILE_S)
+        self._start_thread(RECONCILE_S, self._reconcile)
         self._start_thread(TIDY_S, self._tidy)
 
-    def _start_thread(self, period_s: float, duty: Callable[[], None], *, first_s: float = 0.0) -> None:
+    def _start_thread(self, period_s: float, duty: Callable[[], None]) -> None:
         """Do a duty again and again, so that none delays another."""
 
         def repeat() -> None:
-            sleep(first_s)
             while True:
                 self._do(duty)
                 sleep(period_s)
@@ -182,35 +170,32 @@ class Worker:
     def _take_over_dead(self) -> None:
         """Take over from workers whose lease has expired, and from those of this machine that are gone."""
         jobs = self._store.jobs
-        for row in jobs.workers():
-            if row.host == self._host and not is_running(row.pid, row.pid_started):
-                jobs.bury(row.id)
+        for alive in self._scratch.glob("*.alive"):
+            if alive.stem != self.id and _is_free(alive):
+                jobs.bury(alive.stem)
+                alive.unlink(missing_ok=True)
         # should this end in between, `_reconcile` of another one does the rest
         for dead in jobs.remove_dead(self._settings.lease_seconds, by=self.id):
-            self._engine.take_over(dead)
+            self._engine.take_over(self._living)
             shutil.rmtree(self._scratch / dead, ignore_errors=True)
             metrics.TAKEN_OVER.inc()
             log.info("took over the work of worker %s", dead)
 
     def _reconcile(self) -> None:
         """End jobs that the engine lost or gave up, so that none stays unfinished for ever."""
-        holders = self._engine.holders()  # first: a worker has its row before it holds anything
-        for holder in holders - {row.id for row in self._store.jobs.workers()}:
-            self._engine.take_over(holder)
+        self._engine.take_over(self._living)
         for job in self._store.jobs.to_do(begun=True):
-            ended = self._lost(job)
-            if ended:
-                end_job(self._store, job, ended)
+            status = self._engine.status(job)
+            if status == "unknown":
+                self._engine.enqueue(job)
+            elif status == "lost":
+                why = "the worker died each time that it tried; report the file"
+                end_job(self._store, job, JobFailedError("crashed_repeatedly", why))
+            elif status == "done":
+                end_job(self._store, job, JobFailedError("internal_error", OURS))
 
-    def _lost(self, job: Job) -> JobFailedError | None:
-        status = self._engine.status(job)
-        if status == "unknown":
-            self._engine.enqueue(job)
-        if status == "lost":
-            return JobFailedError(
-                "crashed_repeatedly", "the worker died each time that it tried; report the file"
-            )
-        return JobFailedError("internal_error", OURS) if status == "done" else None
+    def _living(self) -> set[str]:
+        return {row.id for row in self._store.jobs.workers()}
 
     def _tidy(self) -> None:
         """Delete data that are no longer needed; one failure does not prevent the others."""
@@ -237,7 +222,7 @@ class Worker:
             cache = self._sandbox.cache
             if (done := cache / f"warm-{fingerprint()}").exists():
                 return
-            own = {"NUMBA_CACHE_DIR": str(cache), PARENT: str(os.getpid())}
+            own = {"NUMBA_CACHE_DIR": str(cache), confine.PARENT: str(os.getpid())}
             subprocess.run(  # noqa: S603 - our own interpreter, our own module
                 [sys.executable, "-m", WARMING, str(self._settings.task_niceness)],
                 env=clean_environment() | own,
@@ -251,10 +236,8 @@ class Worker:
     def _delete(self, prefix: str) -> None:
         if not self._store.jobs.claim_garbage(prefix):
             return  # an upload that ended meanwhile has kept it
-        if prefix.endswith("/"):
-            self._context.storage.delete(prefix)
-        else:
-            self._context.storage.remove(prefix)
+        storage = self._context.storage
+        (storage.delete if prefix.endswith("/") else storage.remove)(prefix)
         self._store.jobs.forget_garbage(prefix)
 
     def _die(self, why: str) -> None:
@@ -266,27 +249,34 @@ class Worker:
 
 def fingerprint() -> str:
     """Return a digest of the library and its compiler: what was compiled for others is of no use."""
-    files = sorted(Path(lensmodel.__file__).parent.rglob("*.py"))
-    stamps = [(str(path), path.stat().st_mtime_ns) for path in files]
+    files = Path(lensmodel.__file__).parent.rglob("*.py")
+    stamps = sorted((str(path), path.stat().st_mtime_ns) for path in files)
     return hashlib.sha256(f"{version('numba')} {stamps}".encode()).hexdigest()[:16]
 
 
+def _is_free(path: Path) -> bool:
+    """Say whether the process that locked a file is gone."""
+    with suppress(OSError), path.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    return False
+
+
 def _identity(path: Path) -> tuple[int, int]:
-    try:
+    with suppress(FileNotFoundError):
         status = path.stat()
-    except FileNotFoundError:
-        return (0, 0)
-    return (status.st_dev, status.st_ino)
+        return status.st_dev, status.st_ino
+    return 0, 0
 
 
 def main() -> None:
     """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
-    end_with_parent()
+    confine.end_with_parent()
     settings = Settings()
     logs.begin("worker", settings.log_level, settings.log_format)
     confine.keep_private()
     if settings.metrics_address:
         metrics.publish(settings.metrics_address)
     ending.install()
-    with contextlib.suppress(InterruptedByUser):
+    with suppress(InterruptedByUser):
         Worker(settings).run()

@@ -12,7 +12,7 @@ from app.blobs import tiles
 from app.blobs.storage import Storage
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep, OneSession
-from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
+from app.jobs.answers import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.store.tables import CorrectionRow
 
 Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo

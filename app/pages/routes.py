@@ -18,11 +18,11 @@ from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
 from pydantic import BeforeValidator
 
-from app.blobs.zipped import zipped
+from app.blobs.account_data import zipped
 from app.errors import NotReadyError
 from app.http import errors, views
 from app.http.dependencies import Call, CallDep, OneSession, call_of
-from app.jobs.task_files import SHOWN, SIDES
+from app.jobs.answers import SHOWN, SIDES
 from app.pages import pictures, shown
 from app.routes.common import file_headers
 from app.routes.corrections import list_corrections

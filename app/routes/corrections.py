@@ -16,8 +16,8 @@ from app.routes import common
 from app.routes.common import Cursor, Limit, OnlyId
 from app.routes.photos import SEND_AGAIN, check_usage
 from app.schemas import V1, CorrectionIn, CorrectionOut, Page, Region
+from app.store.lenses import LensState
 from app.store.photos import stored_settings
-from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.correction import deconvolvers

@@ -17,7 +17,7 @@ from app.routes.psf import MEDIA_TYPES
 from app.runtime import metrics
 from app.sandbox import confine
 from app.schemas import MAX_PSF_SIZE, ColorSpace, OutputFormat, Readiness
-from app.store import migrate
+from app.store.database import current, head
 from lensmodel.blind import estimators
 from lensmodel.correction import deconvolvers
 from lensmodel.patches import selectors
@@ -76,7 +76,7 @@ def _readiness(call: Call) -> Readiness:
 
 
 def _schema(call: Call) -> None:
-    database, program = migrate.current(call.store.database), migrate.head()
+    database, program = current(call.store.database), head()
     if database != program:
         raise RuntimeError(
             f"the database is at {database}, this program needs {program}: run `lensmodel serve`"
@@ -103,7 +103,7 @@ def get_metrics(call: CallDep) -> Response:
 @router.get("/version")
 def get_version(call: CallDep) -> dict[str, str | None]:
     """Return what runs here, and which revision of the schema the database has."""
-    revision = migrate.current(call.store.database)
+    revision = current(call.store.database)
     return {"name": "lensmodel", "version": version("lensmodel"), "api": "v1", "schema_revision": revision}
 
 
@@ -126,7 +126,7 @@ def get_limits(call: CallDep) -> dict[str, int | float]:
     """Return how much of everything."""
     settings = call.settings
     return {
-        "max_upload_bytes": settings.max_upload_bytes,
+        "max_upload_bytes": settings.max_upload_mb << 20,
         "max_megapixels": settings.max_megapixels,
         "max_queued_photos": MAX_UNFINISHED,
         "max_stored_bytes": int(settings.max_stored_gb * GIB),

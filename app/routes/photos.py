@@ -195,11 +195,7 @@ def recorded(call: Call, public_id: str, key: str, file: upload.Uploaded, **more
         calibrate=file.fields.calibrate,
         given=file.fields.model_dump(exclude={"calibrate"}, exclude_none=True) | more,
     )
-    if received.photo.public_id != public_id:
-        if received.wants_file:  # its file was given up: this is the same one
-            kept = f"{received.photo.folder}original-{public_id}"
-            call.storage.rename(key, kept)
-            call.store.photos.restore_file(received.photo.public_id, kept, again=received.fresh)
+    if received.photo.blob_key != key:
         call.storage.delete(f"photos/{public_id}/")  # the same bytes are stored already
     # another request may have deleted it meanwhile: then it is told as it was received
     photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo

@@ -1,23 +1,22 @@
 """Back up an installation that may be running, into a folder that is itself the data folder of one.
 
-`app.db` has all rows of one moment, `blobs/` at least what these rows name. Blobs are immutable, written
-before the rows that name them and deleted after these. So the rows are taken first, then the blobs that they
-name; one that was deleted in between is missing then, and newer rows are taken. `app.db` is replaced last:
-the folder is a complete backup at every moment, also while the next one is being written into it.
+Blobs are immutable, written before the rows that name them and deleted after these. So the rows of one moment
+are taken first, then the blobs that they name; where one was deleted in between, newer rows are taken.
+`app.db` is replaced last: the folder is a complete backup at every moment.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from app.blobs.storage import Storage
+from app.errors import ServiceError
 from app.store.database import Database
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import StepHook, ignore_step
 
 ROWS: Final = "app.db"
@@ -30,24 +29,10 @@ _NAMED: Final = """
     UNION SELECT result_key FROM correction WHERE state = 'succeeded' AND result_key IS NOT NULL"""
 
 
-class BackupError(LensModelError):
-    """A backup cannot be made."""
-
-    code = "backup_failed"
-
-
-@dataclass(frozen=True, slots=True)
-class Backup:
-    """Contents of a backup."""
-
-    made_at: str
-    photos: int
-    blobs: int
-    byte_size: int
-
-
-def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook = ignore_step) -> Backup:
-    """Bring a backup folder up to date with an installation, which may be running."""
+def backup(
+    database: Database, storage: Storage, folder: Path, on_step: StepHook = ignore_step
+) -> dict[str, int | str]:
+    """Bring a backup folder up to date with an installation, which may be running; return what it holds."""
     if not database.is_sqlite:
         raise InvalidInputError(
             "the rows are in a database server: back them up with pg_dump, then the blobs with the tools of "
@@ -74,9 +59,9 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
             part.replace(folder / ROWS)
             for key in kept.keys() - named:
                 target.remove(key)
-            return Backup(made_at, photos, len(named), sum(kept[key] for key in named))
+            return {"made_at": made_at, "photos": photos, "blobs": len(named)}
     part.unlink()
-    raise BackupError(f"{len(missing)} blobs are missing, the first is {missing[0]}: run lensmodel doctor")
+    raise ServiceError(f"{len(missing)} blobs are missing, the first is {missing[0]}: run lensmodel doctor")
 
 
 def _rows(database: Path, part: Path) -> tuple[int, set[str]]:

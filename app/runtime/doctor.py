@@ -1,27 +1,80 @@
-"""Examine an installation, running or not: whether its invariants hold and its blobs are complete.
+"""Examine an installation, running or not: whether its tables are sound and its blobs complete.
 
-The tables are examined by `app.store.invariants`, the same checks that end the tests with random
-deaths. Here the blobs are compared with the tables.
+Nothing is changed. The checks of the tables also end the tests with random deaths: they hold at every moment,
+whichever process dies when.
 """
 
 from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import func, select, text
+from sqlalchemy.orm import Session
 
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.invariants import INVARIANTS, broken
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
 
-_WITH_FILE: Final = PhotoRow.file_gone_at.is_(None)
+MOST: Final = 1000  # findings of one check at most (chosen): nobody reads more
+# What must hold in the tables, with the query of the public ids of the rows that break it
+INVARIANTS: Final[Mapping[str, str]] = {
+    "the version of a lens is the number of its events": """
+    SELECT public_id FROM lens
+    WHERE version <> (SELECT count(*) FROM calibration_event e WHERE e.lens_id = lens.id)
+        OR version <> (SELECT coalesce(max(version), 0) FROM calibration_event e WHERE lens_id = lens.id)""",
+    "lenses count their samples and photos rightly": """
+    SELECT public_id FROM lens LEFT JOIN (
+        SELECT lens_id, count(*) AS samples, count(DISTINCT photo_id) AS photos
+        FROM psf_sample WHERE lens_id IS NOT NULL GROUP BY lens_id
+    ) AS counted ON counted.lens_id = lens.id
+    WHERE sample_count <> coalesce(samples, 0) OR photo_count <> coalesce(photos, 0)""",
+    "each counted photo joined its lens by an event": """
+    SELECT public_id FROM photo WHERE state = 'counted' AND NOT EXISTS (
+        SELECT 1 FROM calibration_event e WHERE e.lens_id = photo.lens_id
+        AND e.photo_public_id = photo.public_id AND e.kind IN ('photo_added', 'photo_included')
+    )""",
+    "exactly the samples of counted photos count": """
+    SELECT DISTINCT photo.public_id FROM photo
+    JOIN psf_sample ON psf_sample.photo_id = photo.id
+    JOIN patch ON patch.id = psf_sample.patch_id
+    LEFT JOIN lens ON lens.id = psf_sample.lens_id
+    WHERE CASE WHEN photo.state = 'counted' AND patch.epoch = photo.epoch
+        THEN psf_sample.lens_id IS NULL OR psf_sample.lens_id <> photo.lens_id
+            OR psf_sample.version_added IS NULL OR psf_sample.version_added > lens.version
+        ELSE psf_sample.lens_id IS NOT NULL END""",
+    "patches are done exactly if they have samples": """
+    SELECT DISTINCT photo.public_id FROM photo JOIN patch ON patch.photo_id = photo.id
+    WHERE (patch.state = 'done') <> EXISTS (
+        SELECT 1 FROM psf_sample WHERE psf_sample.patch_id = patch.id
+    )""",
+    "photos count their patches rightly": """
+    SELECT public_id FROM photo LEFT JOIN (
+        SELECT photo_id, epoch,
+            sum(CASE WHEN state = 'done' THEN 1 ELSE 0 END) AS done,
+            sum(CASE WHEN state = 'rejected' THEN 1 ELSE 0 END) AS rejected,
+            sum(CASE WHEN state <> 'rejected' THEN 1 ELSE 0 END) AS used
+        FROM patch GROUP BY photo_id, epoch
+    ) AS counted ON counted.photo_id = photo.id AND counted.epoch = photo.epoch
+    WHERE state IN ('estimating', 'counted', 'excluded') AND (
+        patches_done <> coalesce(done, 0) OR patches_total <> coalesce(used, 0)
+        OR patches_rejected <> coalesce(rejected, 0) + windows_rejected
+    )""",
+    "counted photos have a lens, failed ones a reason": """
+    SELECT public_id FROM photo WHERE (state = 'counted' AND (lens_id IS NULL OR finished_at IS NULL))
+        OR (state = 'failed' AND (error_code IS NULL OR finished_at IS NULL))""",
+    "photos teach lenses of their owner": """
+    SELECT photo.public_id FROM photo JOIN lens ON lens.id = photo.lens_id
+    WHERE lens.owner_id <> photo.owner_id""",
+    "corrections are of photos of their owner": """
+    SELECT correction.public_id FROM correction JOIN photo ON photo.id = correction.photo_id
+    WHERE correction.owner_id <> photo.owner_id""",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,22 +87,16 @@ class Violation:
     remedy: str
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorReport:
-    """The checks that ran, and their findings."""
-
-    checks: tuple[str, ...]
-    findings: tuple[Violation, ...]
+def examine(settings: Settings, store: Store, storage: Storage, *, deep: bool = False) -> list[Violation]:
+    """Return what is wrong; `deep` also reads all kernels and files."""
+    findings = [*_tables(store), *_work(settings, store), *_blobs(store, storage, deep=deep)]
+    return [*findings, *_kernels(store)] if deep else findings
 
 
-def examine(settings: Settings, store: Store, storage: Storage, *, deep: bool = False) -> DoctorReport:
-    """Run all checks."""
-    checks = ["database", *INVARIANTS, "work", "blobs"]
-    findings = [*_tables(store), *_work(settings, store), *_blobs(store, storage)]
-    if deep:
-        checks += ["kernels", "photos"]
-        findings += [*_kernels(store), *_photos(store, storage)]
-    return DoctorReport(tuple(checks), tuple(findings))
+def broken(session: Session) -> dict[str, list[str]]:
+    """Return the invariants that do not hold, each with the public ids of what breaks it."""
+    rows = {name: session.scalars(text(f"{query} LIMIT {MOST}")).all() for name, query in INVARIANTS.items()}
+    return {name: list(found) for name, found in rows.items() if found}
 
 
 def _tables(store: Store) -> Iterator[Violation]:
@@ -61,9 +108,8 @@ def _tables(store: Store) -> Iterator[Violation]:
             for line in lines:
                 if line != "ok":
                     yield Violation("database", str(line), "the database is damaged", remedy)
-        for name, (sentence, query) in INVARIANTS.items():
-            for subject in broken(session, query):
-                yield Violation(name, subject, f"not so: {sentence}", remedy)
+        for name, subjects in broken(session).items():
+            yield from (Violation("tables", subject, f"not so: {name}", remedy) for subject in subjects)
 
 
 def _work(settings: Settings, store: Store) -> Iterator[Violation]:
@@ -73,29 +119,27 @@ def _work(settings: Settings, store: Store) -> Iterator[Violation]:
         yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")
 
 
-def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
+def _blobs(store: Store, storage: Storage, *, deep: bool) -> Iterator[Violation]:
     """Compare the stored blobs with the tables, which are read last, since blobs are written first."""
     if not storage.is_there:
         where = str(storage.folder)
         yield Violation("blobs", where, "the folder of the blobs is missing", "mount its disk, or restore it")
         return
     sizes = dict(storage.listed())
-    kept = {
-        "photos": select(PhotoRow.public_id),
-        "corrections": select(CorrectionRow.public_id),
-        "models": select(LensRow.public_id),
-    }
+    kept = {"corrections": CorrectionRow.public_id, "models": LensRow.public_id}
+    digest = func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256)
+    photo = select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size, digest)
+    result = CorrectionRow.result_key, CorrectionRow.result_bytes, CorrectionRow.result_etag
     named = {
-        "photo": select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(_WITH_FILE),
-        "correction": select(
-            CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes
-        ).where(CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)),
+        "photo": photo.where(PhotoRow.file_gone_at.is_(None)),
+        "correction": select(CorrectionRow.public_id, *result).where(CorrectionRow.state == "succeeded"),
     }
     with store.database.reading() as session:
         rows: list[Any] = [(what, *row) for what, query in named.items() for row in session.execute(query)]
-        known = {f"{place}/{key}/" for place, query in kept.items() for key in session.scalars(query)}
+        known = {f"{place}/{key}/" for place, ids in kept.items() for key in session.scalars(select(ids))}
+        known |= {_folder(key) for key in session.scalars(select(PhotoRow.blob_key))}
         garbage = tuple(session.scalars(select(GarbageRow.prefix)))
-    for what, public_id, key, size in rows:
+    for what, public_id, key, size, sha256 in rows:
         there = sizes.get(key)
         if there != size:  # it may have come since
             there = dict(storage.listed(f"{key.rpartition('/')[0]}/")).get(key)
@@ -103,9 +147,25 @@ def _blobs(store: Store, storage: Storage) -> Iterator[Violation]:
             problem = "missing" if there is None else f"{there} bytes instead of {size}"
             says = f"the file of the {what} is {problem}"
             yield Violation("blobs", public_id, says, f"restore it, or delete the {what}")
-    for prefix in sorted({"/".join([*key.split("/")[:2], ""]) for key in sizes}):
+        elif deep:
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                if _sha256(storage, key, size) != sha256:
+                    says = f"the file of the {what} has changed"
+                    yield Violation("files", public_id, says, "restore the blobs")
+    for prefix in sorted({_folder(key) for key in sizes}):
         if prefix not in known and not prefix.startswith(garbage):
             yield Violation("blobs", prefix, "no row names these blobs", "delete them by hand")
+
+
+def _folder(key: str) -> str:
+    return "/".join([*key.split("/")[:2], ""])
+
+
+def _sha256(storage: Storage, key: str, size: int) -> str:
+    hashed = hashlib.sha256()
+    for piece in storage.stream(key, 0, size):
+        hashed.update(piece)
+    return hashed.hexdigest()
 
 
 def _kernels(store: Store) -> Iterator[Violation]:
@@ -115,19 +175,3 @@ def _kernels(store: Store) -> Iterator[Violation]:
             if zlib.crc32(psf) != crc32:
                 says = "differs from what was written"
                 yield Violation("kernels", f"sample {key}", says, "restore the database")
-
-
-def _photos(store: Store, storage: Storage) -> Iterator[Violation]:
-    digest = func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256)
-    query = select(PhotoRow.public_id, PhotoRow.blob_key, digest, PhotoRow.byte_size).where(_WITH_FILE)
-    with store.database.reading() as session:
-        rows = session.execute(query).all()
-    for public_id, key, sha256, size in rows:
-        hashed = hashlib.sha256()
-        with suppress(FileNotFoundError):  # a finding of `_blobs`
-            for piece in storage.stream(key, 0, size):
-                hashed.update(piece)
-            if hashed.hexdigest() != sha256:
-                yield Violation(
-                    "photos", public_id, "the file differs from what was sent", "restore the blobs"
-                )

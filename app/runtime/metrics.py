@@ -1,19 +1,15 @@
 """Metrics of the service, in the text format of Prometheus.
 
-The API measures requests and models under `/metrics`; a worker its jobs, where `LENS_METRICS_ADDRESS` gives
-it an address. Queues and workers are read from the tables at each request, so that any API reports them for
-all machines. No label holds an id or the name of a person.
+Queues and workers are read from the tables at each request, so that any API reports them for all machines. No
+label holds an id or the name of a person.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest, start_http_server
-from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_1_0_0
-from prometheus_client.registry import Collector
 
 from app.store import Store
 
@@ -39,6 +35,11 @@ MODELS: Final = Counter(
 MODEL_BYTES: Final = Gauge(
     "lensmodel_model_cache_bytes", "Memory of the fitted models of this process.", registry=API
 )
+QUEUE_JOBS: Final = Gauge("lensmodel_queue_jobs", "Unfinished jobs.", ("kind", "state"), registry=API)
+QUEUE_OLDEST: Final = Gauge(
+    "lensmodel_queue_oldest_seconds", "Age of the oldest job that nobody began.", ("kind",), registry=API
+)
+WORKERS: Final = Gauge("lensmodel_workers", "Workers heard of within their lease.", registry=API)
 JOB_SECONDS: Final = Histogram(
     "lensmodel_job_seconds",
     "Time of a job from its start in a worker to its end, waiting for its parts included.",
@@ -60,33 +61,15 @@ TAKEN_OVER: Final = Counter(
 )
 
 
-class Tables(Collector):
-    """Queues, their age and the live workers, read from the tables at each request."""
-
-    def __init__(self, store: Store, lease_s: float) -> None:
-        self._store, self._lease_s = store, lease_s
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the present values."""
-        jobs, oldest_s = self._store.jobs.load()
-        depth = GaugeMetricFamily("lensmodel_queue_jobs", "Unfinished jobs.", labels=("kind", "state"))
-        for (kind, state), count in jobs.items():
-            depth.add_metric((kind, state), count)
-        age = GaugeMetricFamily(
-            "lensmodel_queue_oldest_seconds", "Age of the oldest job that nobody began.", labels=("kind",)
-        )
-        for kind, seconds in oldest_s.items():
-            age.add_metric((kind,), seconds)
-        workers = GaugeMetricFamily("lensmodel_workers", "Workers heard of within their lease.")
-        workers.add_metric((), len(self._store.jobs.live(self._lease_s)))
-        yield from (depth, age, workers)
-
-
 def of_service(store: Store, lease_s: float) -> bytes:
     """Return the metrics of an API: its own, and those of the tables."""
-    collected = CollectorRegistry()
-    collected.register(Tables(store, lease_s))
-    return generate_latest(API) + generate_latest(collected)
+    jobs, oldest_s = store.jobs.load()
+    for (kind, state), count in jobs.items():
+        QUEUE_JOBS.labels(kind, state).set(count)
+    for kind, seconds in oldest_s.items():
+        QUEUE_OLDEST.labels(kind).set(seconds)
+    WORKERS.set(len(store.jobs.live(lease_s)))
+    return generate_latest(API)
 
 
 def publish(address: str) -> None:

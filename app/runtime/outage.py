@@ -1,21 +1,16 @@
 """Errors of the machinery rather than of a photo: recognised, and waited for until they end.
 
-A database that restarts, an object store that is away, a full disk, a child that the kernel
-killed for memory: none of them says anything about the photo. So such a job is retried with growing
-pauses for hours; only then it fails, with a code by which its owner can retry all such jobs in one
-call.
+A database that restarts, an object store that is away, a full disk: none of them says anything about the
+photo. So such a job is retried for hours; only then it fails, with a code of its own.
 """
 
 from __future__ import annotations
 
 import errno
 import logging
-import random
 import sqlite3
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Final
 
 from obstore import exceptions as stored
@@ -24,13 +19,6 @@ from sqlalchemy import exc
 log = logging.getLogger(__name__)
 
 CODE: Final = "outage"  # error code of a job that waited in vain
-FIRST_PAUSE_S: Final = 1.0
-# Shortest and longest pause before a retry (chosen): a restart of the database takes seconds, and after a
-# long outage work goes on within a minute
-LONGEST_PAUSE_S: Final = 60.0
-# Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
-# fault is reported soon
-BUGS: Final = 3
 _POSTGRES_FULL: Final = "53100"  # SQLSTATE disk_full (PostgreSQL documentation, appendix A)
 # How the storage reports ENOSPC and EDQUOT of Linux: the disk, or the quota of its user, is full
 _FULL: Final = ("os error 28", "os error 122")
@@ -89,29 +77,3 @@ def missable() -> Iterator[None]:
         if not is_outage(error):
             raise
         log.info("left out: %s", error)
-
-
-@dataclass
-class Patience:
-    """How long to wait after each failure of one job, and when to give up."""
-
-    outage_s: float
-    clock: Callable[[], float] = time.monotonic
-    rng: random.Random = field(default_factory=random.Random)  # spreads the load, keeps no secret
-    _began: float | None = None
-    _outages: int = 0
-    _bugs: int = 0
-
-    def pause_after(self, error: BaseException) -> float | None:
-        """Return how many seconds to wait before the next try; None = give up."""
-        # The pause doubles from 1 s to at most 60 s, and is drawn between 1 s and that: jobs that failed
-        # together do not come back together
-        if is_outage(error):
-            now = self.clock()
-            self._began = now if self._began is None else self._began
-            if now - self._began > self.outage_s:
-                return None
-            self._outages += 1
-            return self.rng.uniform(FIRST_PAUSE_S, min(2.0 ** min(self._outages, 6), LONGEST_PAUSE_S))
-        self._bugs += 1
-        return None if self._bugs >= BUGS else 2.0 ** (self._bugs - 1)

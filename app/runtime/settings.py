@@ -163,28 +163,9 @@ class Settings(BaseSettings):
         """Address of the blobs."""
         return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
 
-    @property
-    def max_upload_bytes(self) -> int:
-        """Largest photo file in bytes."""
-        return self.max_upload_mb * MIB
-
 
 def described() -> dict[str, str]:
     """Return what each setting is for, by its name."""
     return {
         name: " ".join((field.description or "").split()) for name, field in Settings.model_fields.items()
     }
-
-
-def table() -> str:
-    """Return all settings as the table of docs/service.md: `python -m app.runtime.settings` prints it."""
-    rows = ["| setting | default | |", "|---|---|---|"]
-    for name, text in described().items():
-        field = Settings.model_fields[name]
-        default = "cores of the machine" if field.default_factory else str(field.default).lower() or "none"
-        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {text} |")
-    return "\n".join(rows)
-
-
-if __name__ == "__main__":
-    print(table())  # noqa: T201 - this is its answer

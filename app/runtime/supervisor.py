@@ -8,26 +8,21 @@ tables say.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
 import uvicorn
 
 from app.runtime import logs
-from app.runtime.processes import PARENT
 from app.runtime.settings import PREFIX, Settings
 from app.sandbox import confine
-from app.store import migrate
 from app.store.accounts import Accounts
-from app.store.database import Database
+from app.store.database import Database, upgrade
 from lensmodel.cli.ending import InterruptedByUser, UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
@@ -47,13 +42,13 @@ def serve(settings: Settings) -> int:
     """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
-    with alone(settings.data_dir), contextlib.closing(listen(settings.host, settings.port)) as listener:
+    with contextlib.closing(listen(settings.host, settings.port)) as listener:
         _prepare(settings, api=True, worker=True)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         worker = subprocess.Popen(  # noqa: S603 - our own interpreter, our own module
             [sys.executable, "-m", WORKER],
-            env=os.environ | environment(settings) | {PARENT: str(os.getpid())},
+            env=os.environ | environment(settings) | {confine.PARENT: str(os.getpid())},
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C reaches this process alone, which stops it
         )
@@ -123,7 +118,7 @@ def _prepare(settings: Settings, *, api: bool = False, worker: bool = False) -> 
     if worker:
         require_sandbox(settings)
     with contextlib.closing(Database(settings.database)) as database:
-        migrate.upgrade(database)  # one of several simultaneous processes does it
+        upgrade(database)  # one of several simultaneous processes does it
         if not (api and settings.needs_keys) or Accounts(database).has_valid_key():
             return
     raise UsageError(
@@ -171,16 +166,3 @@ def listen(host: str, port: int) -> socket.socket:
             f"cannot listen on {host}:{port}: {error.strerror or error}; "
             "give another --port (0 takes any free one) or --host"
         ) from error
-
-
-@contextlib.contextmanager
-def alone(data_dir: Path) -> Iterator[None]:
-    """Make sure that only one service works on this folder; the lock ends with the process."""
-    with (data_dir / "service.lock").open("w", encoding="ascii") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"another service already works on {data_dir}: stop it, or give another folder by --data"
-            ) from error
-        yield

@@ -1,9 +1,7 @@
 """A separate account for processes that decode untrusted files, where a worker may change to one.
 
-A child that was taken over by a hostile file then owns no file of the service, and may signal none of
-its processes, whether or not the kernel has the measures of `app.sandbox.confine`. It reaches its
-task's folder because that belongs to the group of the account; it may pass the folders above without
-listing them; everything else in the data folder is closed to it.
+A child reaches its task's folder because that belongs to the group of the account; it may pass the folders
+above without listing them; everything else in the data folder is closed to it.
 
 References
 ----------
@@ -17,7 +15,7 @@ import os
 import pwd
 import re
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -98,8 +96,10 @@ def close_to_others(data: Path, open_folders: set[str]) -> None:
 def _inside(path: Path) -> Iterator[Path]:
     """Yield a file or folder and everything below it, except symbolic links."""
     yield path
-    for folder, folders, files in os.walk(path):
-        for name in [*folders, *files]:
-            inner = Path(folder, name)
-            if not inner.is_symlink():
-                yield inner
+    yield from (inner for inner in below(path) if not inner.is_symlink())
+
+
+def below(folder: Path, on_error: Callable[[OSError], object] | None = None) -> Iterator[Path]:
+    """Yield everything below a folder; links are not followed."""
+    for place, folders, files in os.walk(folder, onerror=on_error):
+        yield from (Path(place, name) for name in [*folders, *files])

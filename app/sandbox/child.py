@@ -1,4 +1,4 @@
-"""The code of a child process: confine it, run one task, report how it ended.
+"""The code of a child process: confine it, run one task, report how it ended; and what its end means.
 
 This module is what a fresh child imports first, so it imports next to nothing itself.
 """
@@ -9,9 +9,12 @@ import contextlib
 import errno
 import importlib
 import json
+import math
 import multiprocessing
 import os
 import resource
+import shutil
+import signal
 import struct
 import sys
 import threading
@@ -19,24 +22,30 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 from app.sandbox import confine
 from app.sandbox.account import SystemAccount
-from app.sandbox.outcome import MAX_TEXT, NO_ROOM, REPORT, TaskLimits
 from lensmodel.core import files
 from lensmodel.core.errors import LensModelError
 
+Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
 ProgressHook: TypeAlias = Callable[[int, int], None]
 # Called as `task(arguments, folder, progress)`; returns what JSON can write
 Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
+REPORT: Final = "result.json"  # file in which a child reports how its task ended, and what it returned
+# Bytes of JSON that are read from a task at most (chosen): far more than any returns, arrays are files
+MAX_RESULT: Final = 16 * 1024 * 1024
+# Characters of an error's code and text at most (chosen): those of the library have a line or two
+MAX_CODE: Final = 100
+MAX_TEXT: Final = 4000
+# Free bytes of a disk that counts as full (chosen): a write of a few MiB may fail where so much is left
+LEAST_ROOM: Final = 4 << 20
 PRINTED: Final = "printed"  # file of what a task printed
 PROGRESS: Final = "progress"  # file of how far it came: `STEPS`, done and all
 STEPS: Final = struct.Struct("=ii")
 _MAX_OPEN: Final = 1 << 16  # more files than the fork server has open
 _MIB: Final = 1024 * 1024  # bytes
-# Default niceness of tasks above that of the worker (chosen): a tenth of the weight of one at 0, see sched(7)
-NICENESS: Final = 10
 _KEPT_ENVIRONMENT: Final = (
     *("LANG", "LC_ALL", "NUMBA_CACHE_DIR"),
     "TMPDIR",  # where the fork server listens; a task has a folder of its own instead
@@ -45,6 +54,38 @@ _KEPT_ENVIRONMENT: Final = (
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _TOO_LARGE: Final = (errno.EFBIG, errno.ENOMEM)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskLimits:
+    """Resources that one task may use."""
+
+    memory_mb: int  # address space beyond that of the program itself; mapped files count
+    wall_s: float
+    cpu_s: int = 0  # 0: a little more than `wall_s`
+    file_mb: int = 8192  # the largest file
+    scratch_mb: int = 8192  # all that lies in its folder
+    files: int = 10_000
+    open_files: int = 256
+
+    @property
+    def processor_s(self) -> int:
+        """Seconds of processor time."""
+        return self.cpu_s or math.ceil(self.wall_s * 1.25) + 5
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a task ended; `value` is what it returned, `code` and `detail` are for whoever asked for the work.
+
+    `error`: the library refused, with its reason; `outage`: the machine lacked room or memory, which is
+    looked up, not what the child says; `crashed`: a signal, or an exception that nobody foresaw.
+    """
+
+    ending: Ending
+    value: Any = None
+    code: str = ""
+    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +128,7 @@ def main(order: Order) -> None:
     except Exception as error:  # noqa: BLE001 - the parent must learn of any failure
         number = errno.ENOMEM if isinstance(error, MemoryError) else getattr(error, "errno", None)
         if number in _FULL:
-            sys.exit(NO_ROOM)
+            sys.exit(1)  # the worker looks for itself whether a disk is full
         if number not in _TOO_LARGE:
             traceback.print_exc()
         end = "memory_limit" if number in _TOO_LARGE else "bug"
@@ -97,12 +138,7 @@ def main(order: Order) -> None:
 
 
 def _report(folder: Path, **report: object) -> None:
-    """Report how a task ended; by the exit status where even that does not fit."""
-    text = json.dumps(report, allow_nan=False)
-    try:
-        (folder / REPORT).write_text(text, encoding="utf-8")
-    except OSError:
-        sys.exit(NO_ROOM)
+    (folder / REPORT).write_text(json.dumps(report, allow_nan=False), encoding="utf-8")
 
 
 def _close_others() -> None:
@@ -203,3 +239,55 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(os.EX_SOFTWARE)
+
+
+def ended(ending: Ending, detail: str = "the work was cancelled") -> Outcome:
+    """Return an outcome whose code is how it ended."""
+    return Outcome(ending, code=ending, detail=detail)
+
+
+def outcome_of(status: int, folder: Path, limits: TaskLimits, *, out_of_memory: bool = False) -> Outcome:
+    """Return the outcome of a child from its exit status (or -signal) and the report in its folder."""
+    # `out_of_memory`: whether the kernel has killed something for want of it meanwhile
+    if -status == signal.SIGXCPU:
+        text = f"took more than {limits.processor_s} s of processor time; give a smaller photo"
+        return ended("time_limit", text)
+    report = {} if status else _read_report(folder / REPORT)
+    code, text = _text(report.get("code", ""), MAX_CODE), _text(report.get("text", ""), MAX_TEXT)
+    match report.get("end"):
+        case "ok":
+            return Outcome("ok", value=report.get("value"))
+        case "error":
+            return Outcome("error", code=code, detail=text)
+        case "memory_limit":
+            return ended("memory_limit", f"needs more than {limits.memory_mb} MiB: give a smaller photo")
+        case _:
+            out_of_memory &= -status == signal.SIGKILL
+            return _broken_off(status, folder, code or "end", out_of_memory=out_of_memory)
+
+
+def _broken_off(status: int, folder: Path, code: str, *, out_of_memory: bool) -> Outcome:
+    if shutil.disk_usage(folder).free < LEAST_ROOM:
+        return ended("outage", "there is no room on the disk for the work")
+    if out_of_memory:
+        return ended("outage", "the machine has no memory for the work")
+    if not status:
+        why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+        return Outcome("crashed", code="internal_error", detail=why)
+    name = next((known.name for known in signal.Signals if known == -status), "unknown")
+    how = f"signal {-status} ({name})" if status < 0 else f"exit status {status}"
+    return ended("crashed", f"the process that did the work died: {how}")
+
+
+def _text(value: object, most: int) -> str:
+    """Return a text as a database can hold it: without parts of characters, and without zeros."""
+    return str(value)[:most].encode(errors="replace").decode().replace("\0", "")
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    """Read the report of a child as untrusted: nothing where it is no JSON object, or too large."""
+    try:
+        report = json.loads(path.read_text(encoding="utf-8")) if path.stat().st_size <= MAX_RESULT else None
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}

@@ -1,12 +1,8 @@
 """Run one task in a confined child process, and report how it ended.
 
-Photos come from anywhere, and the libraries that decode them are large. So each piece of work
-runs in a child of a fork server: limited in memory, processor time, wall time, file size and
-open files, without the service's environment, killed when the result is no longer wanted
-or the parent is gone. What comes back are files, JSON among them, never a pickle: a child that
-was taken over by a hostile file cannot run code in its parent, nor keep it waiting; nor, where the
-kernel has the means of `app.sandbox.confine`, read what is not its task's, reach a network, or
-start a program.
+Photos come from anywhere, and the libraries that decode them are large: docs/service.md says what a child may
+do. What comes back are files, JSON among them, never a pickle: a child that was taken over by a hostile file
+cannot run code in its parent, nor keep it waiting.
 """
 
 from __future__ import annotations
@@ -22,7 +18,6 @@ import stat
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
@@ -31,8 +26,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from app.sandbox import child
-from app.sandbox.account import SystemAccount
-from app.sandbox.outcome import REPORT, Outcome, TaskLimits, ended, outcome_of
+from app.sandbox.account import SystemAccount, below
+from app.sandbox.child import REPORT, Outcome, TaskLimits, ended, outcome_of
 from lensmodel.core.types import ignore_step
 
 TASKS_MODULE = "app.jobs.tasks"  # has `TASKS`; tests replace it
@@ -47,28 +42,20 @@ class Budget:
     """Slots and memory that children share, first come, first served."""
 
     def __init__(self, slots: int, memory_mb: int) -> None:
-        self._changed = threading.Condition()
-        self._queue: deque[object] = deque()
+        self._first, self._changed = threading.Lock(), threading.Condition()
         self._slots, self._memory, self.memory_mb = slots, memory_mb, memory_mb
 
     @contextlib.contextmanager
     def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
         """Wait for a slot and memory; yield False if the task is no longer wanted."""
         # A task that needs more memory than the whole budget runs alone
-        memory, ticket, entered = min(memory_mb, self.memory_mb), object(), False
-
-        def is_next() -> bool:
-            return self._queue[0] is ticket and self._slots > 0 and self._memory >= memory
-
-        self._queue.append(ticket)
-        try:
-            while not entered and wanted():  # without the lock: it reads a row
+        memory, entered = min(memory_mb, self.memory_mb), False
+        with self._first:  # one waits until there is enough for it, the others for their turn
+            while not entered and wanted():  # without the lock of the budget: it reads a row
                 with self._changed:
-                    entered = self._changed.wait_for(is_next, POLL_S)
+                    fits = self._changed.wait_for(lambda: self._slots and self._memory >= memory, POLL_S)
+                    entered = bool(fits)
                     self._take(entered, memory)
-        finally:
-            self._queue.remove(ticket)
-            self._take(0, 0)  # the next one may be first now
         try:
             yield entered
         finally:
@@ -91,7 +78,7 @@ class Sandbox:
         *,
         cache: Path,
         account: SystemAccount | None = None,
-        niceness: int = child.NICENESS,
+        niceness: int = 10,
     ) -> None:
         self.scratch, self.budget, self.account, self._niceness = scratch, budget, account, niceness
         configured = os.environ.get("NUMBA_CACHE_DIR")
@@ -151,7 +138,8 @@ class Sandbox:
                 return ended("cancelled")
             reads = [*reads, self.cache]
             (folder / child.PROGRESS).write_bytes(child.STEPS.pack(0, 0))
-            _remove(folder / REPORT)  # of a try before
+            shutil.rmtree(folder / REPORT, ignore_errors=True)  # of a try before, which may be a folder
+            (folder / REPORT).unlink(missing_ok=True)
             if self.account is not None:
                 self.account.may_change(folder)
                 for path in reads:
@@ -168,6 +156,7 @@ class Sandbox:
             )
             process = self._context.Process(target=child.main, args=(order,), daemon=True)
             self._serve()
+            killed = _killed_for_memory()
             with (folder / child.PROGRESS).open("rb", buffering=0) as steps:
                 with self._alone:
                     process.start()
@@ -176,7 +165,8 @@ class Sandbox:
                 finally:
                     status = self._end(process)
             _leave_plain_files(folder)
-            outcome = outcome or outcome_of(status, folder, limits)
+            out_of_memory = _killed_for_memory() != killed
+            outcome = outcome or outcome_of(status, folder, limits, out_of_memory=out_of_memory)
             (folder / child.PROGRESS).unlink(missing_ok=True)
             _log_printed(task, folder / child.PRINTED, crashed=outcome.ending == "crashed")
             return outcome
@@ -225,36 +215,22 @@ class Sandbox:
 
 def _overflows(written: Path, limits: TaskLimits) -> bool:
     """Say whether a task has written more to its folder than it may, or hides what it wrote."""
-    files = blocks = 0
-    hidden: list[OSError] = []
-    for place, folders, names in os.walk(written, onerror=hidden.append):
-        for name in [*folders, *names]:
-            with contextlib.suppress(OSError):  # gone meanwhile
-                blocks += Path(place, name).lstat().st_blocks
-            files += 1
-            if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
-                return True
+    blocks, hidden = 0, list[OSError]()
+    for files, path in enumerate(below(written, hidden.append), start=1):
+        with contextlib.suppress(OSError):  # gone meanwhile
+            blocks += path.lstat().st_blocks
+        if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
+            return True
     return any(isinstance(error, PermissionError) for error in hidden)
 
 
 def _leave_plain_files(folder: Path) -> None:
     """Remove all but plain files of a child: by a link we would read what the child could not."""
-    for place, folders, files in os.walk(folder):
-        for name in [*folders, *files]:
-            path = Path(place, name)
-            status = path.lstat()
-            if stat.S_ISREG(status.st_mode) and status.st_nlink == 1:
-                continue
-            if not stat.S_ISDIR(status.st_mode):
-                path.unlink()
-
-
-def _remove(path: Path) -> None:
-    """Remove what a child left where its report belongs, a folder too."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    for path in below(folder):
+        status = path.lstat()
+        plain = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+        if not plain and not stat.S_ISDIR(status.st_mode):
+            path.unlink()
 
 
 def _log_printed(task: str, path: Path, *, crashed: bool) -> None:
@@ -266,6 +242,14 @@ def _log_printed(task: str, path: Path, *, crashed: bool) -> None:
         if text:
             log.log(logging.ERROR if crashed else logging.INFO, "task %s printed:\n%s", task, text)
         path.unlink()
+
+
+def _killed_for_memory() -> str:
+    """Return how many processes the kernel has killed for want of memory; nothing where it does not count."""
+    with contextlib.suppress(OSError):
+        counts = Path("/proc/vmstat").read_text(encoding="ascii")
+        return counts.partition("oom_kill ")[2].partition("\n")[0]
+    return ""
 
 
 def _lives(pid: int) -> bool:

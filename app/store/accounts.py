@@ -16,10 +16,8 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 
 from sqlalchemy import ColumnElement, Select, delete, func, or_, select, update
 from sqlalchemy.orm import Session, joinedload
-from sqlalchemy.sql.base import ReadOnlyColumnCollection
-from sqlalchemy.sql.elements import KeyedColumnElement
 
-from app.store.database import Repository, new_id, reads, writes, writes_durably
+from app.store.database import Repository, new_id, reads, writes
 from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, now, owner_id
 from app.store.tables import (
     CORRECTION_ACTIVE,
@@ -63,7 +61,7 @@ class Accounts(Repository):
 
     # --- keys -------------------------------------------------------------------------------------
 
-    @writes_durably
+    @writes
     def create_key(
         self,
         session: Session,
@@ -97,7 +95,7 @@ class Accounts(Repository):
         )
         return text
 
-    @writes_durably
+    @writes
     def revoke_key(self, session: Session, prefix: str) -> bool:
         """End a key and all sessions that began with it; False if there is no such key."""
         key = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix).with_for_update())
@@ -160,15 +158,14 @@ class Accounts(Repository):
         if row is None:
             return Usage()
         kept = func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None))
-        working = func.count().filter(PhotoRow.state.in_(PHOTO_WORKED_ON))
-        photos = select(func.count(), func.coalesce(kept, 0), working).where(PhotoRow.owner_id == row.id)
         made = func.sum(CorrectionRow.result_bytes).filter(CorrectionRow.state == "succeeded")
+        working = func.count().filter(PhotoRow.state.in_(PHOTO_WORKED_ON))
         running = func.count().filter(CorrectionRow.state.in_(CORRECTION_ACTIVE))
-        corrections = select(func.count(), func.coalesce(made, 0), running).where(
-            CorrectionRow.owner_id == row.id
-        )
         lenses = select(func.count()).where(LensRow.owner_id == row.id)
-        photo, correction = (session.execute(query).one() for query in (photos, corrections))
+        photo, correction = (
+            session.execute(select(func.count(), size, busy).where(table.owner_id == row.id)).one()
+            for table, size, busy in ((PhotoRow, kept, working), (CorrectionRow, made, running))
+        )
         return Usage(
             photos=photo[0],
             lenses=session.scalar(lenses) or 0,
@@ -196,7 +193,7 @@ class Accounts(Repository):
 
     # --- erasure --------------------------------------------------------------------------------
 
-    @writes_durably
+    @writes
     def begin_erasing(self, session: Session, owner: str) -> int | None:
         """Remove the name and keys of an owner whose data are to be erased; return the row's key, if any."""
         row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner).with_for_update())
@@ -214,15 +211,15 @@ class Accounts(Repository):
     @writes
     def erase_some(self, session: Session, owner_key: int) -> list[str] | None:
         """Erase some rows of an owner; return the prefixes of their blobs. None once nothing is left."""
+        if session.get(OwnerRow, owner_key, with_for_update=True) is None:
+            return None
         of_owner = select(PhotoRow).where(PhotoRow.owner_id == owner_key)
-        photos = list(session.scalars(of_owner.limit(AT_ONCE).with_for_update()))
+        photos = list(session.scalars(of_owner.limit(AT_ONCE)))
         if photos:
             keys = [photo.id for photo in photos]
             corrections = session.scalars(select(CorrectionRow).where(CorrectionRow.photo_id.in_(keys)))
             prefixes = [row.folder for row in corrections] + [photo.folder for photo in photos]
             session.execute(delete(PhotoRow).where(PhotoRow.id.in_(keys)))  # and by their keys all of them
-        elif session.get(OwnerRow, owner_key) is None:
-            return None
         else:
             lenses = list(session.scalars(select(LensRow).where(LensRow.owner_id == owner_key)))
             prefixes = [f"models/{lens.public_id}/" for lens in lenses]
@@ -231,7 +228,7 @@ class Accounts(Repository):
         return prefixes
 
 
-def _of_owner(cells: ReadOnlyColumnCollection[str, KeyedColumnElement[Any]], key: int) -> ColumnElement[bool]:
+def _of_owner(cells: Any, key: int) -> ColumnElement[bool]:  # noqa: ANN401 - the columns of any table
     """Select rows by the owner that they name, or by their photo or lens."""
     if "owner_id" in cells:
         return cells.owner_id == key

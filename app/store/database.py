@@ -1,9 +1,8 @@
 """Connections: who may write, who only reads, and what a transaction means on each database.
 
-By default the SQLite driver opens a transaction at the first write, so that two processes
-which read, add one and write lose updates silently. Here every writing transaction
-begins with BEGIN IMMEDIATE: one writer at a time, waiting rather than failing. Readers see a
-consistent snapshot (WAL) and cannot write at all. What a request reads is of one session (`scope`).
+On SQLite every writing transaction begins with BEGIN IMMEDIATE, else two that read, add one and write would
+lose updates silently. Readers see a consistent snapshot (WAL) and cannot write at all. What a request reads
+is of one session (`scope`).
 """
 
 from __future__ import annotations
@@ -14,16 +13,32 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Any, Concatenate, Final, ParamSpec, TypeAlias, TypeVar, cast
 
-from sqlalchemy import Connection, CursorResult, Engine, Executable, Select, create_engine, event, make_url
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from alembic.util import CommandError
+from sqlalchemy import (
+    Connection,
+    CursorResult,
+    Engine,
+    Executable,
+    Select,
+    create_engine,
+    event,
+    make_url,
+    text,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from app.errors import BusyError
+import migrations
 from app.store.tables import Base
+from lensmodel.core.errors import InvalidInputError
 
 # How long a transaction of SQLite waits for the one writer (chosen): transactions take milliseconds, on a
 # slow disk seconds
@@ -38,13 +53,10 @@ SERVER_DEADLINES: Final = {
     "keepalives_count": 3,
     # the server's end, too: else what a transaction has locked stays locked for hours
     "options": "-c tcp_user_timeout=15000 -c tcp_keepalives_idle=10 -c tcp_keepalives_interval=5 "
-    "-c tcp_keepalives_count=3",
+    "-c tcp_keepalives_count=3 -c idle_in_transaction_session_timeout=600000",
 }
 
-
-# How often to look again for a row of the same key (chosen: 80 simultaneous uploads and deletions of the same
-# bytes on PostgreSQL all end)
-TRIES: Final = 100
+_LOCK: Final = 0x1E45  # of migrations: any number that only this program uses
 
 
 class Database:
@@ -56,13 +68,10 @@ class Database:
         if self.is_sqlite:
             self.path = Path(self.url.database or "")
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # NORMAL never corrupts, but can lose the last commits when the power fails; each commit of FULL
-            # waits for the disk, which would delay leases where that is slow
-            self.writer = _sqlite(url, "BEGIN IMMEDIATE", "NORMAL")
-            self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
-            self.reader = _sqlite(url, "BEGIN", "NORMAL", read_only=True)
+            self.writer = _sqlite(url, "BEGIN IMMEDIATE")
+            self.reader = _sqlite(url, "BEGIN", read_only=True)
         else:
-            self.writer = self.durable = create_engine(
+            self.writer = create_engine(
                 url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
             )
             # one snapshot for each reading transaction, as on SQLite: what is read together is of one moment
@@ -95,12 +104,9 @@ class Database:
             yield session
 
     @contextmanager
-    def writing(self, *, durable: bool = False) -> Iterator[Session]:
+    def writing(self) -> Iterator[Session]:
         """Give a session whose changes are committed together at the end, or not at all."""
-        # `durable` also survives loss of power: for what a caller may rely on afterwards, such as an accepted
-        # upload whose memory card is formatted next
-        engine = self.durable if durable else self.writer
-        with Session(engine, expire_on_commit=False) as session, session.begin():
+        with Session(self.writer, expire_on_commit=False) as session, session.begin():
             yield session
         reads = self._in_scope()
         if reads is not None:
@@ -108,7 +114,7 @@ class Database:
 
     def close(self) -> None:
         """Close all connections."""
-        for engine in (self.writer, self.durable, self.reader):
+        for engine in (self.writer, self.reader):
             engine.dispose()
 
 
@@ -152,12 +158,7 @@ def writes(method: Method[R, P, T]) -> Called[R, P, T]:
     return _in(method, Database.writing)
 
 
-def writes_durably(method: Method[R, P, T]) -> Called[R, P, T]:
-    """Give a method a transaction of its own that survives loss of power once it has returned."""
-    return _in(method, partial(Database.writing, durable=True))
-
-
-def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
+def _sqlite(url: str, begin: str, *, read_only: bool = False) -> Engine:
     engine = create_engine(
         url,
         connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000},
@@ -171,7 +172,8 @@ def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) 
         connection.isolation_level = None  # we say BEGIN ourselves
         connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
         connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute(f"PRAGMA synchronous={synchronous}")
+        # what was committed survives loss of power: an upload is accepted, its memory card formatted next
+        connection.execute("PRAGMA synchronous=FULL")
         connection.execute("PRAGMA foreign_keys=ON")
         if read_only:
             connection.execute("PRAGMA query_only=ON")
@@ -183,30 +185,21 @@ def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) 
     return engine
 
 
-def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any]]) -> int:
-    """Insert the rows that break no unique key, leave the others; return how many went in."""
+def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any]]) -> None:
+    """Insert the rows that break no unique key, leave the others."""
+    insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+    if rows:
+        session.connection().execute(insert(table).on_conflict_do_nothing(), rows)
+
+
+def find_or_insert(session: Session, query: Select[B], fresh: B) -> tuple[B, bool]:
+    """Return the row of a query, or insert one, of an owner who is locked; True if inserted."""
+    row = session.scalar(query)
+    if row is not None:
+        return row, False
+    session.add(fresh)
     session.flush()
-    dialect = session.get_bind().dialect.name
-    insert = sqlite.insert if dialect == "sqlite" else postgresql.insert
-    # RETURNING shows on both databases what went in; on PostgreSQL the row count does not
-    statement = insert(table).on_conflict_do_nothing().returning(table.__mapper__.primary_key[0])
-    connection, inserted = session.connection(), 0
-    for row in rows:  # values given here, not in the statement, which else is made anew for each row
-        inserted += len(connection.execute(statement, row).all())
-    return inserted
-
-
-def insert_or_find(
-    session: Session, table: type[B], fresh: dict[str, Any], query: Select[B], what: str
-) -> tuple[B, bool]:
-    """Insert a row, or find the one of the same unique key by a query; True if inserted."""
-    # On PostgreSQL another transaction may delete that one after it blocked our insert and before our select
-    for _ in range(TRIES):
-        created = insert_new(session, table, [fresh]) == 1
-        row = session.scalar(query)
-        if row is not None:
-            return row, created
-    raise BusyError(f"{TRIES} times the {what} came and went: send it again")
+    return fresh, True
 
 
 def changed(session: Session, statement: Executable) -> int:
@@ -217,3 +210,48 @@ def changed(session: Session, statement: Executable) -> int:
 def new_id() -> str:
     """Return 32 hexadecimal digits: 12 of the time in ms, 20 at random, so that later ids sort later."""
     return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(10)}"
+
+
+def _config(connection: Connection | None = None) -> Config:
+    alembic = Config()
+    alembic.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
+    alembic.attributes["connection"] = connection
+    return alembic
+
+
+def head() -> str | None:
+    """Return the newest revision that this program knows."""
+    return ScriptDirectory.from_config(_config()).get_current_head()
+
+
+def current(database: Database) -> str | None:
+    """Return the revision of the database; None if it is empty."""
+    with database.reader.connect() as connection:
+        return MigrationContext.configure(connection).get_current_revision()
+
+
+def upgrade(database: Database) -> None:
+    """Run the missing steps, one process at a time."""
+    if current(database) == head():
+        return
+    with database.writer.connect() as connection, connection.begin():
+        if not database.is_sqlite:  # on SQLite BEGIN IMMEDIATE shuts the others out
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        if MigrationContext.configure(connection).get_current_revision() is None:
+            Base.metadata.create_all(connection)
+            command.stamp(_config(connection), "head")
+        try:
+            command.upgrade(_config(connection), "head")
+        except CommandError as error:
+            why = f"the database was made by a newer program ({error}): update lensmodel, or use other data"
+            raise InvalidInputError(why) from error
+
+
+def check(database: Database) -> None:
+    """Make sure that a database has the schema of this program."""
+    present, wanted = current(database), head()
+    if present != wanted:
+        raise InvalidInputError(
+            f"{database.url.render_as_string()} has schema {present}, this program needs {wanted}: "
+            "start the service of this version on it once"
+        )

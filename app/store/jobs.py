@@ -13,8 +13,8 @@ from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import ConflictError, UnknownError
-from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.owners import ANY_OWNER, Owner, discard, find_owned, find_to_change, now, page_of
+from app.store.database import changed, find_or_insert, new_id, reads, writes
+from app.store.owners import ANY_OWNER, Owner, Works, discard, find_to_change, now, page_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
     ENDED_BADLY,
@@ -27,7 +27,6 @@ from app.store.tables import (
     PhotoRow,
     WorkerRow,
 )
-from app.store.work import Works
 
 Kind: TypeAlias = Literal["photo", "correction", "measure"]
 
@@ -69,26 +68,26 @@ class Jobs(Works[CorrectionRow]):
 
     # --- corrections ------------------------------------------------------------------------------
 
-    @writes_durably
+    @writes
     def correct(
         self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:
         """Create a correction, or return the one of the same request; True if it is new."""
         request = dict(zip(_REQUEST, (photo.id, lens.public_id, version, params_hash(params)), strict=True))
-        fresh = {
+        fresh = CorrectionRow(
             **request,
-            "public_id": new_id(),
-            "owner_id": photo.owner_id,
-            "params": dict(params),
-            "state": "queued",
+            public_id=new_id(),
+            owner_id=photo.owner_id,
+            params=dict(params),
+            state="queued",
             **dict.fromkeys(("created_at", "stage_at"), now()),
-        }
+        )
         current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
         if current is None:
             raise UnknownError("photo", photo.public_id)
         if current.file_gone_at is not None:
             raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
-        row, created = insert_or_find(session, CorrectionRow, fresh, _same(request), "same correction")
+        row, created = find_or_insert(session, _same(request), fresh)
         session.refresh(row, ["photo", "lens"])
         return row, created
 
@@ -118,7 +117,7 @@ class Jobs(Works[CorrectionRow]):
     ) -> None:
         """Record how far a correction is, as it was taken up."""
         fields = {"progress_done": done, "progress_total": total, "stage": stage}
-        self._move_run(session, run, "running", fields)
+        self._move_run(session, run, "running", **fields)
 
     @writes
     def finish(
@@ -127,12 +126,11 @@ class Jobs(Works[CorrectionRow]):
         """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
         # `result`: key, etag, media_type, bytes and name of the file
         fields = {f"result_{name}": value for name, value in result.items()}
-        ended = {"report": dict(report), "finished_at": now()}
-        return self._move_run(session, run, "succeeded", fields | ended)
+        return self._move_run(session, run, "succeeded", report=dict(report), **fields)
 
-    def _move_run(self, session: Session, run: CorrectionRow, state: str, fields: Mapping[str, Any]) -> bool:
-        of_run, key = {"epoch": run.epoch, "attempt": run.attempt}, run.public_id
-        return self.move(session, key, ANY_OWNER, ("running",), state, fields, **of_run) is not None
+    def _move_run(self, session: Session, run: CorrectionRow, state: str, **fields: object) -> bool:
+        of_run: dict[str, Any] = {"epoch": run.epoch, "attempt": run.attempt, **fields}
+        return self.move(session, run.public_id, ANY_OWNER, ("running",), state, **of_run) is not None
 
     @reads
     def ended_before(self, session: Session, moment: datetime, limit: int = 100) -> list[str]:
@@ -143,7 +141,7 @@ class Jobs(Works[CorrectionRow]):
     @writes
     def delete(self, session: Session, correction_id: str, owner: Owner) -> str | None:
         """Forget a correction; return the prefix of its blobs, None if there is no such correction."""
-        row = find_owned(session, CorrectionRow, correction_id, owner)
+        row = find_to_change(session, CorrectionRow, correction_id, owner)
         if row is None:
             return None
         discard(session, row.folder)
@@ -192,13 +190,9 @@ class Jobs(Works[CorrectionRow]):
         return now() if self.database.is_sqlite else session.scalars(select(func.now())).one()
 
     @writes
-    def register(
-        self, session: Session, worker_id: str, *, host: str, pid: int, pid_started: float, confined: str = ""
-    ) -> None:
+    def register(self, session: Session, worker_id: str, *, confined: str = "") -> None:
         """Enter a new worker, with the measures that confine its children."""
-        times = dict.fromkeys(("started_at", "heartbeat_at"), self._now(session))
-        process = {"host": host, "pid": pid, "pid_started": pid_started, "confined": confined}
-        session.add(WorkerRow(id=worker_id, **process, **times))
+        session.add(WorkerRow(id=worker_id, heartbeat_at=self._now(session), confined=confined))
 
     @writes
     def beat(self, session: Session, worker_id: str) -> bool:

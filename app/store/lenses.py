@@ -6,15 +6,22 @@ visible in the same order.
 
 from __future__ import annotations
 
+import math
+import zlib
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import lru_cache
 from typing import Any, Final
 
-from sqlalchemy import Select, delete, func, select, update
+import numpy as np
+from sqlalchemy import Row, Select, delete, func, select, update
 from sqlalchemy.orm import Session
 
-from app.store.database import Repository, changed, insert_or_find, new_id, reads, writes
+from app import distances
+from app.errors import ServiceError
+from app.store.database import Repository, changed, find_or_insert, new_id, reads, writes
 from app.store.owners import (
     ANY_OWNER,
     Owner,
@@ -27,7 +34,6 @@ from app.store.owners import (
     owned,
     page_of,
 )
-from app.store.samples import COLUMNS, LensState, sample_in
 from app.store.tables import (
     CORRECTION_ACTIVE,
     ENDED_BADLY,
@@ -39,20 +45,37 @@ from app.store.tables import (
     PhotoRow,
     SampleRow,
 )
+from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import name_key, serial_key
-from lensmodel.core.psf import PsfSample
+from lensmodel.core.psf import EncodedPatch, PsfSample
+from lensmodel.model.samples import entry_of, sample_of
+
+DTYPE: Final = "<f4"
+FORMAT_VERSION: Final = 2  # raised when samples of before mean nothing to the model any more
+# Characters kept of an estimator's name, which profiles and own estimators choose (chosen: every name of
+# ours fits, and no other fills the table)
+MAX_ESTIMATOR: Final = 60
+_OWN: Final = ("r", "phi", "weight", "size", "estimator", "error")
+_OF_PHOTO: Final = {"photo": PhotoRow.public_id, "pixel_pitch_um": PhotoRow.pixel_pitch_um}
+_SETTINGS: Final = {
+    "channel": SampleRow.channel,
+    "aperture": PhotoRow.aperture,
+    "focal_mm": PhotoRow.focal_mm,
+    "focus_m": PhotoRow.focus_m,
+}
+
+# What `sample_in` reads: of samples joined with their patches and photos
+COLUMNS: Final = (
+    *(column.label(name) for name, column in {**_OF_PHOTO, **_SETTINGS}.items()),
+    *(SampleRow.entry, SampleRow.crc32, SampleRow.format_version, SampleRow.psf),
+    *(PatchRow.encoded, PhotoRow.width, PhotoRow.height),
+)
+PROFILE: Final = "profile"  # kind of a photo of which a profile has told: its file was never here
 
 TEACHES: Final = PhotoRow.state == "counted"
 
 # How long the previous version is kept (chosen): a worker may still be reporting of it
 STILL_WRITTEN: Final = timedelta(minutes=30)
-# Whether an event lets the samples of its photo join the model, or takes them out
-_JOINS: Final = {
-    "photo_added": True,
-    "photo_included": True,
-    "photo_excluded": False,
-    "photo_removed": False,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +87,14 @@ class LensName:
     serial: str | None
     serial_source: str = "user"
     label: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LensState:
+    """Version of a lens: shows whether a fitted model is up to date."""
+
+    version: int
+    rebuild_epoch: int
 
 
 def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
@@ -111,10 +142,7 @@ class Lenses(Repository):
     @reads
     def by_identity(self, session: Session, photo: PhotoRow) -> LensRow | None:
         """Return the lens that the serial of an inspected photo identifies, if it exists by now."""
-        if photo.lens_serial is None:
-            return None
-        key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
-        return session.scalar(select(LensRow).where(*_same(photo.owner_id, key)))
+        return None if photo.lens_serial is None else session.scalar(_same(photo.owner_id, _key_of(photo)))
 
     @reads
     def coverage_of(
@@ -143,16 +171,9 @@ class Lenses(Repository):
     @reads
     def shape_of(self, session: Session, lens: LensRow) -> tuple[int, int] | None:
         """Return the commonest height and width of the photos of a lens in pixels, in sensor orientation."""
-        query = (
-            select(PhotoRow.height, PhotoRow.width)
-            .where(PhotoRow.lens_id == lens.id, TEACHES)
-            .where(PhotoRow.width.is_not(None), PhotoRow.height.is_not(None))
-            .group_by(PhotoRow.height, PhotoRow.width)
-            .order_by(func.count().desc(), PhotoRow.width.desc())
-            .limit(1)
-        )
-        row = session.execute(query).one_or_none()
-        return None if row is None else (row[0] or 0, row[1] or 0)
+        query = select(PhotoRow.height, PhotoRow.width).where(PhotoRow.lens_id == lens.id, TEACHES)
+        shapes = Counter((row[0], row[1]) for row in session.execute(query) if row[0] and row[1])
+        return max(shapes, key=lambda shape: (shapes[shape], shape[1]), default=None)
 
     @reads
     def history(
@@ -207,11 +228,6 @@ class Lenses(Repository):
             statement = update(EventRow).where(*of_version, EventRow.metrics.is_(None))
             session.execute(statement.values(metrics=metrics))
 
-    def fail(self, lens_id: str, version: int, code: str, detail: str) -> None:
-        """Record that a version could not be measured, and why."""
-        del detail
-        self.record_metrics(lens_id, version, {"error": None, "coverage": None, "problem": code})
-
     # --- changes ----------------------------------------------------------------------------------
 
     @writes
@@ -231,14 +247,11 @@ class Lenses(Repository):
     @writes
     def merge(self, session: Session, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along."""
-        # False if one of the two does not exist, or photos of the first are still being learned from. Always
-        # locked in the same order: two merges at once must not wait for each other
-        rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
-        lens, target = rows[lens_id], rows[into]
+        # False if one of the two does not exist, or photos of the first are still being learned from
+        lens, target = (find_to_change(session, LensRow, key, owner) for key in (lens_id, into))
         if lens is None or target is None or lens.id == target.id:
             return False
-        query = select(PhotoRow).where(PhotoRow.lens_id == lens.id)
-        photos = list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
+        photos = list(session.scalars(select(PhotoRow).where(PhotoRow.lens_id == lens.id)))
         if any(photo.state in PHOTO_WORKED_ON for photo in photos):
             return False
         for photo in photos:
@@ -256,7 +269,7 @@ class Lenses(Repository):
         lens = find_to_change(session, LensRow, lens_id, owner)
         if lens is None:
             return False
-        for photo in session.scalars(select(PhotoRow).where(PhotoRow.lens_id == lens.id).with_for_update()):
+        for photo in session.scalars(select(PhotoRow).where(PhotoRow.lens_id == lens.id)):
             _unlearn(session, photo)
         session.execute(
             update(CorrectionRow)
@@ -279,40 +292,42 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     """Return the lens of an inspected photo; a photo that calibrates creates it where there is none."""
     lens_id = photo.given.get("lens_id")
     if lens_id is not None:
-        query = select(LensRow).where(LensRow.public_id == lens_id, LensRow.owner_id == photo.owner_id)
-        chosen = session.scalar(query.with_for_update())
+        of_owner = LensRow.owner_id == photo.owner_id
+        chosen = session.scalar(select(LensRow).where(LensRow.public_id == lens_id, of_owner))
         if chosen is not None:
             return chosen
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
         return None
-    name = LensName(photo.lens_maker, photo.lens_model, photo.lens_serial, photo.lens_serial_source or "none")
     if photo.calibrate:
+        source = photo.lens_serial_source or "none"
+        name = LensName(photo.lens_maker, photo.lens_model, photo.lens_serial, source)
         return named(session, photo.owner_id, name)
-    key = identity_key(name.maker, name.model, name.serial)
-    return session.scalar(select(LensRow).where(*_same(photo.owner_id, key)).with_for_update())
+    return session.scalar(_same(photo.owner_id, _key_of(photo)))
 
 
-def _same(owner_id: int, key: str) -> tuple[Any, ...]:
-    return LensRow.owner_id == owner_id, LensRow.identity_key == key
+def _key_of(photo: PhotoRow) -> str:
+    return identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
+
+
+def _same(owner_id: int, key: str) -> Select[LensRow]:
+    return select(LensRow).where(LensRow.owner_id == owner_id, LensRow.identity_key == key)
 
 
 def named(session: Session, owner_id: int, name: LensName) -> LensRow:
     """Return the lens of a serial, creating it if need be; a label always creates a new lens."""
     key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
-    fresh = {
-        "public_id": new_id(),
-        "owner_id": owner_id,
-        "identity_key": key,
-        "maker": name.maker,
-        "model": name.model,
-        "serial": name.serial,
-        "serial_source": "user" if name.label else name.serial_source if name.serial else "none",
-        "label": name.label,
-        "created_at": now(),
-    }
-    # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
-    query = select(LensRow).where(*_same(owner_id, key)).with_for_update()
-    return insert_or_find(session, LensRow, fresh, query, "lens")[0]
+    fresh = LensRow(
+        public_id=new_id(),
+        owner_id=owner_id,
+        identity_key=key,
+        maker=name.maker,
+        model=name.model,
+        serial=name.serial,
+        serial_source="user" if name.label else name.serial_source if name.serial else "none",
+        label=name.label,
+        created_at=now(),
+    )
+    return find_or_insert(session, _same(owner_id, key), fresh)[0]
 
 
 # --- samples and versions -------------------------------------------------------------------------
@@ -320,18 +335,16 @@ def named(session: Session, owner_id: int, name: LensName) -> LensRow:
 
 def note_change(session: Session, photo: PhotoRow, kind: str) -> int:
     """Give the lens of a photo a new version, which `kind` explains; return it."""
-    # The lens's row is locked until the transaction ends. Its samples and photos are counted anew, never
-    # incremented.
-    query = select(LensRow).where(LensRow.id == photo.lens_id).with_for_update()
-    lens = session.scalars(query.execution_options(populate_existing=True)).one()
+    # Its samples and photos are counted anew, never incremented
+    lens = session.get_one(LensRow, photo.lens_id)
     if lens.version:  # before the first there was nothing to report
-        discard(session, _reports_prefix(lens), after=STILL_WRITTEN)
+        discard(session, report_key(lens.public_id, lens.version, lens.rebuild_epoch), after=STILL_WRITTEN)
     lens.version += 1
     # where samples went away or changed, models in memory are fitted anew instead of extended
     lens.rebuild_epoch += kind != "photo_added"
-    change = 0
-    if kind in _JOINS:
-        belongs = (lens.id, lens.version) if _JOINS[kind] else (None, None)
+    change, joins = 0, kind in {"photo_added", "photo_included"}
+    if kind != "photo_changed":
+        belongs = (lens.id, lens.version) if joins else (None, None)
         samples = dict(zip(("lens_id", "version_added"), belongs, strict=True))
         change = changed(session, update(SampleRow).where(SampleRow.photo_id == photo.id).values(samples))
     lens.sample_count, lens.photo_count = session.execute(
@@ -344,7 +357,7 @@ def note_change(session: Session, photo: PhotoRow, kind: str) -> int:
             kind=kind,
             photo_public_id=photo.public_id,
             epoch=photo.epoch,
-            samples_added=change if _JOINS.get(kind) else -change,
+            samples_added=change if joins else -change,
             samples=lens.sample_count,
             photos=lens.photo_count,
             created_at=now(),
@@ -375,10 +388,6 @@ def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
         note_change(session, photo, "photo_included")
 
 
-def _reports_prefix(lens: LensRow) -> str:
-    return f"models/{lens.public_id}/{lens.version}-{lens.rebuild_epoch}/"
-
-
 def report_key(lens_id: str, version: int, epoch: int) -> str:
     """Return the key of the report that a worker makes of one version of a lens."""
     return f"models/{lens_id}/{version}-{epoch}/report.json"
@@ -390,7 +399,7 @@ def report_key(lens_id: str, version: int, epoch: int) -> str:
 def forget_if_empty(session: Session, photo: PhotoRow, *, gone: bool = False) -> None:
     """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it."""
     # A lens that the owner named stays as long as there is any photo of it, even a failed one
-    lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
+    lens = None if photo.lens_id is None else session.get(LensRow, photo.lens_id)
     if lens is None:
         return
     others = select(PhotoRow.id).where(PhotoRow.lens_id == lens.id, PhotoRow.id != photo.id)
@@ -424,3 +433,48 @@ def _forget(session: Session, lens: LensRow) -> None:
     discard(session, f"models/{lens.public_id}/", after=STILL_WRITTEN)
     session.delete(lens)
     session.flush()
+
+
+def columns_of(sample: PsfSample, photo: PhotoRow, patch: PatchRow) -> dict[str, Any]:
+    """Return a sample as a row; what its photo knows, its photo's row keeps, and `patch` what it encodes."""
+    entry = entry_of(sample)
+    entry["estimator"] = entry["estimator"][:MAX_ESTIMATOR] or PROFILE
+    if sample.encoded is not None:
+        patch.encoded = sample.encoded.to_bytes()
+    blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
+    return {
+        "photo_id": photo.id,
+        "patch_id": patch.id,
+        "channel": sample.settings.channel,
+        "entry": {name: entry[name] for name in _OWN},
+        "format_version": FORMAT_VERSION,
+        "crc32": zlib.crc32(blob),
+        "psf": blob,
+    }
+
+
+def sample_in(row: Row[*tuple[Any, ...]]) -> PsfSample:
+    """Build the sample of a row of `COLUMNS`."""
+    if row.format_version != FORMAT_VERSION:
+        raise NoSamplesError(
+            "the samples of this lens were made by an earlier version of the program: calibrate it again, by "
+            "retrying its photos"
+        )
+    if zlib.crc32(row.psf) != row.crc32:
+        text = f"sample {row.id} differs from what was written: restore the database"
+        raise ServiceError(text, code="corrupt_sample")
+    settings = {name: getattr(row, name) for name in _SETTINGS}
+    settings["focus_m"] = distances.read(settings["focus_m"])
+    entry = row.entry | {name: getattr(row, name) for name in _OF_PHOTO}
+    entry["half_diagonal_px"] = math.hypot(row.width, row.height) / 2 if row.width and row.height else None
+    return sample_of(
+        {**entry, "settings": settings},
+        np.frombuffer(row.psf, dtype=DTYPE).reshape(entry["size"], entry["size"]),
+        None if row.encoded is None else _encoded(row.encoded),
+    )
+
+
+@lru_cache(maxsize=16)
+def _encoded(data: bytes) -> EncodedPatch:
+    """Decode a patch once for its three channels."""
+    return EncodedPatch.from_bytes(data)

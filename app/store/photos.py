@@ -1,4 +1,8 @@
-"""Photos: received once, moved from state to state, counted exactly once."""
+"""Photos: received once, moved from state to state, counted exactly once.
+
+Their patches are planned once, and each cell of them is finished once. Windows that were rejected before
+estimation are one compact value of their photo, not thousands of rows.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +13,15 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Final
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import Select, delete, func, select, update
 from sqlalchemy.orm import Session, joinedload
 
 from app import distances
 from app.errors import BusyError, UnknownError
 from app.store import lenses
-from app.store.database import changed, insert_or_find, new_id, reads, writes, writes_durably
-from app.store.lenses import LensName, forget_if_empty, forget_patches, note_change
-from app.store.owners import ANY_OWNER, Owner, discard, ensure_owner, find_to_change, now, page_of
-from app.store.patches import Patches
-from app.store.samples import PROFILE, columns_of
+from app.store.database import find_or_insert, new_id, reads, writes
+from app.store.lenses import PROFILE, LensName, columns_of, forget_if_empty, forget_patches, note_change
+from app.store.owners import ANY_OWNER, Owner, Works, discard, ensure_owner, find_to_change, now, page_of
 from app.store.tables import (
     CORRECTION_ACTIVE,
     ENDED_BADLY,
@@ -33,26 +35,27 @@ from app.store.tables import (
     PhotoRow,
     SampleRow,
 )
-from app.store.work import Works
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 
-# Fields that the owner may give, with the column that each fills
+# Fields that the owner may give, with the column that each fills. Sent with the file they fill it until the
+# file says otherwise; said later they are corrections, in `PhotoRow.given`, and go before what the file says.
 GIVEN_SETTINGS: Final = {
     "aperture": "aperture",
     "focal_length_mm": "focal_mm",
     "focus_distance_m": "focus_m",
     "pixel_pitch_um": "pixel_pitch_um",
 }
-# Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
-# under their own names are corrections made since and go before the header.
-FALLBACKS: Final = "fallbacks"
 # Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
 # several machines differ by less
 SPARE: Final = timedelta(hours=1)
 # How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen): its
 # owner looks again within a day
 FILE_KEPT: Final = timedelta(days=1)
+# Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
+# diagonal is 3,600 pixels
+DIGITS: Final = 4
+_WINDOW: Final = ("row", "col", "size", "r", "phi", "reason")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +64,17 @@ class Received:
 
     photo: PhotoRow
     fresh: bool
-    wants_file: bool = False  # whether the photo is known without its file, which has now come again
 
 
-class Photos(Patches, Works[PhotoRow]):
+class Photos(Works[PhotoRow]):
     """Photos of all owners, with their patches."""
 
     table, active, unfinished = PhotoRow, PHOTO_WORKED_ON, PHOTO_UNFINISHED
 
     @reads
-    def newest_file(self, session: Session) -> str | None:
-        """Return the key of the file of the newest photo, or None where there is no file."""
-        return session.scalar(select(PhotoRow.blob_key).where(_FILED).order_by(PhotoRow.id.desc()).limit(1))
+    def have_files(self, session: Session) -> bool:
+        """Say whether the file of any photo is kept."""
+        return session.scalar(select(PhotoRow.id).where(_FILED).limit(1)) is not None
 
     @reads
     def page(
@@ -144,7 +146,7 @@ class Photos(Patches, Works[PhotoRow]):
         """Announce blobs below `prefix`: garbage an hour after that time unless a photo claims them."""
         discard(session, prefix, after=within + SPARE)
 
-    @writes_durably
+    @writes
     def receive(
         self,
         session: Session,
@@ -160,34 +162,41 @@ class Photos(Patches, Works[PhotoRow]):
         # `file`: public_id, sha256, filename, kind, byte_size and blob_key.
         # A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
         # calibrate its lens and was not before, or it waited for settings that are now given
-        fresh = {
+        settings = {GIVEN_SETTINGS[field]: given[field] for field in GIVEN_SETTINGS.keys() & given.keys()}
+        said = {field: value for field, value in given.items() if field not in GIVEN_SETTINGS}
+        fresh = PhotoRow(
             **file,
-            "owner_id": ensure_owner(session, owner, may_be_new=may_be_new),
-            "calibrate": calibrate,
-            "given": _of_upload(given),
-            "state": "received",
+            **settings,
+            lens=None,
+            owner_id=ensure_owner(session, owner, may_be_new=may_be_new),
+            calibrate=calibrate,
+            given=said,
+            state="received",
             **dict.fromkeys(("received_at", "stage_at"), now()),
-            **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
-        }
-        of_bytes = (PhotoRow.owner_id == fresh["owner_id"], PhotoRow.sha256 == file["sha256"])
-        same = select(PhotoRow).where(*of_bytes)
-        query = same.options(joinedload(PhotoRow.lens)).with_for_update(of=PhotoRow)
-        known, created = insert_or_find(session, PhotoRow, fresh, query, "photo of the same bytes")
+        )
+        of_bytes = (PhotoRow.owner_id == fresh.owner_id, PhotoRow.sha256 == fresh.sha256)
+        same = select(PhotoRow).where(*of_bytes).options(joinedload(PhotoRow.lens))
+        known, created = find_or_insert(session, same, fresh)
         if created:
             _keep_announced(session, known.folder)
             return Received(known, fresh=True)
-        merged = _of_upload(given, known.given)
+        before, now_said = {name: getattr(known, name) for name in settings}, {**known.given, **said}
         again = (
             known.state in ENDED_BADLY
             or (calibrate and not known.calibrate)
-            or (known.state == "needs_lens" and merged != known.given)
+            or (known.state == "needs_lens" and (settings, now_said) != (before, known.given))
             or (known.kind == PROFILE_FILE and known.state == "stored")
         )
+        if known.file_gone_at is not None:  # this is the same one
+            known.blob_key, known.file_gone_at = fresh.blob_key, None
+            known.location = known.file_sha256 = None
+            _keep_announced(session, known.folder)
         if again:
-            known.calibrate, known.given = calibrate, merged
-            if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
-                self.restart(session, known)
-        return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
+            known.calibrate, known.given = calibrate, now_said
+            for column, value in settings.items():
+                setattr(known, column, value)
+            self.restart(session, known)
+        return Received(known, fresh=again)
 
     @writes
     def give_up_file(self, session: Session, photo_id: str, names: Sequence[str]) -> bool:
@@ -204,29 +213,29 @@ class Photos(Patches, Works[PhotoRow]):
         discard(session, photo.blob_key, *(f"{photo.folder}{name}" for name in names), after=timedelta(0))
         return True
 
-    @writes_durably
-    def restore_file(self, session: Session, photo_id: str, blob_key: str, *, again: bool = False) -> None:
-        """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
-        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-        if photo is None:
-            return
-        photo.blob_key, photo.file_gone_at = blob_key, None
-        photo.location = photo.file_sha256 = None
-        if again:
-            self.restart(session, photo)
-
     # --- work -------------------------------------------------------------------------------------
 
     @writes
     def record_inspection(
-        self, session: Session, /, photo_id: str, identity: LensName, **header: object
-    ) -> None:
-        """Store what the header says; the owner's corrections go before it, settings of the upload after."""
+        self,
+        session: Session,
+        /,
+        photo_id: str,
+        identity: LensName,
+        *,
+        single_copy: bool = False,
+        **header: object,
+    ) -> PhotoRow | None:
+        """Store what the header says; return the photo with its lens, None if it was deleted."""
+        # The owner's corrections go before the header, settings of the upload after it. The lens is the one
+        # that the owner named, else that of the serial, else, only with `single_copy`, of the model alone.
+        # Photos that are merely stored join a lens that exists but create none.
         photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
         if photo is None:
-            return
+            return None
         for field, column in GIVEN_SETTINGS.items():
-            setattr(photo, column, _setting(photo, field, header.pop(column, None)))
+            ranked = (photo.given.get(field), header.pop(column, None), getattr(photo, column))
+            setattr(photo, column, next((value for value in ranked if value is not None), None))
         for column, value in header.items():
             setattr(photo, column, value)
         serial = photo.given.get("lens_serial")
@@ -234,6 +243,11 @@ class Photos(Patches, Works[PhotoRow]):
         photo.lens_model = photo.given.get("lens_model") or identity.model
         photo.lens_serial = serial or identity.serial
         photo.lens_serial_source = "user" if serial else identity.serial_source
+        lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
+        if lens is not None:
+            photo.lens = lens
+            lens.complete(photo.lens_maker, photo.lens_model)
+        return photo
 
     @writes
     def record_lateral(self, session: Session, photo_id: str, epoch: int, lateral: dict[str, Any]) -> None:
@@ -241,7 +255,7 @@ class Photos(Patches, Works[PhotoRow]):
         current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch)
         session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
 
-    @writes_durably
+    @writes
     def record_location(
         self,
         session: Session,
@@ -254,38 +268,21 @@ class Photos(Patches, Works[PhotoRow]):
         """Record whether the file of a photo said where it was taken; False if it has another file by now."""
         # With `key` and `digest` a file without the place, of that SHA-256, is stored there: it becomes the
         # file of the photo, and the one before garbage once nobody reads it any more
-        current = (PhotoRow.public_id == photo.public_id, PhotoRow.blob_key == photo.blob_key)
-        values = {"location": location, **({} if key is None else {"blob_key": key, "file_sha256": digest})}
-        statement = update(PhotoRow).where(*current).values(**values)
-        if changed(session, statement) != 1:
+        current = find_to_change(session, PhotoRow, photo.public_id, ANY_OWNER)
+        if current is None or current.blob_key != photo.blob_key:
             return False
+        current.location = location
         if key is not None:
-            discard(session, photo.blob_key)
+            discard(session, current.blob_key)
+            current.blob_key, current.file_sha256 = key, digest
         return True
-
-    @writes
-    def assign_lens(self, session: Session, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
-        """Return the lens of an inspected photo, created if need be; None if its copy is unknown."""
-        # Order: the lens that the owner named, then the serial (given by the owner, else of the file), then,
-        # only with `single_copy`, the model alone. Photos that are merely stored join a lens that exists but
-        # create none.
-        photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
-        if photo is None:
-            return None
-        lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
-        if lens is not None:
-            photo.lens_id = lens.id
-            lens.complete(photo.lens_maker, photo.lens_model)
-        return lens
 
     @writes
     def finish(self, session: Session, photo_id: str, epoch: int) -> int | None:
         """Count a photo: its samples join the model and the lens's version grows by one."""
         # Returns the new version, or None if the photo was counted, cancelled or started anew meanwhile. One
         # transaction: it happens entirely and once, however often it is tried.
-        photo = self.move(
-            session, photo_id, ANY_OWNER, ("estimating",), "counted", {"finished_at": now()}, epoch=epoch
-        )
+        photo = self.move(session, photo_id, ANY_OWNER, ("estimating",), "counted", epoch=epoch)
         if photo is not None and photo.lens_id is None:
             raise ValueError(f"photo {photo_id} has no lens: assign one before it is counted")
         return None if photo is None else note_change(session, photo, "photo_added")
@@ -295,6 +292,83 @@ class Photos(Patches, Works[PhotoRow]):
         if photo.state == "cancelled":
             session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
         forget_if_empty(session, photo)
+
+    # --- patches ----------------------------------------------------------------------------------
+
+    @writes
+    def plan_patches(
+        self,
+        session: Session,
+        photo_id: str,
+        epoch: int,
+        patches: Sequence[Mapping[str, Any]],
+        rejected: Sequence[Mapping[str, Any]],
+    ) -> int:
+        """Write the plan of a photo once, as columns of patches; return how many are to be estimated."""
+        # A second call, by a worker that repeats the step, adds nothing
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return 0
+        if photo.windows is None:
+            which = {"photo_id": photo.id, "epoch": epoch, "state": "pending"}
+            session.add_all(PatchRow(**which, idx=idx, **patch) for idx, patch in enumerate(patches))
+            photo.windows, photo.windows_rejected = _packed(rejected), len(rejected)
+        return _recount(session, photo)
+
+    @reads
+    def patches(self, session: Session, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
+        """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
+        return list(session.scalars(_patches_of(photo_id, epoch).order_by(PatchRow.idx)))
+
+    @reads
+    def windows(self, session: Session, photo_id: str) -> list[PatchRow]:
+        """Return the patches of a photo, followed by the windows that were rejected before estimation."""
+        rows = list(session.scalars(_patches_of(photo_id).order_by(PatchRow.idx)))
+        columns = session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id)) or {}
+        rejected = enumerate(zip(*columns.values(), strict=True), len(rows))
+        return rows + [
+            PatchRow(idx=idx, state="rejected", **dict(zip(columns, window, strict=True)))
+            for idx, window in rejected
+        ]
+
+    @writes
+    def add_samples(
+        self, session: Session, photo_id: str, epoch: int, samples: Sequence[tuple[int, PsfSample]]
+    ) -> int:
+        """Store the samples of some patches and mark these done; return how many samples were new."""
+        # Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated call
+        # stores nothing twice: what is done stays as it is.
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return 0
+        new = {(idx, sample.settings.channel): sample for idx, sample in samples}
+        numbers = PatchRow.idx.in_({idx for idx, _ in new})
+        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, numbers)
+        query = select(PatchRow).where(*mine, PatchRow.state != "done")
+        patches = {patch.idx: patch for patch in session.scalars(query)}
+        rows = [
+            SampleRow(**columns_of(sample, photo, patches[idx]))
+            for (idx, _), sample in new.items()
+            if idx in patches
+        ]
+        session.add_all(rows)
+        for patch in patches.values():
+            patch.state = "done"
+        _recount(session, photo)
+        return len(rows)
+
+    @writes
+    def reject_patches(
+        self, session: Session, photo_id: str, epoch: int, reason: str, numbers: Sequence[int]
+    ) -> None:
+        """Mark patches as useless, except those that are done."""
+        photo = _selecting(session, photo_id, epoch)
+        if photo is None:
+            return
+        mine = (PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers))
+        rejected = update(PatchRow).where(*mine, PatchRow.state != "done")
+        session.execute(rejected.values(state="rejected", reason=reason[:60]))
+        _recount(session, photo)
 
     # --- what owners change -----------------------------------------------------------------------
 
@@ -313,12 +387,10 @@ class Photos(Patches, Works[PhotoRow]):
         """Apply what the owner changes: settings, the lens or its id, whether photos count."""
         # With `calibrate` a photo that was merely stored starts again, to teach its lens. A photo that has a
         # result changes its lens's model at once, any other starts again. To all photos or, where one is
-        # gone, to none; False where the first cannot be excluded or included. Always locked in the same
-        # order: two such changes must not wait for each other.
-        rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
+        # gone, to none; False where the first cannot be excluded or included.
         chosen: LensRow | None = None
         for key in photo_ids:
-            photo = rows[key]
+            photo = find_to_change(session, PhotoRow, key, owner)
             if photo is None:
                 raise UnknownError("photo", key)
             if excluded is not None and not lenses.switch(session, photo, excluded=excluded):
@@ -379,7 +451,7 @@ class Photos(Patches, Works[PhotoRow]):
 
     # --- profiles ---------------------------------------------------------------------------------
 
-    @writes_durably
+    @writes
     def take_in(
         self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
     ) -> bool:
@@ -391,10 +463,8 @@ class Photos(Patches, Works[PhotoRow]):
         for sample in samples:
             groups[sample.photo, sample.settings.with_channel("g")].append(sample)
         lens = find_to_change(session, LensRow, file.given["lens_id"], ANY_OWNER)
-        ended = {"finished_at": now(), "file_gone_at": now()}
-        if lens is None or not self.move(
-            session, file.public_id, ANY_OWNER, ("inspecting",), "stored", ended, epoch=file.epoch
-        ):
+        done: dict[str, Any] = {"epoch": file.epoch, "file_gone_at": now()}
+        if not lens or not self.move(session, file.public_id, ANY_OWNER, ("inspecting",), "stored", **done):
             return False
         discard(session, file.blob_key)
         own = set(session.scalars(select(PhotoRow.public_id).where(PhotoRow.lens_id == lens.id)))
@@ -411,6 +481,42 @@ class Photos(Patches, Works[PhotoRow]):
 _FILED: Final = PhotoRow.file_gone_at.is_(None)  # of photos whose file is kept
 
 
+def _patches_of(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
+    return (
+        select(PatchRow)
+        .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+        .where(PhotoRow.public_id == photo_id, PatchRow.epoch == (epoch or PhotoRow.epoch))
+    )
+
+
+def _selecting(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
+    """Return a photo whose patches may change, locked: on PostgreSQL a cancel waits, and the other way."""
+    photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
+    may = photo is not None and photo.epoch == epoch and photo.state in {"selecting", "estimating"}
+    return photo if may else None
+
+
+def _recount(session: Session, photo: PhotoRow) -> int:
+    """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
+    rows = session.execute(
+        select(PatchRow.state, func.count())
+        .where(PatchRow.photo_id == photo.id, PatchRow.epoch == photo.epoch)
+        .group_by(PatchRow.state)
+    )
+    counts = {row[0]: row[1] for row in rows}
+    rejected = counts.get("rejected", 0)
+    photo.patches_rejected = rejected + photo.windows_rejected
+    photo.patches_done = counts.get("done", 0)
+    photo.patches_total = sum(counts.values()) - rejected
+    return photo.patches_total
+
+
+def _packed(rejected: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return windows as one value that JSON can hold: a list for each column."""
+    columns = {name: [window[name] for window in rejected] for name in _WINDOW}
+    return columns | {name: [round(value, DIGITS) for value in columns[name]] for name in ("r", "phi")}
+
+
 def _keep_announced(session: Session, prefix: str) -> None:
     """Let blobs be garbage no longer; refuse those that a worker deletes already."""
     announced = (GarbageRow.prefix == prefix, GarbageRow.claimed.is_(False))
@@ -421,20 +527,6 @@ def _keep_announced(session: Session, prefix: str) -> None:
 def stored_settings(photo: PhotoRow) -> dict[str, Any]:
     """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
-
-
-def _of_upload(fields: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the fields of an upload, after those of `before`, as `PhotoRow.given` holds them."""
-    known = before or {}
-    fallbacks = {name: value for name, value in fields.items() if name in GIVEN_SETTINGS}
-    merged = {**known, **{name: value for name, value in fields.items() if name not in GIVEN_SETTINGS}}
-    return {**merged, FALLBACKS: {**known.get(FALLBACKS, {}), **fallbacks}} if fallbacks else merged
-
-
-def _setting(photo: PhotoRow, field: str, header: object) -> object:
-    """Return a setting by precedence: corrected by the owner, in the header, given with the file."""
-    ranked = (photo.given.get(field), header, photo.given.get(FALLBACKS, {}).get(field))
-    return next((value for value in ranked if value is not None), None)
 
 
 def _import(

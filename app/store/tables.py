@@ -1,8 +1,7 @@
 """What crosses SQL: the tables of the application database.
 
-Text ids (`public_id`) are for the outside, integer keys stay inside. Times are UTC. The truth
-about photos, samples and versions lies here, not in the job engine: unique keys and conditional
-updates give every effect exactly once, however often a step is repeated.
+Text ids (`public_id`) are for the outside, integer keys stay inside. Times are UTC. The truth lies here, not
+in the job engine: unique keys and conditional updates give every effect once, however often it is tried.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, foreign, mapped_column, rela
 
 from app.schemas import CorrectionState, PhotoState
 
-PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
 PHOTO_WORKED_ON: Final = ("received", *PHOTO_RUNNING)  # costs computing time; one that waits costs space only
 PHOTO_UNFINISHED: Final = (*PHOTO_WORKED_ON, "needs_lens")
@@ -38,8 +36,6 @@ CORRECTION_ACTIVE: Final = ("queued", "running")
 PROFILE_FILE: Final = "lensprofile"
 ENDED_BADLY: Final = ("failed", "cancelled")  # of photos and of corrections
 
-PATCH_STATES: Final = ("pending", "done", "rejected", "failed")
-CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
 EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
 
 
@@ -177,7 +173,7 @@ class PhotoRow(Work, Base):
 
     __tablename__ = "photo"
     __table_args__ = (
-        CheckConstraint(_one_of("state", PHOTO_STATES), name="state"),
+        CheckConstraint(_one_of("state", get_args(PhotoState)), name="state"),
         UniqueConstraint("owner_id", "sha256"),
         Index("ix_photo_state", "state"),
         Index("ix_photo_page", "owner_id", "public_id"),
@@ -192,7 +188,7 @@ class PhotoRow(Work, Base):
     byte_size: Mapped[Big]
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
-    # What the owner said about the photo; goes before what the file says, except `photos.FALLBACKS`
+    # What the owner said about the photo; goes before what the file says
     given: Mapped[dict[str, Any]]
     width: Mapped[int | None]
     height: Mapped[int | None]
@@ -216,7 +212,7 @@ class PhotoRow(Work, Base):
     patches_rejected: Mapped[Count]
     # How many windows were rejected before anything was estimated in them
     windows_rejected: Mapped[Count]
-    # Those windows, as `app.store.patches` writes them: thousands, never queried one by one
+    # Those windows, as `app.store.photos` writes them: thousands, never queried one by one
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
     received_at: Mapped[datetime]
     # Whether the file said where it was taken: none, removed, or unknown; None until it was searched
@@ -237,7 +233,7 @@ class PatchRow(Base):
 
     __tablename__ = "patch"
     __table_args__ = (
-        CheckConstraint(_one_of("state", PATCH_STATES), name="state"),
+        CheckConstraint(_one_of("state", ("pending", "done", "rejected")), name="state"),
         UniqueConstraint("photo_id", "epoch", "idx"),
     )
 
@@ -278,15 +274,10 @@ class SampleRow(Base):
     lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
     version_added: Mapped[int | None]
     channel: Mapped[str]
-    r: Mapped[float]
-    phi: Mapped[float]
-    weight: Mapped[float]
-    predicted_error: Mapped[float | None]
-    size: Mapped[int]
+    entry: Mapped[dict[str, Any]]  # what its photo's row does not know: fields of `lensmodel.model.samples`
     format_version: Mapped[int]
     crc32: Mapped[Big]
     psf: Mapped[bytes] = mapped_column(deferred=True)
-    estimator: Mapped[str]
 
 
 class EventRow(Base):
@@ -319,7 +310,7 @@ class CorrectionRow(Work, Base):
 
     __tablename__ = "correction"
     __table_args__ = (
-        CheckConstraint(_one_of("state", CORRECTION_STATES), name="state"),
+        CheckConstraint(_one_of("state", get_args(CorrectionState)), name="state"),
         _unique(
             "uq_correction_params",
             *("photo_id", "lens_public_id", "lens_version", "params_hash"),
@@ -367,10 +358,6 @@ class WorkerRow(Base):
     __tablename__ = "worker"
 
     id: Mapped[str] = mapped_column(primary_key=True)
-    host: Mapped[str]
-    pid: Mapped[int]
-    pid_started: Mapped[float]  # when the process began: a pid alone may belong to another process by now
-    started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
     # Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces
     confined: Mapped[str]

@@ -21,11 +21,10 @@ from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
-from app.sandbox.outcome import Outcome
+from app.sandbox.child import Outcome
 from app.sandbox.runner import Budget
 from app.store import LensName, Store, database
-from app.store.database import Database, new_id
-from app.store.migrate import upgrade
+from app.store.database import Database, new_id, upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import PROFILE_FILE, CorrectionRow, PhotoRow
 from lensmodel.core.errors import LensModelError
@@ -87,7 +86,6 @@ class Steps:
             focus_m=None,
             pixel_pitch_um=6.0,
         )
-        self.store.photos.assign_lens(photo.public_id)
 
     def plan(self, photo: PhotoRow, count: int = 2) -> None:
         self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
@@ -206,7 +204,7 @@ def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
         shutil.copy(empty_database, settings.data_dir / "app.db")
     opened = Store(settings)
     # before rows that name files which are not there
-    Storage(settings.storage, create=False).settle(opened.photos.newest_file)
+    Storage(settings.storage, create=False).settle(opened.photos.have_files)
     yield opened
     opened.close()
 
@@ -243,8 +241,8 @@ class TasksHere:
 def reading(settings: Settings, store: Store) -> Iterator[None]:
     """Read the profiles that are sent meanwhile, as a worker does."""
     from app.jobs.context import JobContext  # noqa: PLC0415 - as above
-    from app.jobs.photo_work import work_on  # noqa: PLC0415 - as above
-    from app.jobs.running import durable, end_job  # noqa: PLC0415 - as above
+    from app.jobs.queue import durable, end_job  # noqa: PLC0415 - as above
+    from app.jobs.work import work_on  # noqa: PLC0415 - as above
 
     sandbox: Any = TasksHere(settings.data_dir / "scratch")
     context = JobContext(settings, store, Storage(settings.storage, create=False), sandbox)

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 import tifffile
 from deadline import Deadline, stretched
-from in_process import lensmodel
 from PIL import Image
 from running import (
     BRIEF,
@@ -256,13 +255,6 @@ def test_a_killed_api_ends_the_service_which_starts_again(service: Service, firs
     killed(service, "pid")
 
     assert lens_of(service, first)["serial"] == "L-42"
-
-
-def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
-    second = lensmodel("serve", "--port", "0", "--data", str(service.data), cwd=service.data)
-
-    assert second.returncode == 2
-    assert "another service already works on" in second.stderr
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
         samples = lines(archive, "samples.jsonl")
         assert len(samples) == 6
         kernel = np.frombuffer(base64.b64decode(samples[0]["psf"]), dtype="<f4")
-        assert kernel.size == samples[0]["size"] ** 2
+        assert kernel.size == samples[0]["entry"]["size"] ** 2
         assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
         assert len(lines(archive, "patches.jsonl")) == 2
         assert [row["kind"] for row in lines(archive, "calibrations.jsonl")] == ["photo_added"]

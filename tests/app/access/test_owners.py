@@ -20,7 +20,7 @@ from app.pages import pictures
 from app.pages import routes as page_routes
 from app.runtime.settings import Settings
 from app.store import Store, accounts
-from app.store.migrate import upgrade
+from app.store.database import upgrade
 from app.store.owners import ANY_OWNER, now
 from app.store.tables import KeyRow, SessionRow
 

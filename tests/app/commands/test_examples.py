@@ -34,8 +34,7 @@ from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.accounts import Accounts
-from app.store.database import Database
-from app.store.migrate import upgrade
+from app.store.database import Database, upgrade
 from app.store.tables import KeyRow
 from lab import targets
 from lab.lens_test import MARGIN, squares_chart

@@ -186,7 +186,7 @@ def main() -> int:
             while any(store.jobs.load()[0].values()) and time.monotonic() < end:
                 time.sleep(1.0)
             unsettled = sum(store.jobs.load()[0].values())
-            findings = examine(settings, store, Storage(settings.storage)).findings
+            findings = examine(settings, store, Storage(settings.storage))
             store.close()
     print(json.dumps({"answers": dict(load.answers), "unfinished": unsettled, "faults": load.faults[:5]}))
     print("\n".join(f"{finding.check}: {finding.subject}: {finding.says}" for finding in findings))

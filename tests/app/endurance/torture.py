@@ -47,8 +47,7 @@ from app.errors import BusyError  # noqa: E402
 from app.runtime.doctor import examine  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
 from app.store import Store  # noqa: E402
-from app.store.database import new_id  # noqa: E402
-from app.store.migrate import upgrade  # noqa: E402
+from app.store.database import new_id, upgrade  # noqa: E402
 from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow  # noqa: E402
 
 OWNERS = ("one", "two")
@@ -294,7 +293,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
 
 
 def check(settings: Settings, store: Store, storage: Storage, plan: Plan) -> None:
-    findings = examine(settings, store, storage, deep=False).findings
+    findings = examine(settings, store, storage, deep=False)
     assert not [finding for finding in findings if finding.check != "work"], findings
     with store.database.reading() as session:
         samples = session.scalar(select(func.count()).select_from(SampleRow))

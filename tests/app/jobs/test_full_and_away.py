@@ -14,16 +14,14 @@ from typing import Any
 import pytest
 import small_disk as disks
 from servers import postgres
-from sqlalchemy import delete
 from starlette.testclient import TestClient
 
 from app.blobs.storage import MARK
 from app.main import create_app
 from app.routes import health
 from app.runtime.settings import Settings
-from app.store import Store, database
-from app.store.migrate import upgrade
-from app.store.tables import PhotoRow
+from app.store import Store
+from app.store.database import upgrade
 
 TIFF = b"II*\x00" + bytes(9000)
 
@@ -93,28 +91,6 @@ def test_an_upload_without_a_length_that_fills_the_disk_is_refused_and_leaves_no
 
 
 # --- the same bytes sent and deleted at once --------------------------------------------------
-
-
-@pytest.mark.tools
-def test_an_upload_whose_twin_is_deleted_meanwhile_is_stored(
-    store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    twin = steps.receive()
-    really = database.insert_new
-    tries = []
-
-    def insert(session: Any, table: Any, rows: Any) -> int:
-        made: int = really(session, table, rows)
-        tries.append(made)
-        if len(tries) == 1:  # deleted between our insert, which it blocked, and our look for it
-            twin_of = PhotoRow.public_id == twin.public_id
-            session.execute(delete(PhotoRow).where(twin_of))
-        return made
-
-    monkeypatch.setattr(database, "insert_new", insert)
-
-    assert steps.receive_again(twin).public_id != twin.public_id
-    assert tries[:2] == [0, 1]
 
 
 @pytest.mark.tools

@@ -62,7 +62,6 @@ def taken(steps: Steps, store: Store) -> Callable[..., str]:
             focus_m=None,
             pixel_pitch_um=pitch_um,
         )
-        store.photos.assign_lens(photo.public_id)
         store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
         places = [(0.1 + 0.15 * k, 1.1 * k - 3.0) for k in range(6)]
         corner = {"row": 0, "col": 0, "size": 64, "score": 1.0}

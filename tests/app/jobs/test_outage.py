@@ -25,14 +25,13 @@ from starlette.testclient import TestClient
 from uploads import receive
 
 from app.blobs.storage import Storage
-from app.jobs.running import durable, end_job
+from app.jobs.queue import durable, end_job, insist
 from app.jobs.worker import Worker
-from app.runtime.outage import Patience, is_outage
+from app.runtime.outage import is_outage
 from app.runtime.settings import Settings
 from app.store import LensName, Store
-from app.store.database import new_id
+from app.store.database import new_id, upgrade
 from app.store.jobs import Job
-from app.store.migrate import upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.cli.ending import InterruptedByUser
@@ -81,25 +80,34 @@ def test_errors_of_ours_are_no_outage(error: Exception) -> None:
     assert not is_outage(error)
 
 
-def test_pauses_grow_from_a_second_to_a_minute_until_hours_have_passed() -> None:
-    now = 0.0
-    patience = Patience(3600.0, clock=lambda: now, rng=random.Random(3))
-    pauses = []
-    while (pause := patience.pause_after(ConnectionResetError())) is not None:
-        pauses.append(pause)
-        now += pause
+def pauses_of(monkeypatch: pytest.MonkeyPatch, error: Exception, outage_s: float) -> list[float]:
+    """Return how long a job that always fails waits before each retry."""
+    pauses: list[float] = []
+    monkeypatch.setattr("app.jobs.queue.monotonic", lambda: sum(pauses))
+    monkeypatch.setattr("app.jobs.queue.sleep", pauses.append)
+    monkeypatch.setattr("app.jobs.queue.uniform", random.Random(3).uniform)
+    with pytest.raises(type(error)):
+        insist(Away(error, times=10**6), outage_s)
+    return pauses
+
+
+def test_pauses_grow_from_a_second_to_a_minute_until_hours_have_passed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses = pauses_of(monkeypatch, ConnectionResetError(), 3600.0)
 
     assert 1.0 <= min(pauses) < 2.0
     assert 45.0 < max(pauses) <= 60.0
     assert pauses[0] <= 2.0
     assert len({round(pause, 3) for pause in pauses}) == len(pauses)  # never in step with others
-    assert 3600.0 < now <= 3660.0
+    assert 3600.0 < sum(pauses) <= 3660.0
 
 
-def test_what_nobody_foresaw_is_tried_three_times() -> None:
-    patience = Patience(3600.0)
+def test_what_nobody_foresaw_is_tried_three_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = pauses_of(monkeypatch, KeyError(), 3600.0)
 
-    assert [patience.pause_after(KeyError()) for _ in range(3)] == [1.0, 2.0, None]
+    assert 1.0 <= first <= 2.0
+    assert 1.0 <= second <= 4.0
 
 
 class Away:
@@ -118,7 +126,7 @@ class Away:
 
 @pytest.fixture
 def worker(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Worker:
-    monkeypatch.setattr("app.jobs.running.sleep", lambda _: None)
+    monkeypatch.setattr("app.jobs.queue.sleep", lambda _: None)
     return Worker(settings)
 
 
@@ -135,7 +143,7 @@ def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> N
 def test_a_job_that_waited_in_vain_ends_as_such(
     worker: Worker, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.jobs.running.OUTAGE_S", 0.0)
+    monkeypatch.setattr("app.jobs.queue.OUTAGE_S", 0.0)
     photo = steps.receive()
     steps.inspect(photo)
 

@@ -14,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from dbos import DBOS
 from deadline import Deadline, stretched
 
 from app.jobs.queue import MAX_DEATHS, DbosEngine, Handler
@@ -53,7 +54,7 @@ def engine(url: str, ran: Ran) -> Iterator[DbosEngine]:
     made = DbosEngine(url, "this-process", slots=2)
     made.start(ran.handlers)
     yield made
-    made.stop()
+    DBOS.destroy(destroy_registry=True)
 
 
 def until(condition: Callable[[], object], within_s: float = 20.0) -> None:
@@ -90,7 +91,7 @@ def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
         engine.enqueue(Job("photo", ("p",)))
         until(lambda: engine.status(Job("photo", ("p",))) == "done")
     finally:
-        engine.stop()
+        DBOS.destroy(destroy_registry=True)
 
     assert calls == ["p"]
 
@@ -105,7 +106,7 @@ def test_photos_run_side_by_side_one_more_than_there_are_slots(url: str) -> None
             engine.enqueue(job)
         until(lambda: all(engine.status(job) == "done" for job in jobs))
     finally:
-        engine.stop()
+        DBOS.destroy(destroy_registry=True)
 
     assert not together.broken
 
@@ -148,18 +149,17 @@ def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: 
     try:
         time.sleep(0.5)
         held_before = (engine.status(job), list(ran.jobs))
-        engine.take_over(DEAD)
+        engine.take_over(set)
         until(lambda: ran.jobs == [("correction", "p", "1")])
         until(lambda: engine.status(job) == "done")
     finally:
-        engine.stop()
+        DBOS.destroy(destroy_registry=True)
 
     assert held_before == ("waiting", [])
 
 
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
-    previous = DEAD
     die_in_a_job(url)
     for number in range(MAX_DEATHS["correction"] + 1):
         script = textwrap.dedent(
@@ -168,12 +168,11 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
             from app.jobs.queue import DbosEngine
             engine = DbosEngine({url!r}, "worker-{number}", slots=1)
             engine.start({{"correction": lambda *arguments: os.kill(os.getpid(), 9)}})
-            engine.take_over({previous!r})
+            engine.take_over(set)
             time.sleep(3)
             os._exit(0)
             """
         )
-        previous = f"worker-{number}"
         if subprocess.run([sys.executable, "-c", script], check=False).returncode == 0:
             break
     engine = DbosEngine(url, "this-process", slots=2)
@@ -181,7 +180,7 @@ def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
     try:
         status = engine.status(Job("correction", ("p", 1)))
     finally:
-        engine.stop()
+        DBOS.destroy(destroy_registry=True)
 
     assert number == MAX_DEATHS["correction"]
     assert status == "lost"

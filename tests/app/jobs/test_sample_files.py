@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from app.jobs import sample_files, tasks
+from app.jobs.answers import ENCODED, KERNELS, SAMPLES
 from app.jobs.sample_files import DAMAGED, MAX_SIDE, read_samples, returned_samples, write_samples
-from app.jobs.task_files import ENCODED, KERNELS, SAMPLES
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings

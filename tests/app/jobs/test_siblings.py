@@ -13,7 +13,7 @@ from uploads import receive
 
 from app.blobs.storage import Storage
 from app.jobs.context import JobContext
-from app.jobs.inspection import inspect
+from app.jobs.work import inspect
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.owners import ANY_OWNER
@@ -48,13 +48,13 @@ def test_a_photo_is_developed_with_others_of_its_owner_and_body(
         store.photos.expect(f"photos/{path.stem}/", within=timedelta(minutes=1))
         row = receive(store, path.stem, owner=owner, kind="dng", sha256=path.stem).photo
         context.storage.put(row.blob_key, path.read_bytes())
-        inspect(context, row, lambda: True)
+        inspect(context, row)
         return store.photos.get(row.public_id, ANY_OWNER)
 
     first, *_ = [stored(path) for path in (*paths, other_body)]
     stored(foreign, "somebody")
 
-    developed = sampling.load_developed(context.developed(first, lambda: True))
+    developed = sampling.load_developed(context.developed(first, wanted=lambda: True))
 
     alone, together = photo.develop(paths[0]), photo.develop(paths[0], siblings=paths[:0:-1])
     assert np.array_equal(developed.planes, together.planes)

@@ -26,18 +26,13 @@ from sqlalchemy import update
 from app.blobs.storage import Storage
 from app.http import views
 from app.jobs import tasks
-from app.jobs.answers import JobFailedError, NotWantedError
+from app.jobs.answers import KERNELS, SAMPLES, SHOWN, THUMBNAIL, JobFailedError, NotWantedError
 from app.jobs.context import JobContext
-from app.jobs.correction_work import correct, measure
-from app.jobs.inspection import remove_location
-from app.jobs.photo_work import work_on
-from app.jobs.queue import Handler
-from app.jobs.running import durable, end_job
+from app.jobs.queue import Handler, durable, end_job
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import KERNELS, SAMPLES, SHOWN, THUMBNAIL
+from app.jobs.work import correct, measure, remove_location, work_on
 from app.runtime.settings import Settings
-from app.sandbox.child import ProgressHook
-from app.sandbox.outcome import MAX_RESULT, Outcome, TaskLimits
+from app.sandbox.child import MAX_RESULT, Outcome, ProgressHook, TaskLimits
 from app.sandbox.runner import Budget
 from app.store import Store
 from app.store.owners import ANY_OWNER
@@ -165,7 +160,7 @@ def context(
     settings: Settings, store: Store, sandbox: Scripted, monkeypatch: pytest.MonkeyPatch
 ) -> JobContext:
     monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
-    monkeypatch.setattr("app.jobs.photo_work.WAIT_S", 0.001)
+    monkeypatch.setattr("app.jobs.work.WAIT_S", 0.001)
     return JobContext(settings, store, Storage(settings.storage), sandbox)  # type: ignore[arg-type]  # scripted
 
 
@@ -280,7 +275,22 @@ def test_a_cell_whose_child_answers_nonsense_fails(
     work(photo.public_id, 1)
 
     patches = context.store.photos.patches(photo.public_id, 1)
-    assert {(row.state, row.reason) for row in patches} == {("failed", "internal_error")}
+    assert {(row.state, row.reason) for row in patches} == {("rejected", "internal_error")}
+
+
+def test_a_cell_in_which_something_unforeseen_happens_is_rejected_and_the_rest_counts(
+    work: Handler, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any
+) -> None:
+    def stumble(arguments: dict[str, Any], folder: Path) -> Outcome:
+        raise ZeroDivisionError("of the worker, not of the child")
+
+    sandbox.answers["estimate"] = [stumble, estimate]
+    work(photo.public_id, 1)
+
+    rows = context.store.photos.patches(photo.public_id, 1)
+    assert {(row.state, row.reason) for row in rows} == {("done", None), ("rejected", "internal_error")}
+    counted = steps.fresh(photo)
+    assert (counted.state, counted.patches_done, counted.patches_rejected) == ("counted", 1, 1)
 
 
 def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estimate(

@@ -56,7 +56,9 @@ def send(settings: Settings, store: Store, steps: Any) -> Callable[[int], list[P
 def test_a_worker_in_doubt_ends_what_broke_and_nothing_else(
     settings: Settings, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    engine = SimpleNamespace(holders=set, status=lambda _: "done")  # all jobs ended, whatever they did
+    engine = SimpleNamespace(
+        take_over=lambda _: None, status=lambda _: "done"
+    )  # all jobs ended, whatever they did
     lens_id = steps.lens_id(steps.counted())
     broken, waiting = steps.receive(), steps.receive()
     steps.inspect(waiting, serial=None)

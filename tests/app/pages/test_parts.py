@@ -16,13 +16,12 @@ from PIL import Image
 from sqlalchemy import event
 from starlette.testclient import TestClient
 
-from app.blobs import small_pictures
 from app.blobs.storage import Storage
 from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
-from app.jobs.inspection import body_key
+from app.jobs.answers import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import LAYER_FILES, SHOWN, SIDES, THUMBNAIL
+from app.jobs.work import body_key
 from app.main import create_app
 from app.pages.routes import templates, unused_name
 from app.pages.shown import cell_px, grouped
@@ -295,14 +294,14 @@ def test_a_jpeg_that_would_gain_nothing_is_left_soon(tmp_path: Path, ending: str
     wish = {
         "developed": str(developed),
         "photo": "p",
-        "mode": "default",
         "lateral": None,
-        "method": "fast",
         "settings": {"aperture": None, "focal_mm": None, "focus_m": None},
-        "strength": 1.0,
+        "params": {
+            "method": "fast",
+            "strength": 1.0,
+            "output": {"format": "png8", "color_space": "srgb", "quality": 90},
+        },
         "bounds": {},
-        "output": {"format": "png8", "color_space": "srgb", "quality": 90},
-        "roi": None,
         "workers": 1,
         "description": "",
     }
@@ -351,7 +350,7 @@ def test_a_photo_has_a_thumbnail_before_it_is_developed(
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
-    picture = small_pictures.thumbnail(tmp_path / "p.jpg", "jpeg", 6)
+    picture = tasks.thumbnail(tmp_path / "p.jpg", "jpeg", 6)
     Storage(settings.storage).put(f"{photo.folder}{THUMBNAIL}", picture)
 
     assert opened(client, address).size == (258, 480)
@@ -367,7 +366,7 @@ def test_every_kind_of_photo_has_a_thumbnail(kind: str, tmp_path: Path) -> None:
     else:
         write_bayer_dng(path, np.full((64, 96), 3000, np.uint16), black=512, white=15512)
 
-    with Image.open(io.BytesIO(small_pictures.thumbnail(path, kind, 1))) as picture:
+    with Image.open(io.BytesIO(tasks.thumbnail(path, kind, 1))) as picture:
         assert picture.width > picture.height > 16
 
 

@@ -244,7 +244,7 @@ def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", bytes(1 << 20))
-    monkeypatch.setattr("app.jobs.photo_work.MAX_UNPACKED", (1 << 20) - 1)
+    monkeypatch.setattr("app.jobs.work.MAX_UNPACKED", (1 << 20) - 1)
     read: list[str] = []
     monkeypatch.setattr("app.jobs.tasks.read_profile", lambda *_: read.append("read"))
 

@@ -13,10 +13,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.jobs import tasks
-from app.jobs.answers import JobFailedError
-from app.jobs.photo_work import _measured
+from app.jobs.answers import SAMPLES, JobFailedError
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import SAMPLES
+from app.jobs.work import _measured
 from app.store import Store
 from app.store.owners import ANY_OWNER
 from lensmodel.core.geometry import Frame

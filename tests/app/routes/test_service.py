@@ -62,7 +62,7 @@ def ready_needs_all(client: TestClient, store: Store) -> None:
     assert before.json()["checks"]["schema"] == before.json()["checks"]["storage"] == "ok"
     assert "lensmodel worker" in before.json()["checks"]["worker"]
 
-    store.jobs.register("w", host="h", pid=1, pid_started=0.0)
+    store.jobs.register("w")
 
     after = client.get("/readyz")
     assert (after.status_code, after.json()["status"]) == (200, "ready")
@@ -83,7 +83,7 @@ def test_formats_limits_and_version_are_told(client: TestClient, settings: Setti
     formats = client.get("/v1/formats").json()
     assert {"fast", "standard", "paper"} <= set(formats["methods"])
     assert "default" in formats["estimators"]
-    assert client.get("/v1/limits").json()["max_upload_bytes"] == settings.max_upload_bytes
+    assert client.get("/v1/limits").json()["max_upload_bytes"] == settings.max_upload_mb << 20
     assert client.get("/v1/version").json()["api"] == "v1"
 
 

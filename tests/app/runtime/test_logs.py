@@ -14,7 +14,7 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.jobs.running import durable
+from app.jobs.queue import durable
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
@@ -25,7 +25,7 @@ def lines() -> Iterator[io.StringIO]:
     """Let every record of the service be written as JSON into a text."""
     written = io.StringIO()
     handler = logging.StreamHandler(written)
-    handler.setFormatter(logs.OneObject("test"))
+    handler.setFormatter(logs.one_object("test"))
     root, log = logging.getLogger(), logging.getLogger("app")
     of_requests = logging.getLogger("app.access")  # others may have begun the log of a service before
     before = log.level, of_requests.level

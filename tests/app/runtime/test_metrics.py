@@ -10,7 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
-from app.jobs.running import durable
+from app.jobs.queue import durable
 from app.runtime import metrics
 from app.runtime.outage import OutageError
 
@@ -67,7 +67,7 @@ def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
 
 
 def test_a_worker_tells_its_own_where_it_has_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.jobs.running.sleep", lambda _: None)
+    monkeypatch.setattr("app.jobs.queue.sleep", lambda _: None)
     failures = iter([OutageError(), *[KeyError()] * 3])
 
     def fail(*_: object) -> None:

@@ -12,10 +12,10 @@ from servers import Moto, Postgres, moto, postgres
 from torture import Plan, in_environment, torture
 
 from app.blobs.storage import Storage
+from app.runtime import metrics
 from app.runtime.doctor import examine
-from app.runtime.metrics import Tables
 from app.runtime.settings import Settings
-from app.store import Store, migrate
+from app.store import Store, database
 
 pytestmark = pytest.mark.tools
 
@@ -39,7 +39,7 @@ def far(servers: tuple[Postgres, Moto], tmp_path: Path) -> Iterator[tuple[Settin
         min_free_mb=0,
     )
     with closing(Store(settings)) as store:
-        migrate.upgrade(store.database)
+        database.upgrade(store.database)
         yield settings, store, Storage(settings.storage)
 
 
@@ -50,9 +50,9 @@ def test_an_installation_works_on_servers(steps: Any, far: tuple[Settings, Store
         blobs.put(photo.blob_key, b"m" * photo.byte_size)
 
     assert there.lenses.samples_of(busy.lens_id(busy.counted()))[0].version == 3
-    found = {finding.check for finding in examine(away, there, blobs, deep=True).findings}
-    assert found == {"blobs", "photos", "work"}  # of one photo there is no file, the others are made up
-    assert next(iter(Tables(there, 20.0).collect())).samples
+    found = {finding.check for finding in examine(away, there, blobs, deep=True)}
+    assert found == {"blobs", "files", "work"}  # of one photo there is no file, the others are made up
+    assert b"lensmodel_queue_jobs{" in metrics.of_service(there, 20.0)
 
 
 @pytest.mark.slow

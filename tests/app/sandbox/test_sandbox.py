@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import signal
 import site
 import socket
@@ -15,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
@@ -26,8 +28,7 @@ from deadline import Deadline, stretched
 from app.runtime import logs, supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine, runner
-from app.sandbox.child import NICENESS
-from app.sandbox.outcome import REPORT, Outcome, TaskLimits, outcome_of
+from app.sandbox.child import REPORT, Outcome, TaskLimits, outcome_of
 from app.sandbox.runner import MAX_SAID, Budget, Sandbox
 from lensmodel.cli.ending import UsageError
 
@@ -107,7 +108,7 @@ def test_a_task_sees_nothing_of_the_services_environment(run: Run, monkeypatch: 
     assert seen["TMPDIR"] == seen["HOME"] == outcome.value["folder"]
 
 
-@pytest.mark.parametrize("niceness", [NICENESS, 0])
+@pytest.mark.parametrize("niceness", [10, 0])
 def test_a_task_gives_way_to_requests_as_far_as_it_is_told(run: Run, sandbox: Sandbox, niceness: int) -> None:
     sandbox._niceness = niceness
 
@@ -134,8 +135,8 @@ ENDINGS: dict[str, tuple[str, dict[str, Any], dict[str, Any], str, str, str]] = 
     "wall time": ("spin", {}, {"wall_s": 0.6}, "time_limit", "time_limit", "0.6 s"),
     "processor time": ("spin", {}, {"cpu_s": 1}, "time_limit", "time_limit", "1 s of processor time"),
     "crash": ("crash", {}, {}, "crashed", "crashed", "SIGSEGV"),
-    "killed by the machine": ("die", {}, {}, "outage", "outage", "SIGKILL"),
-    "full disk": ("fill_the_disk", {"with_files": True}, {}, "outage", "outage", "no room"),
+    "killed by itself": ("die", {}, {}, "crashed", "crashed", "SIGKILL"),
+    "a full disk that is not": ("fill_the_disk", {"with_files": True}, {}, "crashed", "crashed", "status 1"),
     "no room for words": ("fill_the_disk", {"with_files": False}, {}, "ok", "", ""),
     "unforeseen": ("blunder", {}, {}, "crashed", "internal_error", "KeyError"),
     "many bytes": (
@@ -189,7 +190,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         import sys
         from pathlib import Path
         sys.path.insert(0, {str(OWN)!r})
-        from app.sandbox.outcome import TaskLimits
+        from app.sandbox.child import TaskLimits
         from app.sandbox import runner
         if __name__ == "__main__":
             folder = Path({str(pid_file.parent)!r})
@@ -236,7 +237,7 @@ from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine
 from app.sandbox.account import find
-from app.sandbox.outcome import TaskLimits
+from app.sandbox.child import TaskLimits
 from app.sandbox import runner
 if __name__ == "__main__":
     data = Path({data!r})
@@ -415,6 +416,19 @@ def test_a_database_can_hold_what_a_report_says(tmp_path: Path) -> None:
     assert outcome.code == outcome.detail == "half ? of a character and an end"
 
 
+@pytest.mark.parametrize(("full", "out_of_memory"), [(True, False), (False, True), (False, False)])
+def test_an_outage_is_what_the_machine_lacks_and_not_what_a_child_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: bool, out_of_memory: bool
+) -> None:
+    disk = shutil.disk_usage(tmp_path)._replace(free=0 if full else 1 << 30)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk)
+    kept = partial(outcome_of, folder=tmp_path, limits=LIMITS, out_of_memory=out_of_memory)
+
+    assert kept(-signal.SIGKILL).ending == ("outage" if full or out_of_memory else "crashed")
+    for status in (1, os.EX_TEMPFAIL, -signal.SIGSEGV, 0):
+        assert kept(status).ending == ("outage" if full else "crashed")
+
+
 def test_a_path_beneath_a_file_leaves_all_measures_in_force(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -454,7 +468,7 @@ def test_a_task_that_needs_all_memory_runs_alone_and_is_not_starved() -> None:
     with budget.share(60, lambda: True):
         large = threading.Thread(target=_enter, args=(budget, 1000, "large", order))
         large.start()
-        while not budget._queue:
+        while not budget._first.locked():
             time.sleep(0.001)
         small = threading.Thread(target=_enter, args=(budget, 10, "small", order))
         small.start()

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +20,9 @@ from sqlalchemy.exc import DBAPIError
 from uploads import receive
 
 from app.errors import BusyError, UnknownError
-from app.runtime.settings import Settings, table
-from app.store import LensName, Store, database
-from app.store.database import Database
-from app.store.migrate import current, head, upgrade
+from app.runtime.settings import PREFIX, Settings, described
+from app.store import LensName, Store
+from app.store.database import Database, current, head, upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow
 from lensmodel.core.errors import InvalidInputError
@@ -58,10 +61,10 @@ def test_patches_that_fail_stay_so_and_those_that_are_done_do_not_fail(store: St
     steps.plan(photo, count=4)
     steps.estimate(photo, (0, 2))
 
-    store.photos.fail_patches(photo.public_id, 1, "time_limit", [1, 2, 3])
+    store.photos.reject_patches(photo.public_id, 1, "time_limit", [1, 2, 3])
 
     states = [row.state for row in store.photos.patches(photo.public_id)]
-    assert states == ["done", "failed", "done", "failed"]
+    assert states == ["done", "rejected", "done", "rejected"]
 
 
 def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
@@ -227,7 +230,10 @@ def test_without_a_serial_no_lens_is_guessed(store: Store, steps: Steps) -> None
     steps.inspect(photo, serial=None)
 
     assert steps.fresh(photo).lens_id is None
-    assert store.photos.assign_lens(photo.public_id, single_copy=True) is not None
+    nameless = LensName("Canon", "EF24mm f/1.4L", None, "none")
+    again = store.photos.record_inspection(photo.public_id, nameless, single_copy=True, aperture=1.4)
+    assert again is not None
+    assert again.lens is not None
 
 
 def test_the_lens_that_the_owner_names_goes_before_that_of_the_file(store: Store, steps: Steps) -> None:
@@ -244,7 +250,7 @@ def test_a_stored_photo_makes_no_lens_but_joins_one(store: Store, steps: Steps) 
     assert steps.fresh(photo).lens_id is None
 
     steps.counted()
-    store.photos.assign_lens(photo.public_id)
+    steps.inspect(photo)
 
     assert steps.fresh(photo).lens_id is not None
 
@@ -293,7 +299,7 @@ def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, 
     assert {stored.photo for stored in store.lenses.samples_of(lens)[1]} == {other.public_id}
     assert store.jobs.garbage() == []  # a worker may still write: once more in a while
     late = datetime.now(UTC) + timedelta(hours=1)
-    models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
+    models = {f"models/{lens}/{version}-0/report.json" for version in (1, 2)}
     assert set(store.jobs.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
     found = store.lenses.get(lens, ANY_OWNER)
     assert found is not None
@@ -371,7 +377,7 @@ def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> Non
 
 
 def test_a_worker_declared_dead_cannot_beat_again(store: Store, steps: Steps) -> None:
-    store.jobs.register("w", host="h", pid=1, pid_started=0.0)
+    store.jobs.register("w")
     assert store.jobs.beat("w")
     assert [row.id for row in store.jobs.live(10)] == ["w"]
 
@@ -420,9 +426,8 @@ def test_the_steps_of_the_schema_lead_to_the_tables(tmp_path: Path) -> None:
 
     database = Database(f"sqlite:///{tmp_path}/app.db")
     assert current(database) is None
-    assert upgrade(database)
+    upgrade(database)
     assert current(database) == head()
-    assert not upgrade(database)
     with database.writer.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
     database.close()
@@ -453,8 +458,13 @@ def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
 
 def test_the_page_of_the_service_lists_all_settings() -> None:
     page = Path(__file__).parents[3] / "docs" / "service.md"
+    rows = []
+    for name, said in described().items():
+        field = Settings.model_fields[name]
+        default = "cores of the machine" if field.default_factory else str(field.default).lower() or "none"
+        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {said} |")
 
-    assert table() in page.read_text(encoding="utf-8")
+    assert "\n".join(["| setting | default | |", "|---|---|---|", *rows]) in page.read_text(encoding="utf-8")
 
 
 def test_a_database_server_needs_shared_storage() -> None:
@@ -472,7 +482,7 @@ def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
     with store.database.writer.begin() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
 
-    with pytest.raises(InvalidInputError, match="newer program, schema 9999"):
+    with pytest.raises(InvalidInputError, match=r"newer program .*9999"):
         upgrade(store.database)
 
 
@@ -514,39 +524,49 @@ def samples_are_of_their_version(store: Store, steps: Steps) -> None:
     assert during[0].public_id not in {sample.photo for sample in samples}
 
 
-def blocked_once(monkeypatch: pytest.MonkeyPatch, module: Any) -> None:
-    """Let the first insert meet a row that is gone by the time it is looked for."""
-    really, calls = module.insert_new, []
+def at_once(store: Store, first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
+    """Begin a second change on a server once the first has locked something; return what both return."""
+    begun: list[Future[Any]] = []
 
-    def insert(session: Any, table: Any, rows: Any) -> int:
-        calls.append(table)
-        return 0 if len(calls) == 1 else int(really(session, table, rows))
+    def begin(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
+        if " FOR " in statement and not begun:
+            begun.append(others.submit(second))
+            time.sleep(0.5)  # until it waits, or has locked what the first wants next
 
-    monkeypatch.setattr(module, "insert_new", insert)
+    with ThreadPoolExecutor() as others:
+        event.listen(store.database.writer, "after_cursor_execute", begin)
+        try:
+            return first(), begun[0].result()
+        finally:
+            event.remove(store.database.writer, "after_cursor_execute", begin)
 
 
-def test_a_correction_whose_twin_ends_meanwhile_is_created(
-    store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.tools
+def test_two_changes_at_once_wait_for_each_other_on_a_server_and_do_not_deadlock(
+    settings: Settings, steps: Steps
 ) -> None:
-    photo = steps.counted()
-    lens = photo.lens
-    assert lens is not None
-    blocked_once(monkeypatch, database)
+    with (
+        postgres() as server,
+        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
+    ):
+        upgrade(on.database)
+        there = type(steps)(on)
+        photo, other = there.counted(), there.counted()
+        lens, ids = there.lens_id(photo), [photo.public_id, other.public_id]
 
-    row, created = store.jobs.correct(photo, lens, 1, {"method": "fast"})
+        changed = partial(on.photos.change, ids, OWNER, {"aperture": 2.0})
+        backwards = partial(on.photos.change, ids[::-1], OWNER, {"aperture": 2.8})
+        assert at_once(on, changed, backwards) == (True, True)
+        merged = partial(on.lenses.merge, lens, there.named(LensName("Canon", "EF24mm", "7")), OWNER)
+        assert at_once(on, partial(on.photos.change, ids, OWNER, {"aperture": 4.0}), merged) == (True, True)
+        lens = there.lens_id(photo)
+        gone = partial(on.lenses.delete, lens, OWNER)
+        assert at_once(on, partial(on.photos.change, ids, OWNER, {"aperture": 8.0}), gone) == (True, True)
 
-    assert (row.state, created) == ("queued", True)
-
-
-def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
-    store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    photo = steps.counted()
-    blocked_once(monkeypatch, database)
-
-    assert store.photos.change([photo.public_id], OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
-
-    assert steps.lens_id(photo) != steps.lens_id(steps.counted())
+        deleted = partial(on.photos.delete, photo.public_id, OWNER)
+        folder, again = at_once(on, deleted, partial(there.receive_again, photo))
+        assert folder == photo.folder
+        assert again.public_id != photo.public_id
 
 
 def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:

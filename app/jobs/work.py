@@ -1,11 +1,12 @@
-"""The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
+"""The jobs: learning from photos, reading profiles, correcting photos, measuring models of lenses.
 
-Each step reads the tables first and does only what is not done yet. So the job may be started again at any
-time, by any worker, and still every effect happens once.
+Each step of a photo reads the tables first and does only what is not done yet. So the job may be started
+again at any time, by any worker, and still every effect happens once.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections import Counter, defaultdict
@@ -14,22 +15,36 @@ from concurrent.futures import wait
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePath
 from typing import Any, Final
 
 from app.errors import OTHER_LENS_REMEDY
-from app.jobs import inspection
-from app.jobs.answers import JobFailedError, NotWantedError
-from app.jobs.context import MAX_UNPACKED, JobContext
+from app.jobs.answers import (
+    CLEANED,
+    LAYER_FILES,
+    REPORT,
+    SIDES,
+    SUFFIX,
+    THUMBNAIL,
+    JobFailedError,
+    NotWantedError,
+)
+from app.jobs.context import MAX_UNPACKED, JobContext, Wanted
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.presets import configured_preset
-from app.store.owners import ANY_OWNER, now
+from app.runtime.outage import is_outage, missable
+from app.store import LensName
+from app.store.lenses import LensState, report_key
+from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
-from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, PatchRow, PhotoRow
+from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, CorrectionRow, LensRow, PatchRow, PhotoRow
 from lensmodel.core import codec
-from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
+from lensmodel.core.errors import InvalidInputError, NoSamplesError, NoUsablePatchesError
+from lensmodel.core.names import full_name, name_key, serial_key
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
+from lensmodel.correction import Bounds
 from lensmodel.patches import Patch
 from lensmodel.workflow import sampling
 from lensmodel.workflow.identity import Identity, difference
@@ -40,14 +55,21 @@ log = logging.getLogger(__name__)
 SELECTOR: Final = "r-map"
 # Seconds between two looks whether a photo is inspected (chosen): a look is one query
 WAIT_S: Final = 0.2
-# Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken
-MAX_PLACES: Final = 1000
 # How long the open photo of a pair waits until the closed one is inspected (chosen): that takes seconds,
 # unless many photos are before it
 WAIT_FOR_REFERENCE_S: Final = 60.0
+# Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken
+MAX_PLACES: Final = 1000
 POOR: Final = "not-enough-evidence"  # reason of patches that gave no PSF
 # What the library refuses because of the patches of a cell
 _OF_PATCHES: Final = frozenset({"no_samples", "no_usable_patches", "invalid_parameter"})
+
+# Fields of a header that have columns of the same name
+_COLUMNS: Final = (
+    *("camera_maker", "camera_model", "aperture", "focal_mm", "focus_m", "pixel_pitch_um", "orientation"),
+)
+
+MEDIA_TYPE: Final = {".tif": "tiff", ".png": "png", ".jpg": "jpeg", ".dng": "x-adobe-dng"}
 
 
 def work_on(context: JobContext, photo_id: str, epoch: int) -> None:
@@ -75,7 +97,7 @@ class _Steps:
         if self._photo.state == "inspecting" and not self._inspect():
             return
         self._enter("developing")
-        developed = self._context.developed(self._photo, self._wanted)
+        developed = self._context.developed(self._photo)
         self._enter("selecting")
         if self._photo.given.get("kind"):
             self._measure(developed)  # made for it: one place is enough
@@ -100,17 +122,12 @@ class _Steps:
 
     def _inspect(self) -> bool:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
-        inspection.inspect(self._context, self._photo, self._wanted)
-        single = self._context.settings.assume_single_copy
-        lens = self._photos.assign_lens(self._photo.public_id, single_copy=single)
-        photo = self._photos.get(self._photo.public_id, ANY_OWNER)
-        if photo is None:
-            raise NotWantedError
+        photo = inspect(self._context, self._photo)
         self._photo = photo
         if not photo.calibrate:
-            self._move(("inspecting",), "stored", finished_at=now())
+            self._move(("inspecting",), "stored")
             return False
-        missing = _missing(photo, lens_known=lens is not None)
+        missing = _missing(photo)
         if missing:
             why = {"error_code": "metadata_missing", "error_detail": missing}
             self._move(("inspecting",), "needs_lens", **why)
@@ -123,7 +140,6 @@ class _Steps:
             with self._context.task(
                 "select",
                 photo,
-                self._wanted,
                 reads=[developed],
                 developed=str(developed),
                 count=self._preset.patches,
@@ -158,29 +174,30 @@ class _Steps:
             wait(jobs)
 
     def _estimate_cell(self, rows: Sequence[PatchRow]) -> None:
-        poor = {row.idx for row in rows}
+        left, reason = {row.idx for row in rows}, POOR
         try:
             samples = self._samples(rows)
-        except JobFailedError as error:
-            log.info("cell %s of photo %s: %s: %s", rows[0].cell, self._which[0], error.code, error.detail)
-            if error.code not in _OF_PATCHES:
-                self._photos.fail_patches(*self._which, error.code, sorted(poor))
-                return
-        else:
             self._photos.add_samples(*self._which, samples)
-            poor -= {number for number, _ in samples}
-        if poor:
-            self._photos.fail_patches(*self._which, POOR, sorted(poor), rejected=True)
+            left -= {number for number, _ in samples}
+        except Exception as error:
+            if is_outage(error) or isinstance(error, NotWantedError):
+                raise
+            code = error.code if isinstance(error, JobFailedError) else "internal_error"
+            reason = POOR if code in _OF_PATCHES else code
+            known = isinstance(error, JobFailedError)
+            text = f"cell {rows[0].cell} of photo {self._which[0]}: {code}: {error}"
+            log.info(text, exc_info=None if known else error)
+        if left:
+            self._photos.reject_patches(*self._which, reason, sorted(left))
 
     def _samples(self, rows: Sequence[PatchRow]) -> list[tuple[int, PsfSample]]:
         """Return the samples of some patches; they lie where their patches do, whatever a child says."""
         places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
-        developed = self._context.developed(self._photo, self._wanted)
+        developed = self._context.developed(self._photo)
         with (
             self._context.task(
                 "estimate",
                 self._photo,
-                self._wanted,
                 reads=[developed],
                 developed=str(developed),
                 photo=self._photo.public_id,
@@ -203,7 +220,12 @@ class _Steps:
         tried = self._photos.patches(*self._which)
         done = [_patch_of(row) for row in tried if row.state == "done"]
         if not done:
-            raise JobFailedError(*_why_none(tried))
+            code, text = "no_usable_patches", "gave a PSF: use a photo with more fine detail in focus"
+            text = f"0 of {len(tried)} patches {text}"
+            failures = Counter(row.reason or "internal_error" for row in tried if row.reason != POOR)
+            for code, count in failures.most_common(1):
+                text = f"{count} of {len(tried)} patches ended with {code}; retry, or report the file"
+            raise JobFailedError(code, text)
         try:
             sampling.require_spread(done, count=self._preset.patches)
         except NoUsablePatchesError as error:
@@ -216,7 +238,6 @@ class _Steps:
         with self._context.task(
             "measure-lens",
             photo,
-            self._wanted,
             reads=folders,
             kind=photo.given["kind"],
             developed=[str(folder) for folder in folders],
@@ -248,9 +269,9 @@ class _Steps:
         return [self._context.developed(row, self._wanted)]
 
 
-def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
+def _missing(photo: PhotoRow) -> str:
     """Return what the owner must supply before the photo can count; empty if nothing."""
-    if not lens_known:
+    if photo.lens is None:
         model = photo.lens_model or "unknown model"
         return (
             f"the photo does not say which copy of a lens took it ({model}): choose a lens, give its "
@@ -264,16 +285,6 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
 def _patch_of(row: PatchRow) -> Patch:
     """Return a patch as a value of the library."""
     return Patch(row.row, row.col, row.size, FieldPosition(row.r, row.phi), row.score or 0.0, row.cell or 0)
-
-
-def _why_none(tried: Sequence[PatchRow]) -> tuple[str, str]:
-    """Return why a photo without a useful patch does not count: a code and a sentence."""
-    failures = Counter(row.reason or "internal_error" for row in tried if row.state == "failed")
-    if failures:
-        reason, count = failures.most_common(1)[0]
-        return reason, f"{count} of {len(tried)} patches ended with {reason}; retry, or report the file"
-    text = f"0 of {len(tried)} patches gave a PSF: use a photo with more fine detail in focus"
-    return "no_usable_patches", text
 
 
 @contextmanager
@@ -308,9 +319,7 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     """Let the samples of a profile join the lens that `file` names."""
     store, most = context.store, MAX_UNPACKED
     with context.original(file) as path:
-        task = context.task(
-            "profile", file, context.wants(file), reads=[path], path=str(path), max_unpacked=most
-        )
+        task = context.task("profile", file, reads=[path], path=str(path), max_unpacked=most)
         try:
             with task as (read, folder), _validated("profile"):
                 samples = returned_samples(folder, count=read["samples"])
@@ -335,3 +344,164 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
     if not store.photos.take_in(file, samples, names):
         raise NotWantedError
+
+
+def inspect(context: JobContext, photo: PhotoRow) -> PhotoRow:
+    """Remove the place from the file of a photo, record its header, and store a small picture of it."""
+    settings = context.settings
+    most = settings.max_megapixels
+    with context.original(photo) as path:
+        _remove_place(context, photo, path)
+        task = context.task("inspect", photo, reads=[path], path=str(path), max_megapixels=most)
+        with task as (info, folder):
+            context.keep(f"{photo.folder}{THUMBNAIL}", folder / THUMBNAIL)
+    metadata = info["metadata"]
+    camera = (metadata["camera_maker"], metadata["camera_model"])
+    recorded = context.store.photos.record_inspection(
+        photo.public_id,
+        LensName(**metadata["lens"]),
+        single_copy=settings.assume_single_copy,
+        width=info["width"],
+        height=info["height"],
+        body_key=body_key(*camera, metadata.get("body_serial")),
+        **{name: metadata[name] for name in _COLUMNS},
+    )
+    if recorded is None:
+        raise NotWantedError
+    return recorded
+
+
+def remove_location(context: JobContext, photo: PhotoRow) -> None:
+    """Remove the place from the file of a photo on which nobody works, once."""
+    try:
+        with context.original(photo) as path:
+            _remove_place(context, photo, path, lambda: True)
+    except JobFailedError:  # its file is lost, which the doctor reports
+        context.store.photos.record_location(photo, "unknown")
+
+
+def _remove_place(context: JobContext, photo: PhotoRow, path: Path, wanted: Wanted | None = None) -> None:
+    """Have a child search a hostile file; its copy without the place becomes that of the photo."""
+    # The copy, of the same length, gets a key of its own: blobs never change, so that a backup need not look
+    # into them
+    if photo.location is not None:
+        return
+    said, new = "unknown", {}
+    try:
+        with context.task("locate", photo, wanted, reads=[path], path=str(path)) as (answer, folder):
+            said, cleaned = answer["location"], folder / CLEANED
+            if cleaned.is_file() and cleaned.stat().st_size == photo.byte_size:
+                with cleaned.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
+                new = {"key": f"{photo.folder}cleaned-{digest[:16]}", "digest": digest}
+                context.storage.put(new["key"], cleaned)
+    except JobFailedError as error:
+        log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
+    context.store.photos.record_location(photo, said, **new)
+
+
+def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:
+    """Return a digest of a camera's name and serial; None without a serial."""
+    if not serial:
+        return None
+    identity = "|".join((name_key(maker), name_key(model), serial_key(serial)))
+    return hashlib.sha256(identity.encode()).hexdigest()[:16]
+
+
+def correct(context: JobContext, correction_id: str, epoch: int) -> None:
+    """Make the corrected file."""
+    jobs = context.store.jobs
+    row = jobs.start(correction_id, epoch)
+    if row is None:
+        return
+    photo, params, wanted = row.photo, row.params, partial(jobs.is_live, correction_id, epoch)
+    jobs.progress(row, 0, 0, "developing")
+    developed = context.developed(photo, wanted)
+    jobs.progress(row, 0, 0)
+    _, samples = _samples_of(context, row.lens_public_id, row.lens_version)
+
+    bounds = {name: params[name] for name in ("halo", "texture", "denoise") if name in params}
+
+    def tell(done: int, total: int) -> None:
+        with missable():
+            jobs.progress(row, done, total)
+
+    with context.task(
+        "correct",
+        photo,
+        wanted,
+        reads=[developed],
+        samples=samples,
+        on_progress=tell,
+        developed=str(developed),
+        photo=photo.public_id,
+        # as they were when the correction was requested
+        settings=params.get("settings") or stored_settings(photo),
+        lateral=photo.lateral,
+        params=params,
+        workers=context.settings.worker_slots,
+        bounds=bounds,
+        description=(
+            f"lens blur corrected by lensmodel: {_name(row.lens, 'unknown lens')}, version "
+            f"{row.lens_version}, method {params['method']}, strength {params['strength']:g}"
+            f"{Bounds(**bounds).described}"
+        ),
+        lens=(row.lens and row.lens.label) or "",
+    ) as (done, folder):
+        _store_result(context, row, folder / Path(done["file"]).name, done["report"])
+
+
+def _samples_of(context: JobContext, lens_id: str, version: int) -> tuple[LensState, list[PsfSample]]:
+    try:
+        state, samples = context.store.lenses.samples_of(lens_id, up_to_version=version)
+    except NoSamplesError as error:
+        raise JobFailedError(error.code, str(error)) from error
+    if not samples:
+        text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
+        raise JobFailedError("no_samples", text)
+    return state, samples
+
+
+def _store_result(context: JobContext, row: CorrectionRow, path: Path, report: dict[str, Any]) -> None:
+    if path.suffix != SUFFIX[row.params["output"]["format"]] or not path.is_file():
+        raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    base, storage = row.run_folder, context.storage
+    key = f"{base}result{path.suffix}"
+    storage.put(key, path)
+    for shown in (*SIDES.values(), *LAYER_FILES.values()):
+        if (path.parent / shown).is_file():
+            storage.put(f"{base}{shown}", path.parent / shown)
+    name = f"{PurePath(row.photo.filename).stem or 'photo'}-corrected{path.suffix}"
+    about = {"key": key, "etag": digest, "media_type": f"image/{MEDIA_TYPE[path.suffix]}", "name": name}
+    if not context.store.jobs.finish(row, report, bytes=path.stat().st_size, **about):
+        storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
+
+
+def measure(context: JobContext, lens_id: str, version: int) -> None:
+    """Note the errors that one version of a lens expects, and write its report."""
+    lenses = context.store.lenses
+    lens = lenses.get(lens_id, ANY_OWNER)
+    if lens is None:
+        return
+
+    def newest() -> bool:  # reports of earlier versions have been deleted
+        now = lenses.state_of(lens_id, ANY_OWNER)
+        return now is not None and now.version == version
+
+    state, samples = _samples_of(context, lens_id, version)
+    height, width = lenses.shape_of(lens) or (2, 3)
+    about = {
+        "name": _name(lens, "Unknown lens"),
+        "aspect": width / height,
+        "height_px": height if height > 2 else None,
+        "lateral": lenses.lateral_of(lens),
+    }
+    with context.task("measure", None, newest, samples=samples, about=about) as (metrics, folder):
+        context.keep(report_key(lens_id, version, state.rebuild_epoch), folder / REPORT)
+    lenses.record_metrics(lens_id, version, metrics)
+
+
+def _name(lens: LensRow | None, otherwise: str) -> str:
+    return otherwise if lens is None else lens.label or full_name(lens.maker, lens.model) or otherwise

@@ -143,6 +143,16 @@ def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: C
 
 
 @jit
+def _predict(X: Complex, K: Complex, E: Complex, P: Complex) -> None:
+    """Spectrum of the estimate X blurred by K, and what the change of the kernel adds to it, into `P`."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            P[i, j] = K[i, j] * X[i, j]
+    if E.shape[0] > 0:
+        P += E
+
+
+@jit
 def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     x: Real,
     y: Real,
@@ -158,6 +168,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     factors: Real,
     couplings: Real,
     turns: NDArray[np.bool_],
+    predicts: NDArray[np.bool_],
     drift: Complex,
     down: Real,
     across: Real,
@@ -171,21 +182,22 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
 
     `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
     `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
-    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
+    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`,
+    the prediction of unknown pixels in those marked in `predicts`.
     `explained` receives what the result makes of the data, blurred again.
     """
     channels, height, width = x.shape
     half = width // 2 + 1
-    X = np.empty((channels, height, half), np.complex64)
-    E = np.zeros((channels if drift.shape[0] > 0 else 0, height, half), np.complex64)
+    S = np.empty((channels, height, half), np.complex64)  # of the data, and of what is predicted between them
+    X = np.empty((0 if whole else channels, height, half), np.complex64)
+    E = np.zeros((channels, height, half) if drift.shape[0] > 0 else (0, 0, 0), np.complex64)
     D = np.empty((height, half), np.complex64)
     P = np.empty((height, half), np.complex64)
     pull = np.empty_like(x)
     work = np.empty((height, width), np.float32)
     for c in range(channels):
-        # Where the data are whole, X keeps their spectrum from here on, else that of the estimate.
-        to_spectrum(y[c], X[c])
-        _wiener(X[c], K[c], decay, prior_power, height * width, noise[c], variance[c], P)
+        to_spectrum(y[c], S[c])
+        _wiener(S[c], K[c], decay, prior_power, height * width, noise[c], variance[c], P)
         if not whole:
             X[c] = P
         to_plane(P, x[c])
@@ -194,48 +206,35 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
         for c in range(channels):
             if drift.shape[0] > 0 and turns[step]:
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
-            if not whole:
-                for i in range(height):
-                    for j in range(half):
-                        P[i, j] = K[c, i, j] * X[c, i, j]
-                if drift.shape[0] > 0:
-                    P += E[c]
+            if not whole and predicts[step]:
+                _predict(X[c], K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
+                S[c] = P
                 to_plane(P, work)
                 for i in range(height):
                     for j in range(width):
                         work[i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO
                 to_spectrum(work, D)
+                S[c] += D
             to_spectrum(pull[c], P)
             weight = couplings[step] * noise[c]
-            if whole:
-                for i in range(height):
-                    for j in range(half):
-                        k = K[c, i, j]
-                        power = k.real * k.real + k.imag * k.imag
-                        spectrum = X[c, i, j]
-                        if drift.shape[0] > 0:
-                            spectrum -= E[c, i, j]
-                        P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
-                            ONE / (power + weight * smooth[i, j])
-                        )
-            else:
-                for i in range(height):
-                    for j in range(half):
-                        k = K[c, i, j]
-                        power = k.real * k.real + k.imag * k.imag
-                        data = power * X[c, i, j] + np.conj(k) * D[i, j]
-                        P[i, j] = (data + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
+            for i in range(height):
+                for j in range(half):
+                    k = K[c, i, j]
+                    power = k.real * k.real + k.imag * k.imag
+                    spectrum = S[c, i, j]
+                    if drift.shape[0] > 0:
+                        spectrum -= E[c, i, j]
+                    P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
+                        ONE / (power + weight * smooth[i, j])
+                    )
+            if not whole:
                 X[c] = P
             to_plane(P, x[c])
     for c in range(channels):
         if whole:
-            to_spectrum(x[c], X[c])
-        for i in range(height):
-            for j in range(half):
-                P[i, j] = K[c, i, j] * X[c, i, j]
-        if drift.shape[0] > 0:
-            P += E[c]
+            to_spectrum(x[c], D)
+        else:
+            D[:] = X[c]
+        _predict(D, K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
         to_plane(P, work)
-        for i in range(height):
-            for j in range(width):
-                explained[c, i, j] = work[i, j]
+        explained[c] = work

@@ -48,13 +48,15 @@ def half_quadratic_on_device(
 
     power = xp.real(transfer) ** 2 + xp.imag(transfer) ** 2
     conjugate, Y = xp.conj(transfer), forward(data)
-    blurred = device.fetch(xp.sum(device.send(prior_power) * power, axis=(-2, -1)))
-    ratio = device.send(
-        (noise * blurred / (levels * (shape[0] * shape[1]))).astype(np.float32)[:, None, None]
-    )
+    passed = device.fetch(xp.sum(device.send(prior_power) * power, axis=(-2, -1)))
+    ratio = device.send((noise * passed / (levels * (shape[0] * shape[1]))).astype(np.float32)[:, None, None])
     X = Y * conjugate / (power + ratio * device.send(decay) + 1e-9)
     X[:, 0, 0] = Y[:, 0, 0] * conjugate[:, 0, 0]
     x, change = back(X), None
+
+    def blurred() -> Array:
+        return transfer * X if change is None else transfer * X + change
+
     for step, coupling in enumerate(p.couplings):
         pull = pull_of(x, step)
         if p.drift.size and p.turns[step]:
@@ -62,13 +64,10 @@ def half_quadratic_on_device(
             moved = forward(x * device.send(p.down[:, None])), forward(x * device.send(p.across[None, :]))
             change = rates[:, 0, ...] * moved[0] + rates[:, 1, ...] * moved[1]
         weight = device.send((coupling * noise)[:, None, None])
-        if whole:
-            fit = conjugate * (Y if change is None else Y - change)
-        else:
-            predicted = back(transfer * X if change is None else transfer * X + change)
-            fit = power * X + conjugate * forward(xp.where(mask, data - predicted, zero))
+        if not whole and p.predicts[step]:
+            Y = blurred() + forward(xp.where(mask, data - back(blurred()), zero))
+        fit = conjugate * (Y if change is None else Y - change)
         X = (fit + weight * forward(pull)) / (power + weight * smoothness)
         x = back(X)
     X = forward(x) if whole else X
-    predicted = back(transfer * X if change is None else transfer * X + change)
-    return device.fetch(x), device.fetch(predicted)
+    return device.fetch(x), device.fetch(back(blurred()))

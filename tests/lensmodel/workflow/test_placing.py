@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from scipy import ndimage
@@ -215,3 +217,38 @@ def test_a_file_says_which_part_of_its_sensor_it_shows(case: str, tmp_path: Path
 
     assert info.metadata.pixel_pitch_um == (None if pitch is None else pytest.approx(pitch, rel=0.01))
     assert info.centred == centred
+
+
+def bayer_dng(path: Path, mosaic: NDArray[np.uint16], **areas: tuple[int, ...]) -> Path:
+    """A DNG that names its ActiveArea, or where its DefaultCrop begins and its size."""
+    tags = {"active": 50829, "crop_origin": 50719, "crop_size": 50720}
+    extra = [
+        (33421, 3, 2, (2, 2), True),
+        (33422, 1, 4, bytes((0, 1, 1, 2)), True),
+        (50706, 1, 4, b"\1\4\0\0", True),
+        (50708, 2, 5, "T-1", True),
+        (50714, 4, 1, 512, True),
+        (50717, 4, 1, 15000, True),
+        (50721, 10, 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
+        *((tags[name], 4, len(area), area, True) for name, area in areas.items()),
+    ]
+    tifffile.imwrite(path, mosaic, photometric=32803, extratags=extra, metadata=None)
+    return path
+
+
+@pytest.mark.parametrize("crop", [{}, {"crop_origin": (8, 60), "crop_size": (200, 90)}])
+def test_places_are_counted_from_the_middle_of_the_active_area_whatever_a_dng_would_crop(
+    crop: dict[str, tuple[int, ...]], tmp_path: Path
+) -> None:
+    light = np.clip(scene()[1, :300, :400], 0.0, 1.0)
+    mosaic = (512 + 14_000 * light).astype(np.uint16)
+    mosaic[:20], mosaic[:, :30] = 512, 512  # covered by a mask
+    top, left, bottom, right = 20, 30, 296, 398
+    alone = bayer_dng(tmp_path / "alone.dng", mosaic[top:bottom, left:right].copy())
+    active = bayer_dng(tmp_path / "active.dng", mosaic, active=(top, left, bottom, right), **crop)
+
+    expected, developed = photo.develop(alone), photo.develop(active)
+
+    assert developed.frame == expected.frame == Frame(276, 368)
+    assert np.abs(developed.planes - expected.planes)[:, 4:-4, 4:-4].max() < 1e-6
+    assert developed.cfa == expected.cfa

@@ -134,7 +134,7 @@ def correct(
     Corrected photos are new files, NAME-corrected; the photos themselves are never changed. Files that
     are already there are left alone, so a run that was stopped can be started again and goes on from
     there. No file is ever half written. The names of the written files go to standard output; with
-    --lens auto it is a table instead, one line per lens, and -v reports on every photo.
+    --lens auto it is a table instead, one row per lens, and -v reports on every photo.
 
     Examples:
 

@@ -172,8 +172,8 @@ def _identified(
                 best = clarity, placed
     if best is None or best[0] < _CLEAR:
         raise NotEnoughEvidenceError(
-            "four discs are seen, but between them not the noise of a target that is known; print it with "
-            "`lensmodel target`, unscaled in one direction, and photograph it in focus"
+            "four discs are seen, but between them not the noise of a known target; print the page that "
+            "`lensmodel target` writes, stretched in no direction, and photograph it in focus"
         )
     return best[1]
 

@@ -113,7 +113,7 @@ class Worker:
             os._exit(0)  # threads in the middle of a job must not go on to report it finished
 
     def _begin(self) -> None:
-        log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
+        log.debug("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
         insist(partial(self._store.jobs.register, self.id, confined=" ".join(self._confined)))
         self._last_beat = monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)

@@ -27,9 +27,8 @@ from app.pages import pictures, shown
 from app.routes.common import file_headers
 from app.routes.corrections import list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
-from app.routes.photos import get_photo
-from app.schemas import Aperture, blank_is_none
-from app.store.tables import CorrectionRow, LensRow
+from app.schemas import Aperture, PhotoOut, blank_is_none
+from app.store.tables import PHOTO_WORKED_ON, CorrectionRow, LensRow
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
@@ -62,7 +61,8 @@ templates.filters.update(
     caution=caution,
     gain_words=gain_words,
     f_stop="f/{:.3g}".format,
-    plain=partial(re.sub, r" \([^)]*\)", ""),  # without the figures in brackets, which are for testers
+    # without the figures, in brackets or after a colon, which are for testers
+    plain=partial(re.sub, r" \([^)]*\)|: [^:]*\d%[^:]*?(?=\.?$)", ""),
 )
 templates.globals.update(
     picker_endings=",".join((*sorted(ENDINGS), "image/*")), full_name=full_name, HELD=HELD
@@ -125,8 +125,8 @@ def home(call: CallDep) -> HTMLResponse:
 @router.get("/photos/{photo_id}")
 def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
-    row = call.photo(photo_id)
-    photo = views.photo_out(row)
+    values = _photo(call, photo_id)
+    row, photo = values["row"], values["photo"]
     patches = call.store.photos.windows(photo_id)
     left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
     lens = None if photo.lens_id is None else get_lens(photo.lens_id, call)
@@ -135,9 +135,8 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     corrections = list_corrections(call, limit=50, photo_id=photo_id).items
     return page(
         "photo.html",
-        photo=photo,
+        **values,
         can_look=pictures.exists(call.storage, f"{row.folder}{SHOWN}"),
-        row=row,
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
         candidates=candidates,
@@ -226,8 +225,8 @@ def lens_page(lens_id: str, call: CallDep, aperture: ChosenAperture = None) -> H
     found = None if test is None else test.at(chosen)
     return page(
         "lens.html",
-        lens=lens,
-        counting=shown.counting(call, lens_id),
+        **_lens(call, lens_id, photos),
+        known={lens_id} if lens.samples else set(),
         photos=photos,
         more=more,
         others=[other for other in shown.lenses_with_photos(call) if other.id != lens_id],
@@ -250,8 +249,7 @@ def lens_tests(lens_id: str, call: CallDep) -> HTMLResponse:
     test = _test(call, row)
     return page(
         "lens_tests.html",
-        lens=lens,
-        counting=shown.counting(call, lens_id),
+        **_lens(call, lens_id, photos),
         history=history,
         names={photo.id: photo.filename for photo in photos},
         aspect=_aspect(call, row),
@@ -310,7 +308,24 @@ def _home(call: Call, _: str = "") -> dict[str, Any]:
     photos, more = shown.photos(call)
     lenses = shown.lenses_with_photos(call)
     steps = {"groups": shown.waiting(call), "next": shown.next_step(call, photos, lenses)}
-    return {"photos": photos, "more": more, "lenses": lenses, **steps}
+    known = {lens.id for lens in lenses if lens.samples}
+    return {"photos": photos, "more": more, "lenses": lenses, "known": known, **steps}
+
+
+def _photo(call: Call, photo_id: str) -> dict[str, Any]:
+    """Return a photo and the address of its best picture so far."""
+    row = call.photo(photo_id)
+    glance = f"/ui/photos/{photo_id}/thumbnail.jpg" if row.width else None
+    if pictures.exists(call.storage, f"{row.folder}{SHOWN}"):
+        glance = f"/ui/photos/{photo_id}/tiles/before/whole.jpg"
+    return {"photo": views.photo_out(row), "row": row, "glance": glance}
+
+
+def _lens(call: Call, lens_id: str, photos: Sequence[PhotoOut] | None = None) -> dict[str, Any]:
+    """Return a lens, and whether and by what it is about to change."""
+    listed = shown.photos(call, lens_id)[0] if photos is None else photos
+    working = [photo for photo in listed if photo.state in PHOTO_WORKED_ON]
+    return {"lens": get_lens(lens_id, call), "counting": shown.counting(call, lens_id), "working": working}
 
 
 def _correction(call: Call, correction_id: str) -> dict[str, Any]:
@@ -325,11 +340,8 @@ def _batch(call: Call, ids: str) -> dict[str, Any]:
 
 _STATES: Final[Mapping[Open, Callable[[Call, str], dict[str, Any]]]] = {
     "home": _home,
-    "photo": lambda call, photo_id: {"photo": get_photo(photo_id, call)},
+    "photo": _photo,
     "correction": _correction,
     "batch": _batch,
-    "lens": lambda call, lens_id: {
-        "lens": get_lens(lens_id, call),
-        "counting": shown.counting(call, lens_id),
-    },
+    "lens": _lens,
 }

@@ -14,6 +14,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from typing import Final
 
 import uvicorn
@@ -55,9 +56,8 @@ def serve(settings: Settings) -> int:
         try:
             text = json.dumps({"url": url, "pid": os.getpid(), "worker_pid": worker.pid}, indent=2)
             write_atomically(file, (text + "\n").encode())
-            # it answers once the API is up: connections wait in the socket until then
-            print(f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})", flush=True)  # noqa: T201
-            run(settings, listener, until=worker)
+            address = f"lensmodel runs at {url}  (data in {settings.data_dir.resolve()})"
+            run(settings, listener, until=worker, announce=lambda: print(address, flush=True))  # noqa: T201
             if worker.poll() is not None:
                 log.error("the worker ended with status %d, and with it the service", worker.returncode)
         except InterruptedByUser:
@@ -89,15 +89,34 @@ def run_worker(settings: Settings) -> None:
     os.execv(sys.executable, [sys.executable, "-m", WORKER])  # noqa: S606 - no shell is wanted
 
 
-def run(settings: Settings, listener: socket.socket, until: subprocess.Popen[bytes] | None = None) -> None:
-    """Serve until SIGTERM, or until another process ends; log as a service does."""
+class _Announced(uvicorn.Server):
+    """A server that says when it is up: what is printed last is what people see."""
+
+    def __init__(self, config: uvicorn.Config, announce: Callable[[], object] | None) -> None:
+        super().__init__(config)
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, then announce it."""
+        await super().startup(sockets)
+        if self._announce is not None and not self.should_exit:
+            self._announce()
+
+
+def run(
+    settings: Settings,
+    listener: socket.socket,
+    until: subprocess.Popen[bytes] | None = None,
+    announce: Callable[[], object] | None = None,
+) -> None:
+    """Serve until SIGTERM, or until another process ends; log as a service does, `announce` once it is up."""
     logs.begin("api", settings.log_level, settings.log_format)
     from app.main import create_app  # noqa: PLC0415 - a worker need not load the application
 
     async def watch() -> None:
         server.should_exit |= until is not None and until.poll() is not None
 
-    server = uvicorn.Server(
+    server = _Announced(
         uvicorn.Config(
             create_app(settings),
             log_level=settings.log_level,
@@ -107,7 +126,8 @@ def run(settings: Settings, listener: socket.socket, until: subprocess.Popen[byt
             limit_concurrency=MAX_CONNECTIONS,
             callback_notify=watch,
             timeout_notify=0,  # each second
-        )
+        ),
+        announce,
     )
     server.run(sockets=[listener])
 

@@ -35,8 +35,8 @@ export async function withItsLens(act) {
     return await act(false);
   } catch (reason) {
     if (reason.code !== "other_lens") throw reason;
-    const [why] = reason.message.split("; choose its own lens");
-    return (await confirmed(`${why}.`, "It is the same lens")) ? act(true) : null;
+    const [, why] = /: (.*?)(?:; choose its own lens.*)?$/.exec(reason.message) ?? [null, reason.message];
+    return (await confirmed(`This seems to be another lens: ${why}.`, "It is the same lens")) ? act(true) : null;
   }
 }
 

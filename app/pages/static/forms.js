@@ -92,6 +92,7 @@ async function learned(group) {
 
 function complain(part, reason) {
   const alert = part.querySelector(":scope > .alert");
+  for (const fold of part.querySelectorAll(":scope > .controls > details")) fold.open = true; // what is missing may be in it
   alert.textContent = reason.message;
   alert.hidden = false;
   return 0;

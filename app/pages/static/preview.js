@@ -50,7 +50,7 @@ export function setUpPreview(viewer) {
   const form = byId("correct");
   if (!viewer || !form || !("preview" in form.dataset)) return;
   const words = byId("preview-words");
-  const canvas = document.createElement("canvas");
+  const canvas = Object.assign(document.createElement("canvas"), { className: "part" });
   const fields = form.elements;
   let [part, timer, running] = [null, 0, new AbortController()];
   let aim = null; // what is computed, or was last
@@ -133,7 +133,10 @@ export function setUpPreview(viewer) {
     show();
     if (first || part) look();
   });
-  fields.lens_id?.addEventListener("change", () => (aim = null));
+  fields.lens_id?.addEventListener("change", () => {
+    aim = null;
+    look();
+  });
   window.addEventListener("pagehide", () => {
     running.abort();
     aim = null;

@@ -3,6 +3,11 @@
 import { byId, failure } from "./common.js";
 
 const AT_ONCE = 2;
+// What files are that people take for photos that can be read, by their endings
+const OTHERS = [
+  [/\.hei[cf]$/i, "HEIC cannot be read. Send the RAW file (DNG), or the photo exported as JPEG."],
+  [/\.lensprofile$/i, "This is a lens profile. Use Add a lens from a profile, under Lenses."],
+];
 
 function send(file, calibrate, onProgress) {
   return new Promise((resolve) => {
@@ -11,20 +16,24 @@ function send(file, calibrate, onProgress) {
     request.open("POST", `/v1/photos?${query}`);
     request.setRequestHeader("Content-Type", "application/octet-stream");
     request.upload.onprogress = (event) => onProgress(event.total ? event.loaded / event.total : 0);
-    request.onerror = () => resolve("The connection was lost. Choose the photo again; nothing is counted twice.");
+    request.onerror = () => resolve({ text: "The connection was lost. Choose the photo again; nothing is counted twice." });
     request.onload = () => {
-      if (request.status === 200) resolve("Already used: the same photo was sent before.");
-      else resolve(request.status === 202 ? null : failure(request.responseText, request.status).message);
+      if (request.status === 202) resolve(null);
+      else if (request.status === 200) resolve({ text: "Already used: the same photo was sent before.", known: JSON.parse(request.responseText).id });
+      else resolve({ text: (OTHERS.find(([ending]) => ending.test(file.name)) ?? [null, failure(request.responseText, request.status).message])[1] });
     };
     request.send(file);
   });
 }
 
-function refused(file, text) {
+function refused(file, { text, known }) {
   const item = document.createElement("li");
-  item.innerHTML = '<div class="grow"><b></b><p class="error"></p></div><button type="button" class="quiet">Dismiss</button>';
+  item.innerHTML = '<div class="grow"><b></b><p></p></div><button type="button" class="quiet">Dismiss</button>';
   item.querySelector("b").textContent = file.name;
-  item.querySelector("p").textContent = text;
+  const words = item.querySelector("p");
+  words.textContent = text;
+  if (known) words.append(" ", Object.assign(document.createElement("a"), { href: `/photos/${known}`, textContent: "Open it" }));
+  else words.className = "error";
   const close = item.querySelector("button");
   close.setAttribute("aria-label", `Dismiss the message about ${file.name}`);
   close.addEventListener("click", () => item.remove());
@@ -33,6 +42,9 @@ function refused(file, text) {
 
 export function setUpUpload() {
   const form = byId("drop");
+  // a file that is dropped beside the fields for files must not take the place of the page
+  const carriesFiles = (event) => event.dataTransfer?.types.includes("Files") && !event.target.matches?.("[type=file]");
+  for (const kind of ["dragenter", "dragover", "drop"]) document.addEventListener(kind, (event) => carriesFiles(event) && event.preventDefault());
   if (!form) return;
   const [input, announce, sending] = [byId("files"), byId("announce"), byId("sending")];
   const [words, bar] = [byId("sending-words"), byId("sending-bar")];
@@ -78,21 +90,12 @@ export function setUpUpload() {
     start(files);
   });
   form.addEventListener("submit", (event) => event.preventDefault());
-  // the whole page takes photos: a drop beside the frame would otherwise leave the page
-  const carriesFiles = (event) => event.dataTransfer?.types.includes("Files");
-  for (const kind of ["dragenter", "dragover"]) {
-    document.addEventListener(kind, (event) => {
-      if (!carriesFiles(event)) return;
-      event.preventDefault();
-      document.body.classList.add("over");
-    });
-  }
+  for (const kind of ["dragenter", "dragover"]) document.addEventListener(kind, (event) => carriesFiles(event) && document.body.classList.add("over"));
   document.addEventListener("dragleave", (event) => {
     if (!event.relatedTarget) document.body.classList.remove("over");
   });
   document.addEventListener("drop", (event) => {
     if (!carriesFiles(event)) return;
-    event.preventDefault();
     document.body.classList.remove("over");
     start([...event.dataTransfer.files]);
   });

@@ -16,6 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -305,20 +306,24 @@ def test_example_runs(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", [k for k in EXAMPLES if EXAMPLES[k] == "serve"])
-def test_example_serves_until_it_is_told_to_stop(line: str, folder: Path) -> None:
+def test_example_serves_and_prints_its_address_last_until_it_is_told_to_stop(line: str, folder: Path) -> None:
     words = [word.replace("~", str(folder)) for word in shlex.split(line)]
     with subprocess.Popen(
         [sys.executable, "-m", "lensmodel", *words, *([] if "--port" in words else ["--port", "0"])],
         cwd=folder,
         env=environment(folder),
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.STDOUT,
         text=True,
     ) as process:
         assert process.stdout is not None
-        said = process.stdout.readline()
+        address = "lensmodel runs at http://127.0.0.1:"
+        before = list(takewhile(lambda said: not said.startswith(address), process.stdout))
         process.send_signal(signal.SIGINT)
+        after = process.stdout.read()
         status = process.wait(stretched(PATIENCE_S))
 
-    assert said.startswith("lensmodel runs at http://127.0.0.1:")
+    assert any("startup complete" in said for said in before)
+    assert "confined" not in after
+    assert "startup complete" not in after
     assert status == 0

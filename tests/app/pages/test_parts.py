@@ -356,6 +356,59 @@ def test_a_photo_has_a_thumbnail_before_it_is_developed(
     assert opened(client, address).size == (258, 480)
 
 
+def test_a_photo_is_seen_while_it_is_worked_on(
+    client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
+) -> None:
+    photo = steps.receive()
+    address = f"/ui/photos/{photo.public_id}"
+
+    def pictures() -> list[str]:
+        answer = client.get("/ui/parts", params={"page": "photo", "id": photo.public_id})
+        page = client.get(f"/photos/{photo.public_id}").text.partition("<main")[2]
+        shown = [re.findall(r'<img src="([^"]*)"', part) for part in (answer.text, page)]
+        assert shown[0] == shown[1]
+        assert 'id="viewer"' not in page
+        return shown[0]
+
+    received = pictures()
+    steps.inspect(photo)
+    inspected = pictures()
+    (tmp_path / "tiles").write_bytes(b"any")
+    Storage(settings.storage).put(f"{photo.folder}{SHOWN}", tmp_path / "tiles")
+    developed = pictures()
+
+    assert received == []
+    assert inspected == [f"{address}/thumbnail.jpg"]
+    assert developed == [f"{address}/tiles/before/whole.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("code", "again", "copy", "correct"),
+    [
+        ("outage", True, False, False),
+        ("time_limit", True, False, False),
+        ("truncated_image", False, True, False),
+        ("raw_decode_failed", False, True, False),
+        ("unsupported_format", False, True, False),
+        ("no_usable_patches", False, False, True),
+    ],
+)
+def test_a_photo_that_failed_offers_what_can_help(
+    client: TestClient, steps: Steps, store: Store, code: str, again: bool, copy: bool, correct: bool
+) -> None:
+    steps.counted()  # its lens is known
+    photo = steps.receive()
+    steps.inspect(photo)
+    store.photos.fail(photo.public_id, photo.epoch, code, "it was so")
+
+    page = client.get(f"/photos/{photo.public_id}").text
+
+    offered = ("Try it again", "Send a new copy", "Correct this photo")
+    assert [text in page for text in offered] == [again, copy, correct]
+    listed = client.get("/").text
+    assert (f'name="photo" value="{photo.public_id}"' in listed) == correct
+
+
 @pytest.mark.parametrize("kind", ["tiff", "png", "dng"])
 def test_every_kind_of_photo_has_a_thumbnail(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"p.{kind}"
@@ -606,6 +659,11 @@ def test_a_photographer_reads_no_figures_in_a_verdict() -> None:
     assert templates.filters["plain"]("It is sharp (MTF50 .41), and its corner softer (T .2, S .3).") == (
         "It is sharp, and its corner softer."
     )
+    assert templates.filters["plain"]("A photo at f/2 would help most: it is wrong by 67%.") == (
+        "A photo at f/2 would help most."
+    )
+    kept = "Nothing is known there: let it fill the frame."
+    assert templates.filters["plain"](kept) == kept
 
 
 def test_the_page_of_a_lens_shows_the_aperture_that_is_asked_for_and_no_empty_sections(

@@ -241,8 +241,21 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     refusal.get_by_role("button", name="Dismiss").click()
     expect(refusal).to_have_count(0)
 
+    page.evaluate(DROP, ["IMG_1.HEIC", base64.b64encode(b"\0\0\0\x18ftypheic" + bytes(500)).decode()])
+    expect(refusal.locator(".error")).to_contain_text("exported as JPEG")
+
     assert all("415" in complaint for complaint in visitor.complaints)
     visitor.complaints.clear()
+
+
+def test_a_file_that_is_dropped_on_another_page_does_not_take_its_place(
+    page: Page, learned: dict[str, Any]
+) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+    dropped = DROP.replace("document.querySelector", "window.prevented = !document.querySelector")
+    page.evaluate(dropped, ["holiday.nef", base64.b64encode(b"any").decode()])
+
+    assert page.evaluate("window.prevented") is True
 
 
 def test_a_tester_begins_with_a_lens_without_photos(page: Page, service: Service) -> None:
@@ -268,6 +281,7 @@ def test_a_photo_sent_twice_is_said_to_be_used_already(page: Page, service: Serv
     page.set_input_files("#files", photo)
 
     expect(page.locator("#uploads li")).to_contain_text("Already used: the same photo was sent before.")
+    expect(page.get_by_role("link", name="Open it")).to_have_attribute("href", f"/photos/{sent['id']}")
     assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
 

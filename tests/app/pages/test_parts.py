@@ -705,6 +705,25 @@ def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
     assert ended.headers["HX-Redirect"] == "/sign-in?next=http%3A//h/%3Fa%3Db"
 
 
+def test_the_page_of_a_lens_follows_its_first_photos(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo, (0,))
+    lens = steps.lens_id(photo)
+    asked = {"page": "lens", "id": lens}
+    page, working = client.get(f"/lenses/{lens}").text, client.get("/ui/parts", params=asked)
+    steps.estimate(photo)
+    steps.store.photos.finish(photo.public_id, 1)
+    counted = client.get("/ui/parts", params=asked)
+
+    assert "Its blur is being measured in 1 photo." in working.text
+    assert '<progress max="2" value="1"' in working.text
+    assert "Its blur is being measured in 1 photo." in page
+    assert "Nothing is known of this lens yet." not in page
+    assert "A photo is being added." in counted.text
+
+
 def test_a_page_whose_work_has_ended_is_made_anew(client: TestClient, steps: Steps) -> None:
     photo = steps.receive()
     asked = {"page": "photo", "id": photo.public_id}

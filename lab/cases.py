@@ -85,28 +85,26 @@ def list_photos(folder: Path | None = None) -> tuple[Path, ...]:
     return found
 
 
-def _split() -> dict[str, dict[str, list[str | int]]]:
-    split: dict[str, dict[str, list[str | int]]] = json.loads(
-        (DATA / "split.json").read_text(encoding="utf-8")
-    )
-    return split
+_SPLIT: Final[dict[str, dict[str, list[str | int]]]] = json.loads(
+    (DATA / "split.json").read_text(encoding="utf-8")
+)
 
 
 def photo_half(stem: str) -> Half:
     """Half of the split that a photo belongs to; photos not listed go by the hash of their name."""
-    split = _split()["photos"]
-    for half in ("dev", "test"):
-        if stem in split[half]:
-            return "dev" if half == "dev" else "test"
-    return "dev" if hashlib.sha256(stem.encode()).digest()[0] % 2 == 0 else "test"
+    chance = hashlib.sha256(stem.encode()).digest()[0]
+    return _half("photos", stem, chance)
 
 
 def psf_half(number: int) -> Half:
     """Half of the split that a PSF belongs to; numbers not listed go by parity."""
-    split = _split()["psfs"]
-    if number in split["test"]:
+    return _half("psfs", number, number)
+
+
+def _half(kind: str, name: str | int, chance: int) -> Half:
+    if name in _SPLIT[kind]["test"]:
         return "test"
-    return "dev" if number in split["dev"] or number % 2 == 0 else "test"
+    return "dev" if name in _SPLIT[kind]["dev"] or chance % 2 == 0 else "test"
 
 
 def make_cases(
@@ -120,10 +118,7 @@ def make_cases(
     limit: int | None,
     scenes: int | None = None,
 ) -> tuple[BlindCase, ...]:
-    """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
-
-    A scene is a window of a photo: one of each, or `scenes` of all in turn.
-    """
+    """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle."""
     if scenes is not None and scenes < 1:
         raise InvalidInputError(f"a benchmark takes at least one scene, not {scenes}")
     own = [p for p in photos if half in {"all", photo_half(p.stem)}]

@@ -6,31 +6,25 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import ZONES, Direction, FieldPosition, Zone
+from lensmodel.core.types import ZONES, Direction, Zone
 from lensmodel.quality.edge import Box, EdgeResponse, direction_of, slanted_edge
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeMeasurement:
+class EdgeMeasurement(NamedTuple):
     """One measured edge of a chart."""
 
-    box: Box  # (row, col, height, width)
-    position: FieldPosition  # of the middle of the box
+    zone: Zone
     direction: Direction  # contrast along u, along v, or between the two: see `direction_of`
     response: EdgeResponse  # what was measured
-
-    @property
-    def zone(self) -> Zone:
-        """Zone of the field."""
-        return zone_of(self.position.r)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +54,8 @@ def measure_edges(plane: NDArray[np.floating], boxes: Sequence[Box]) -> tuple[Ed
             logger.warning("no edge measured in box %s: %s", box, error)
             continue
         position = frame.position(row + (height - 1) / 2.0, col + (width - 1) / 2.0)
-        measured.append(
-            EdgeMeasurement(
-                box=box,
-                position=position,
-                direction=direction_of(response.normal, position),
-                response=response,
-            )
-        )
+        direction = direction_of(response.normal, position)
+        measured.append(EdgeMeasurement(zone_of(position.r), direction, response))
     if not measured:
         raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
     return tuple(measured)
@@ -80,21 +68,17 @@ def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness
         here = [m for m in measurements if m.zone == zone]
         if not here:
             continue
-        directions = {
-            direction: [m.response.mtf50 for m in here if m.direction == direction]
-            for direction in ("tangential", "sagittal")
-        }
+        middle, along, across = (
+            [m.response.mtf50 for m in here if direction in ("", m.direction)]
+            for direction in ("", "tangential", "sagittal")
+        )
         table[zone] = ZoneSharpness(
             zone=zone,
             edges=len(here),
-            mtf50=float(np.median([m.response.mtf50 for m in here])),
-            tangential_mtf50=_median(directions["tangential"]),
-            sagittal_mtf50=_median(directions["sagittal"]),
+            mtf50=float(np.median(middle)),
+            tangential_mtf50=float(np.median(along)) if along else math.nan,
+            sagittal_mtf50=float(np.median(across)) if across else math.nan,
             mtf_max=max(m.response.mtf_max for m in here),
             overshoot=max(m.response.overshoot for m in here),
         )
     return table
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if values else math.nan

@@ -57,11 +57,17 @@ def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]
     }
 
 
-def psnr(image: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
-    _same_shape(image, reference)
-    error = float(np.square(np.subtract(image, reference, dtype=np.float64)).mean())
-    return math.inf if error == 0.0 else psnr_of(error)
+def side_by_side(crops: Sequence[Picture], gap: int = 6) -> Picture:
+    """Put pictures of one size beside each other, on white."""
+    between = np.full((crops[0].shape[0], gap, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for crop in crops for part in (crop, between)][:-1], axis=1)
+
+
+def strip(picture: Picture, side: int) -> Picture:
+    """Put the five crops of `crop_boxes` side by side."""
+    side = min(side, picture.shape[0] // 2, picture.shape[1] // 2)
+    boxes = crop_boxes(picture.shape[0], picture.shape[1], side).values()
+    return side_by_side([picture[row : row + side, col : col + side] for row, col in boxes])
 
 
 def _same_shape(image: NDArray[np.floating], reference: NDArray[np.floating]) -> None:
@@ -77,25 +83,9 @@ def blocks(frame: Frame, most: int | None = None) -> list[tuple[int, int]]:
     return [(row, col) for number, row, col in every if not (thin and number % 2)]
 
 
-def moved(truth: NDArray[np.floating], picture: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the truth where it lies best on the picture."""
-    shift = best_shift(truth, picture)
-    return shifted(truth, *(shift if max(map(abs, shift)) <= _LARGEST_SHIFT else (0.0, 0.0)))
-
-
-def block_error(picture: NDArray[np.floating], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared error of the inner pixels of a block, mean over its channels."""
-    return np.asarray(np.square(picture - truth).mean(axis=0)[CORE])
-
-
 def psnr_of(error: float) -> float:
     """PSNR in dB of a mean squared error, for a peak of 1."""
     return -10.0 * math.log10(max(error, 1e-30))
-
-
-def _radii(frame: Frame) -> NDArray[np.float64]:
-    """R of every pixel."""
-    return frame.polar(np.arange(1.0 * frame.height)[:, None], np.arange(1.0 * frame.width)[None, :])[0]
 
 
 def zone_masks(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
@@ -105,11 +95,7 @@ def zone_masks(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
 
 
 def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[float, float]:
-    """Shift (row, col) in pixels, up to 3, that brings `image` closest to `reference`.
-
-    Gauss-Newton on the sum of squared differences, s <- s - (G'G)^-1 G'(image(s) - reference), with
-    G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
-    """
+    """Shift (row, col) in pixels, up to 3, that brings `image` closest to `reference`, by Gauss-Newton."""
     _same_shape(image, reference)
     rows, cols = (
         slice(max((n - _SHIFT_WINDOW) // 2, 0), max((n - _SHIFT_WINDOW) // 2, 0) + _SHIFT_WINDOW)
@@ -164,6 +150,39 @@ LOSS_DB: Final = 0.5
 _LEAST_ERROR: Final = 1e-8  # mean square, full scale is 1 (chosen): 80 dB, so that ratios stay finite
 
 
+def _errors(
+    pictures: Sequence[NDArray[np.floating]],
+    truth: NDArray[np.floating],
+    frame: Frame,
+    corners: Sequence[tuple[int, int]],
+    *,
+    clipped: bool = False,
+) -> NDArray[np.float64]:
+    """Squared errors of planes, mean over channels, and pixels: `(block, picture, zone, 2)` sums.
+
+    A PSF is centred on its centre of mass, which may lie a pixel beside its core: distortion, not
+    blur. So the truth of each block, which has no noise, is moved to where it lies best.
+    """
+    radius = frame.polar(np.arange(1.0 * frame.height)[:, None], np.arange(1.0 * frame.width)[None, :])[0]
+
+    def sums(corner: tuple[int, int]) -> list[list[tuple[float, int]]]:
+        window = tuple(slice(start, start + BLOCK) for start in corner)
+        zones, found = zone_masks(radius[window][CORE]), []
+        for picture in (whole[:, *window] for whole in pictures):
+            sharp = np.asarray(truth[:, *window])
+            shift = best_shift(sharp, picture)
+            sharp = shifted(sharp, *(shift if max(map(abs, shift)) <= _LARGEST_SHIFT else (0.0, 0.0)))
+            if clipped:
+                sharp = np.clip(sharp, 0.0, 1.0)
+            error = np.square(picture - sharp).mean(axis=0)[CORE]
+            found.append([(float(error[zones[zone]].sum()), int(zones[zone].sum())) for zone in ZONES])
+        return found
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        # in the order of the blocks: the same sum for any number of threads
+        return np.array(list(pool.map(sums, corners)))
+
+
 def fidelity(
     image: Planes,
     reference: Planes,
@@ -172,32 +191,15 @@ def fidelity(
     srgb: bool = True,
     corners: Sequence[tuple[int, int]] | None = None,
 ) -> dict[Zone, float]:
-    """PSNR in dB by zone, each block of 128 pixels at its best shift, as shown or of linear light.
-
-    A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
-    a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
-    distortion of the picture, not blur. So the truth of each block, which has no noise, is moved to where
-    it lies best. Blocks are those at `corners`, or all over the frame; zones without one are left out.
-    """
+    """PSNR in dB by zone, each block of 128 pixels at its best shift, as shown or of linear light."""
     _same_shape(image, reference)
     if image.shape[-2:] != (frame.height, frame.width) or min(frame.height, frame.width) < BLOCK:
         raise InvalidInputError(f"{frame} is not that of pictures {image.shape}, or smaller than {BLOCK}")
     pair = (to_srgb(image), to_srgb(reference)) if srgb else (image, reference)
     found, wanted = (picture.reshape(-1, *picture.shape[-2:]) for picture in pair)
-    radius = _radii(frame)
-
-    def compared(corner: tuple[int, int]) -> dict[Zone, NDArray[np.float64]]:
-        window = tuple(slice(start, start + BLOCK) for start in corner)
-        picture = found[:, *window]
-        error = block_error(picture, moved(wanted[:, *window], picture))
-        zones = zone_masks(radius[window][CORE])
-        return {zone: np.array([error[mask].sum(), mask.sum()]) for zone, mask in zones.items()}
-
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        # in the order of the blocks: the same sum for any number of threads
-        parts = list(pool.map(compared, blocks(frame, EVERY) if corners is None else corners))
-    sums = {zone: np.sum([part[zone] for part in parts], axis=0) for zone in ZONES}
-    return {zone: psnr_of(float(error / count)) for zone, (error, count) in sums.items() if count}
+    every = blocks(frame, EVERY) if corners is None else corners
+    sums = _errors([found], wanted, frame, every)[:, 0].sum(axis=0)
+    return {zone: psnr_of(error / count) for zone, (error, count) in zip(ZONES, sums, strict=True) if count}
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,29 +218,22 @@ def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
     frame = Frame(*truth.shape[:2])
     if min(frame.height, frame.width) < BLOCK:
         return None
-    radius = _radii(frame)
-    errors: dict[Zone, NDArray[np.float64]] = {zone: np.zeros(2) for zone in ZONES}
-    found: list[tuple[float, tuple[int, int]]] = []
-    for row, col in blocks(frame):
-        window = slice(row, row + BLOCK), slice(col, col + BLOCK)
-        old, new, sharp = (_unit(picture[window]) for picture in (before, after, truth))
-        pair = [block_error(picture, np.clip(moved(sharp, picture), 0.0, 1.0)) for picture in (old, new)]
-        for zone, mask in zone_masks(radius[window][CORE]).items():
-            errors[zone] += [float(error[mask].sum()) for error in pair]
-        found.append((_gain(*(float(error.mean()) for error in pair)), (row, col)))
-    worst, at = min(found)
-    return Gains(
-        {zone: _gain(*map(float, pair)) for zone, pair in errors.items() if pair[0] > 0.0},
-        worst,
-        at,
-        float(np.mean([gain < -LOSS_DB for gain, _ in found])),
-        len(found),
+    every = blocks(frame)
+    scale = 65535.0 if truth.dtype == np.uint16 else 1.0
+    old, new, sharp = (
+        np.moveaxis(np.asarray(p, dtype=np.float64), -1, 0) / scale for p in (before, after, truth)
     )
-
-
-def _unit(part: Encoded) -> NDArray[np.float64]:
-    scale = 65535.0 if part.dtype == np.uint16 else 1.0
-    return np.ascontiguousarray(np.moveaxis(np.asarray(part, dtype=np.float64) / scale, -1, 0))
+    errors = _errors([old, new], sharp, frame, every, clipped=True)[..., 0]
+    of_blocks = [_gain(*pair) for pair in errors.sum(axis=2) / (BLOCK - 2 * BORDER) ** 2]
+    worst = int(np.argmin(of_blocks))
+    of_zones = zip(ZONES, errors.sum(axis=0).T, strict=True)
+    return Gains(
+        {zone: _gain(*pair) for zone, pair in of_zones if pair[0] > 0.0},
+        of_blocks[worst],
+        every[worst],
+        float(np.mean([gain < -LOSS_DB for gain in of_blocks])),
+        len(every),
+    )
 
 
 def _gain(old: float, new: float) -> float:

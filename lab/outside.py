@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -28,8 +27,7 @@ SIZE: Final = 31
 _WIDEST: Final = 2.5  # times the median width (chosen): wider cells hold no single stars
 
 
-@dataclass(frozen=True, slots=True)
-class Judged:
+class Judged(NamedTuple):
     """A green PSF at one place of a photo: the stars of a cell against the blind model."""
 
     r: float
@@ -65,12 +63,9 @@ def main() -> None:
     print("| photo | r | relative L2 | told | of the stars | of a point | width of stars, px | blind |")
     print("|---|---|---|---|---|---|---|---|")
     for path in asked.photos:
-        rows = sorted(judged(path, LensSettings(aperture=asked.aperture)), key=lambda row: row.r)
+        rows = sorted(judged(path, LensSettings(aperture=asked.aperture)))
         for row in rows:
-            values = (
-                row.r, row.distance, row.told, row.error, row.point, row.measured_px, row.blind_px,
-            )  # fmt: skip
-            print(f"| {path.name} | " + " | ".join(f"{value:.2f}" for value in values) + " |")
+            print(f"| {path.name} | " + " | ".join(f"{value:.2f}" for value in row) + " |")
         middle = float(np.median([row.distance for row in rows]))
         print(f"{path.name}: median {middle:.2f} of {len(rows)} places")
 

@@ -39,6 +39,10 @@ class Page:
         """Add a paragraph."""
         self._blocks.append(escape(text, quote=False))
 
+    def markdown(self, text: str) -> None:
+        """Add Markdown as it is."""
+        self._blocks.append(text.rstrip())
+
     def table(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         """Add a table."""
         self._blocks.append(table(head, ([escape(cell, quote=False) for cell in row] for row in rows)))

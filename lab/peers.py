@@ -114,22 +114,10 @@ def _gmic(source: Path, target: Path, folder: Path, setting: float) -> list[str]
     return ["gmic", str(source), *step, "-c", "0,65535", "-o", f"{target},uint16"]
 
 
-def _rawtherapee(section: str) -> Command:
-    def command(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
-        profile = folder / "rawtherapee.pp3"
-        enabled = "true" if setting else "false"
-        profile.write_text(
-            "[Version]\nAppVersion=5.9\nVersion=346\n"
-            + section.format(enabled=enabled, radius=setting or 1.0),
-            encoding="utf-8",
-        )
-        words = ["rawtherapee-cli", "-Y", "-t", "-b16", "-o", str(target), "-p", str(profile)]
-        return [*words, "-c", str(source)]
-
-    return command
-
-
-_CAPTURE = """[PostDemosaicSharpening]
+_CAPTURE = """[Version]
+AppVersion=5.9
+Version=346
+[PostDemosaicSharpening]
 Enabled={enabled}
 Contrast=0
 AutoContrast=false
@@ -139,15 +127,15 @@ DeconvRadiusOffset=0
 DeconvIterCheck=false
 DeconvIterations=20
 """
-_LUCY = """[Sharpening]
-Enabled={enabled}
-Contrast=0
-Method=rld
-DeconvRadius={radius}
-DeconvAmount=100
-DeconvDamping=0
-DeconvIterations=10
-"""
+
+
+def _rawtherapee(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
+    profile = folder / "rawtherapee.pp3"
+    enabled = "true" if setting else "false"
+    profile.write_text(_CAPTURE.format(enabled=enabled, radius=setting or 1.0), encoding="utf-8")
+    words = ["rawtherapee-cli", "-Y", "-t", "-b16", "-o", str(target), "-p", str(profile)]
+    return [*words, "-c", str(source)]
+
 
 _HISTORY = """<?xml version="1.0" encoding="UTF-8"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
@@ -163,44 +151,18 @@ _HISTORY = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _darktable(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
     # The preset "lens deblur: medium" of version 4.2 has 16 iterations over 10 pixels.
-    params = struct.pack(
-        "<ifi11fi",
-        int(setting) or 16,
-        0.0,
-        10,
-        3.0,
-        1.0,
-        1.0,
-        0.0,
-        1.0,
-        0.0,
-        0.0,
-        -0.25,
-        0.125,
-        -0.5,
-        0.25,
-        0,
-    )
+    numbers = (3.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, -0.25, 0.125, -0.5, 0.25)
+    params = struct.pack("<ifi11fi", int(setting) or 16, 0.0, 10, *numbers, 0)
     history = folder / "darktable.xmp"
     history.write_text(_HISTORY.format(enabled=int(setting > 0), params=params.hex()), encoding="utf-8")
     core = ["--core", "--configdir", str(folder / "darktable"), "--library", ":memory:"]
-    depth = ["--conf", "plugins/imageio/format/tiff/bpp=16"]
-    return [
-        "darktable-cli",
-        str(source),
-        str(history),
-        str(target),
-        "--apply-custom-presets",
-        "false",
-        *core,
-        *depth,
-    ]
+    files = [str(source), str(history), str(target), "--apply-custom-presets", "false"]
+    return ["darktable-cli", *files, *core, "--conf", "plugins/imageio/format/tiff/bpp=16"]
 
 
 PEERS: Final[tuple[Peer, ...]] = (
     Peer("G'MIC Richardson-Lucy", "gmic", _gmic, 20.0),
-    Peer("RawTherapee RL", "rawtherapee-cli", _rawtherapee(_LUCY), 1.0),
     Peer("darktable lens deblur", "darktable-cli", _darktable, 16.0),
-    Peer("RawTherapee capture sharpening", "rawtherapee-cli", _rawtherapee(_CAPTURE), 1.15, raw=True),
+    Peer("RawTherapee capture sharpening", "rawtherapee-cli", _rawtherapee, 1.15, raw=True),
 )
 """Each at the setting that is timed."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
 from lensmodel.simulate import demo_scene
 
@@ -321,14 +320,10 @@ def dead_leaves(
     largest: float = 150.0,
     oversampling: int = 3,
 ) -> Planes:
-    """Discs that cover one another, radii with density ~ r^-3: natural statistics, sharp edges, 0.02..0.95.
+    """Discs that cover one another, radii with density ~ r^-3, 0.02..0.95, averaged over the pixels.
 
-    Area-sampled: drawn `oversampling` times larger, then averaged over the pixels. Source: A. B. Lee, D.
-    Mumford, J. Huang, "Occlusion models for natural images", International Journal of Computer Vision 41,
-    2001.
+    Source: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", IJCV 41, 2001.
     """
-    if not 0.0 < smallest < largest or oversampling < 1:
-        raise InvalidInputError(f"radii must satisfy 0 < smallest < largest, got {smallest}, {largest}")
     size = (height * oversampling, width * oversampling)
     canvas = np.zeros((*size, 3), dtype=np.float32)
     empty = np.ones(size, dtype=bool)

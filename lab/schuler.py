@@ -43,8 +43,8 @@ from lab.blind.steps.gradients import (
     shock_filtered,
 )
 from lab.blind.steps.pyramid import Image, View
-from lab.model.exact import pixel_to_local
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lab.model_benchmark import pixel_to_local
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import (
     CHANNELS,
@@ -53,7 +53,6 @@ from lensmodel.core.types import (
     Kernel,
     LensSettings,
     NoiseModel,
-    Plane,
     Planes,
 )
 from lensmodel.photo import LinearPhoto
@@ -97,8 +96,6 @@ class RadialBasis:
 def principal(fields: NDArray[np.floating], radii: Sequence[float], count: int) -> RadialBasis:
     """Take the principal components of fields."""
     both = np.concatenate([fields, fields[:, :, ::-1]]).astype(np.float64)
-    if len(both) < count:
-        raise InvalidInputError(f"{count} components need as many fields, got {len(both)} with their mirrors")
     flat = both.reshape(len(both), -1)
     mean = flat.mean(axis=0)
     _, sizes, directions = np.linalg.svd(flat - mean, full_matrices=False)
@@ -165,20 +162,13 @@ class PhotoWindow:
     noise: tuple[NoiseModel, ...]  # one per channel
     position: FieldPosition  # of its middle
 
-    def plane(self, channel: int) -> Plane:
-        """One colour of it."""
-        return self.planes[channel]
 
-
-def windows_of(photos: Sequence[LinearPhoto]) -> list[PhotoWindow]:
+def windows_of(photo: LinearPhoto) -> list[PhotoWindow]:
     """Cut the windows that tell about the blur, chosen in green as a calibration does."""
-    found = []
-    for photo in photos:
-        for patch in sampling.find_patches(photo, count=PATCHES).patches:
-            rows, cols = slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size)
-            planes = np.ascontiguousarray(photo.planes[:, rows, cols])
-            found.append(PhotoWindow(planes, photo.noise, patch.position))
-    return found
+    return [
+        PhotoWindow(photo.planes[:, p.row : p.row + p.size, p.col : p.col + p.size], photo.noise, p.position)
+        for p in sampling.find_patches(photo, count=PATCHES).patches
+    ]
 
 
 _ALPHA = 5e-3  # weight of the gradients in the deconvolution, noise has its own beside it (chosen)
@@ -195,9 +185,9 @@ class Schuler:
     pull: float = 0.005  # weight of |c|² as a share of the mean diagonal of the equations
     turning: float = 4.0  # how much more the change with the angle is held back
 
-    def field(self, photos: Sequence[LinearPhoto]) -> BasisField:
-        """Estimate the field of all channels from photos of one lens at one setting."""
-        windows = windows_of(photos)
+    def field(self, photo: LinearPhoto) -> BasisField:
+        """Estimate the field of all channels from a photo."""
+        windows = windows_of(photo)
         if len(windows) < _LEAST_WINDOWS:
             raise NotEnoughEvidenceError(
                 f"{len(windows)} patches with edges determine no field; use a photo with more detail"
@@ -268,7 +258,7 @@ class _Patch:
 
     @classmethod
     def of(cls, window: PhotoWindow, channel: int, side: int) -> _Patch:
-        view = View.of(window.plane(channel), window.noise[channel])
+        view = View.of(window.planes[channel], window.noise[channel])
         canvas = PeriodicPlane.around(view.y, side)
         row, col = canvas.gradient_power()
         return cls(view, canvas, canvas.spectrum(view.y), row + col)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -18,24 +18,21 @@ ROOT: Final = Path(lensmodel.__file__).parents[1]
 _DATA: Final = (".npz", ".json")
 
 
-def version_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> str:
+def version_of(*modules: str, root: Path = ROOT) -> str:
     """Hash of the code and data behind some modules: 16 hexadecimal digits, wherever the tree lies."""
     total = hashlib.sha256()
-    for path in code_of(*modules, without=without, root=root):
+    for path in code_of(*modules, root=root):
         total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return total.hexdigest()[:16]
 
 
-def code_of(*modules: str, without: Sequence[str] = (), root: Path = ROOT) -> list[Path]:
-    """Files behind some modules, sorted: what they import anywhere, functions included, and their data.
-
-    Only packages below `root` count. Imports are read, not run, and relative ones are not used here.
-    """
+def code_of(*modules: str, root: Path = ROOT) -> list[Path]:
+    """Files behind some modules, sorted: what they import anywhere, functions included, and their data."""
     left, seen = list(modules), dict[str, Path]()
     while left:
         name = left.pop()
         path = _file_of(name, root)
-        if name in seen or path is None or any(f"{name}.".startswith(f"{out}.") for out in without):
+        if name in seen or path is None:
             continue
         seen[name] = path
         left += _imports(path, root)
@@ -52,20 +49,16 @@ def _file_of(name: str, root: Path) -> Path | None:
 
 
 @cache
-def _imports(path: Path, root: Path) -> tuple[str, ...]:
-    return tuple(_imported(ast.parse(path.read_text(encoding="utf-8")), root))
-
-
-def _imported(tree: ast.Module, root: Path) -> Iterator[str]:
+def _imports(path: Path, root: Path) -> list[str]:
     """Names that may be modules; of a package only what is taken from it, where that is all modules."""
-    for node in ast.walk(tree):
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            yield from names
-            if not all(_file_of(name, root) for name in names):
-                yield node.module
+            found += names if all(_file_of(name, root) for name in names) else [*names, node.module]
+    return found
 
 
 Unit: TypeAlias = dict[str, Any]

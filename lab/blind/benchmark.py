@@ -17,7 +17,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from multiprocessing import get_context
@@ -87,8 +87,6 @@ class CaseResult:
     mtf_rmse: float
     width_px: float  # RMS widths
     true_width_px: float
-    confidence: float  # what the estimator says of itself; NaN for "none"
-    predicted_error: float
     declined: bool  # the estimator gave no answer; the patch then stays as it is
     seconds: float  # of the estimate alone
 
@@ -99,37 +97,16 @@ class CaseResult:
 
 
 @dataclass(frozen=True, slots=True)
-class MethodSummary:
-    """One method at one noise level; shares are of all cases, the rest are medians.
-
-    `moment_bias` is the median of the difference of mean second moments, estimated minus true, in
-    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` a percentile.
-    """
-
-    method: str
-    noise: float
-    cases: int
-    improved: float
-    er_lt_3: float
-    er_lt_2: float
-    er_median: float
-    er_p90: float
-    ncc: float
-    rel_l2: float
-    mtf_rmse: float
-    moment_bias: float
-    width_ratio: float
-    declined: int
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
 class BlindReport:
-    """Outcome of a run: the settings, one row a method and noise level, and every case."""
+    """Outcome of a run: the settings, and every case."""
 
     settings: BlindBenchmark
-    summary: tuple[MethodSummary, ...]
     results: tuple[CaseResult, ...]
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """One row a method and noise level, see `summarised`."""
+        return summarised(self.results)
 
     def to_json(self) -> dict[str, object]:
         """Return settings, summary and cases as plain values; NaN becomes None."""
@@ -138,41 +115,40 @@ class BlindReport:
             "benchmark": "blind",
             "protocol": PROTOCOL,
             "settings": settings,
-            "summary": [plain(asdict(row)) for row in self.summary],
+            "summary": [plain(row) for row in self.summary],
             "cases": [{**plain(asdict(row)), "improved": row.improved} for row in self.results],
         }
 
 
-def summarised(results: Sequence[CaseResult]) -> tuple[MethodSummary, ...]:
-    """One row a method and noise level, in the order of first appearance."""
+def summarised(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
+    """One row a method and noise level, in the order of first appearance.
+
+    Shares are of all cases, the rest are medians; `width_ratio` is that of RMS widths over the true ones, NaN
+    for points, `er_p90` a percentile.
+    """
     groups: dict[tuple[float, str], list[CaseResult]] = {}
     for result in results:
         groups.setdefault((result.noise, result.method), []).append(result)
-    return tuple(_summary(noise, method, rows) for (noise, method), rows in groups.items())
-
-
-def _summary(noise: float, method: str, rows: Sequence[CaseResult]) -> MethodSummary:
-    def median(of: Callable[[CaseResult], float]) -> float:
-        return float(np.median([of(row) for row in rows]))
-
-    ratios = np.array([row.error_ratio for row in rows])
-    return MethodSummary(
-        method=method,
-        noise=noise,
-        cases=len(rows),
-        improved=float(np.mean([row.improved for row in rows])),
-        er_lt_3=float((ratios < 3.0).mean()),
-        er_lt_2=float((ratios < 2.0).mean()),
-        er_median=float(np.median(ratios)),
-        er_p90=float(np.percentile(ratios, 90.0)),
-        ncc=median(lambda row: row.ncc),
-        rel_l2=median(lambda row: row.rel_l2),
-        mtf_rmse=median(lambda row: row.mtf_rmse),
-        moment_bias=median(lambda row: row.width_px**2 - row.true_width_px**2),
-        width_ratio=median(lambda row: row.width_px / row.true_width_px if row.true_width_px else math.nan),
-        declined=sum(row.declined for row in rows),
-        seconds=median(lambda row: row.seconds),
-    )
+    rows = []
+    for (noise, method), own in groups.items():
+        ratios = np.array([row.error_ratio for row in own])
+        widths = [row.width_px / row.true_width_px if row.true_width_px else math.nan for row in own]
+        medians = ("ncc", "rel_l2", "mtf_rmse", "seconds")
+        rows.append(
+            {
+                "method": method,
+                "noise": noise,
+                "cases": len(own),
+                "improved": float(np.mean([row.improved for row in own])),
+                "er_lt_3": float((ratios < 3.0).mean()),
+                "er_lt_2": float((ratios < 2.0).mean()),
+                "er_median": float(np.median(ratios)),
+                "er_p90": float(np.percentile(ratios, 90.0)),
+                "width_ratio": float(np.median(widths)),
+                **{name: float(np.median([getattr(row, name) for row in own])) for name in medians},
+            }
+        )
+    return rows
 
 
 def plain(row: Mapping[str, object]) -> dict[str, object]:
@@ -180,42 +156,17 @@ def plain(row: Mapping[str, object]) -> dict[str, object]:
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
-class ResultStore:
-    """Finished results by the content they came from; one file of JSON lines, only ever appended."""
-
-    def __init__(self, folder: Path | None, photos: Sequence[Path]) -> None:
-        self._content = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
-        self._known: dict[str, CaseResult] = {}
-        self._file: Path | None = None
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = folder / "blind.jsonl"
-            self._known = dict(_stored(self._file)) if self._file.exists() else {}
-
-    def find(
-        self, case: BlindCase, kernel: Kernel, name: str, method: BlindMethod | None
-    ) -> CaseResult | None:
-        """Return the stored result, or None."""
-        return self._known.get(self._key(case, kernel, name, method))
-
-    def add(self, case: BlindCase, kernel: Kernel, method: BlindMethod | None, result: CaseResult) -> None:
-        """Keep a result, and write it out at once."""
-        key = self._key(case, kernel, result.method, method)
-        self._known[key] = result
-        if self._file is not None:
-            with self._file.open("a", encoding="utf-8") as out:
-                out.write(json.dumps({"key": key, **plain(asdict(result))}) + "\n")
-
-    def _key(self, case: BlindCase, kernel: Kernel, name: str, method: BlindMethod | None) -> str:
-        parts = (
-            PROTOCOL,
-            self._content[case.photo],
-            case.photo.stem,  # of which the noise is drawn
-            hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
-            (case.psf_number, case.noise, case.patch, case.seed, case.window),
-            (name, getattr(method, "version", 0), changed(method), KERNEL_SIZE),
-        )
-        return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+def key_of(case: BlindCase, content: str, kernel: Kernel, name: str, method: BlindMethod | None) -> str:
+    """Hash of all that a result depends on; `content` is that of the photograph."""
+    parts = (
+        PROTOCOL,
+        content,
+        case.photo.stem,  # of which the noise is drawn
+        hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
+        (case.psf_number, case.noise, case.patch, case.seed, case.window),
+        (name, getattr(method, "version", 0), changed(method), KERNEL_SIZE),
+    )
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
 def changed(method: object) -> dict[str, object]:
@@ -246,46 +197,39 @@ def run_blind_benchmark(
 ) -> BlindReport:
     """Run the benchmark; what the cache folder already holds is not computed again."""
     registry = compared if methods is None else methods
-    chosen = {name: registry.create(name) for name in settings.methods}
+    chosen: dict[str, BlindMethod | None] = {UNTOUCHED: None}
+    chosen |= {name: registry.create(name) for name in settings.methods}
     photos, kernels = list_photos(settings.photos), load_psfs(settings.psfs)
     cases = [
         case
         for noise in settings.noise
         for case in make_cases(
-            photos,
-            len(kernels),
-            half=settings.half,
-            noise=noise,
-            patch=settings.patch,
-            seed=0,
-            limit=settings.cases,
-            scenes=settings.scenes,
+            photos, len(kernels), half=settings.half, noise=noise, patch=settings.patch, seed=0,
+            limit=settings.cases, scenes=settings.scenes,
         )
-    ]
-    store = ResultStore(cache, photos)
+    ]  # fmt: skip
+    contents = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
+
+    def key(case: BlindCase, name: str) -> str:
+        return key_of(case, contents[case.photo], kernels[case.psf_number], name, chosen[name])
+
+    file = None if cache is None else cache / "blind.jsonl"
+    known = dict(_stored(file)) if file is not None and file.exists() else {}
     jobs = []
     for case in cases:
-        kernel = kernels[case.psf_number]
-        missing = {
-            name: method
-            for name, method in {UNTOUCHED: None, **chosen}.items()
-            if store.find(case, kernel, name, method) is None
-        }
+        missing = {name: method for name, method in chosen.items() if key(case, name) not in known}
         if missing:
-            jobs.append(_Job(case, kernel, missing))
-    done = len(cases) - len(jobs)
-    for job, fresh in _run(jobs, workers):
-        for result in fresh:
-            store.add(job.case, job.kernel, job.methods[result.method], result)
-        done += 1
+            jobs.append(_Job(case, kernels[case.psf_number], missing))
+    for done, (job, fresh) in enumerate(_run(jobs, workers), start=len(cases) - len(jobs) + 1):
+        known |= {key(job.case, result.method): result for result in fresh}
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with file.open("a", encoding="utf-8") as out:
+                for result in fresh:
+                    row = {"key": key(job.case, result.method), **plain(asdict(result))}
+                    out.write(json.dumps(row) + "\n")
         on_step(done, len(cases))
-    found = [
-        store.find(case, kernels[case.psf_number], name, method)
-        for case in cases
-        for name, method in {UNTOUCHED: None, **chosen}.items()
-    ]
-    results = tuple(result for result in found if result is not None)
-    return BlindReport(settings, summarised(results), results)
+    return BlindReport(settings, tuple(known[key(case, name)] for case in cases for name in chosen))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,11 +265,7 @@ def _run_job(job: _Job) -> list[CaseResult]:
         estimate = None
         if method is not None:
             try:
-                estimate = method.estimate(
-                    [seen.patch],
-                    [seen.noise],
-                    size=KERNEL_SIZE,
-                )
+                estimate = method.estimate([seen.patch], [seen.noise], size=KERNEL_SIZE)
             except NotEnoughEvidenceError as error:
                 logger.info("%s declined %s: %s", name, job.case.name, error)
         seconds = time.perf_counter() - started
@@ -347,8 +287,6 @@ def _run_job(job: _Job) -> list[CaseResult]:
                 mtf_rmse=distance.mtf_rmse,
                 width_px=psf.rms_width(kernel),
                 true_width_px=psf.rms_width(seen.kernel),
-                confidence=math.nan if estimate is None else float(estimate.confidence),
-                predicted_error=math.nan if estimate is None else float(estimate.predicted_error),
                 declined=method is not None and estimate is None,
                 seconds=seconds,
             )
@@ -369,18 +307,16 @@ def markdown_table(report: BlindReport) -> str:
     """Return the summary as a Markdown table, shares in percent."""
     rows = [
         [
-            f"{100 * s.noise:g} %",
-            s.method,
-            str(s.cases),
-            "" if s.method == UNTOUCHED else f"{100 * s.improved:.0f} %",
-            f"{100 * s.er_lt_3:.0f} %",
-            f"{100 * s.er_lt_2:.0f} %",
-            f"{s.er_median:.2f} ({s.er_p90:.1f})",
-            f"{s.ncc:.3f}",
-            f"{s.rel_l2:.2f}",
-            f"{s.mtf_rmse:.3f}",
-            f"{s.width_ratio:.2f}",
-            f"{s.seconds:.2f}",
+            f"{100 * s['noise']:g} %",
+            s["method"],
+            str(s["cases"]),
+            "" if s["method"] == UNTOUCHED else f"{100 * s['improved']:.0f} %",
+            *(f"{100 * s[name]:.0f} %" for name in ("er_lt_3", "er_lt_2")),
+            f"{s['er_median']:.2f} ({s['er_p90']:.1f})",
+            f"{s['ncc']:.3f}",
+            f"{s['rel_l2']:.2f}",
+            f"{s['mtf_rmse']:.3f}",
+            *(f"{s[name]:.2f}" for name in ("width_ratio", "seconds")),
         ]
         for s in report.summary
     ]
@@ -397,7 +333,7 @@ def curve_figure(report: BlindReport, noise: float) -> Figure:
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     ax = figure.add_subplot()
     grid = np.linspace(LOWEST, HIGHEST, 181)
-    for method in (row.method for row in report.summary if row.noise == noise):
+    for method in dict.fromkeys(r.method for r in report.results if r.noise == noise):
         ratios = np.array([r.error_ratio for r in report.results if r.method == method and r.noise == noise])
         untouched = method == UNTOUCHED
         (line,) = ax.plot(grid, cumulative(ratios, grid), label="no correction" if untouched else method)
@@ -410,20 +346,19 @@ def curve_figure(report: BlindReport, noise: float) -> Figure:
     return figure
 
 
+FILES: Final = ("blind.json", "blind.md")
+"""What a finished report consists of, beside its curves."""
+
+
 def write_report(report: BlindReport, folder: Path) -> tuple[Path, ...]:
-    """Write blind.json, blind.md and one curve a noise level as SVG and PNG."""
+    """Write `FILES`, and one curve a noise level as SVG and PNG."""
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {
-        "blind.json": json.dumps(report.to_json(), indent=1) + "\n",
-        "blind.md": markdown_table(report),
-    }
-    written = []
+    written = [folder / name for name in FILES]
+    texts = (json.dumps(report.to_json(), indent=1) + "\n", markdown_table(report))
+    for path, text in zip(written, texts, strict=True):
+        path.write_text(text, encoding="utf-8")
     for noise in report.settings.noise:
         for ending in ("svg", "png"):
-            path = folder / f"blind-er-{100 * noise:g}percent.{ending}"
-            curve_figure(report, noise).savefig(path, dpi=160)
-            written.append(path)
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
-        written.append(folder / name)
-    return tuple(sorted(written))
+            written.append(folder / f"blind-er-{100 * noise:g}percent.{ending}")
+            curve_figure(report, noise).savefig(written[-1], dpi=160)
+    return tuple(written)

@@ -6,35 +6,19 @@ wait for.
 
 from __future__ import annotations
 
-import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any
 
 import typer
 
-from lab.commands.gallery import gallery
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.files import as_usage, refuse_existing
-from lensmodel.cli.options import Force, Quiet, Verbose
-from lensmodel.core.codec import to_json
-from lensmodel.core.files import write_atomically
-
-NOISE: Final = "0.01,0.003"
-ESTIMATORS: Final = "default,michaeli-irani"
-BLIND_OUTPUT: Final = Path("bench-output")
-STANDARD_OUTPUT: Final = Path("-")
-FINISHED: Final = ("blind.json", "blind.md")
-"""What a finished report of `bench blind` consists of, beside its curves."""
-
-JsonFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--json",
-        metavar="FILE",
-        help="Also write the figures to this file; - prints them instead of the table.",
-    ),
-]
+from lensmodel.cli.options import Force
+from lensmodel.core.types import StepHook
 
 bench = typer.Typer(
     help="""Measure quality and speed.
@@ -48,7 +32,61 @@ bench = typer.Typer(
     no_args_is_help=True,
 )
 
-bench.command()(gallery)
+
+@bench.command()
+def gallery(
+    context: typer.Context,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="LENSMODEL_TEST_DATA",
+            metavar="FOLDER",
+            help="Test data with real photos; without it only simulated frames.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Where to write: a folder for page, crops and stored results."),
+    ] = Path("gallery-output"),
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only pictures whose name contains this; may be repeated."),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes and threads.")] = 2,
+) -> None:
+    """A page to look at: each picture calibrated from itself and corrected, beside its original.
+
+    Real photos of the test data and simulated frames, with crops at 3:1 and figures. Results are kept by the
+    content of the photo and the version of the code: the same command again goes on where it was, and writes
+    the page of the pictures it was asked for.
+
+    Examples:
+
+        lensmodel bench gallery --only simulated/text
+
+        lensmodel bench gallery --only simulated/snow --only simulated/sky -o two-pictures
+
+    Exit status: 0 the page is written, 1 something failed, 2 wrong usage.
+    """
+    from lab.gallery import page, pictures  # noqa: PLC0415 - see the top of the module
+
+    shown, began = Display.of(context), time.monotonic()
+    with as_usage():
+        known = [] if data is None else pictures.real_pictures(data)
+        chosen = pictures.chosen([*known, *pictures.simulated_pictures(output / page.CACHE)], only or [])
+    entries = []
+    for entry in page.entries_of(chosen, output, workers=workers, on_picture=told(shown, began)):
+        entries.append(entry)
+        written = page.write_page(entries, output)  # after each: a run that is stopped leaves a page
+    shown.result(page.text(entries))
+    shown.note(f"written: {written}")
+
+
+def told(shown: Display, began: float) -> Callable[[str, int, int], None]:
+    """Return what tells how much of long work is done."""
+    return lambda words, done, total: shown.progress_line(
+        f"{done} of {total} finished, {words}", time.monotonic() - began
+    )
 
 
 @bench.command()
@@ -56,10 +94,10 @@ def blind(
     context: typer.Context,
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
-    noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
+    noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = "0.01,0.003",
     methods: Annotated[
         str, typer.Option(help="Estimators, comma separated; also cho-lee, sun, xu-jia and zhang.")
-    ] = ESTIMATORS,
+    ] = "default,michaeli-irani",
     cases: Annotated[int | None, typer.Option(help="Largest number of cases.")] = None,
     scenes: Annotated[
         int | None,
@@ -68,13 +106,9 @@ def blind(
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="DIR", help="Where to write: a folder for tables and curves."),
-    ] = BLIND_OUTPUT,
-    json_output: JsonFile = None,
+        Path, typer.Option("--output", "-o", help="Where to write: a folder for tables and curves.")
+    ] = Path("bench-output"),
     force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
 ) -> None:
     """Blind PSF estimators on blurred patches with known truth (paper, section 5.1).
 
@@ -91,35 +125,21 @@ def blind(
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    from lab.blind.benchmark import (  # noqa: PLC0415 - see the top of the module
-        BlindBenchmark,
-        markdown_table,
-        run_blind_benchmark,
-        write_report,
-    )
+    from lab.blind import benchmark  # noqa: PLC0415 - see the top of the module
 
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
-    refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
+    shown = Display.of(context)
+    refuse_existing(*(output / name for name in benchmark.FILES), force=force)
+    levels = tuple(_parts("--noise must be numbers such as 0.01,0.003", noise, float))
     with as_usage():
-        settings = BlindBenchmark(
-            photos=photos,
-            psfs=psfs,
-            noise=_levels(noise),
-            methods=_names(methods),
-            half=half,  # type: ignore[arg-type]  # checked by the benchmark
-            cases=cases,
-            scenes=scenes,
+        settings = benchmark.BlindBenchmark(
+            photos, psfs, levels, _names(methods), half, cases, scenes=scenes,  # type: ignore[arg-type]  # of half: checked there
+        )  # fmt: skip
+    with _bar(shown, "cases") as on_step:
+        report = benchmark.run_blind_benchmark(
+            settings, workers=workers, cache=output / "cache", on_step=on_step
         )
-    with as_usage(), shown.progress() as bars:
-        task = bars.add_task("cases", total=None)
-        report = run_blind_benchmark(
-            settings,
-            workers=workers,
-            cache=output / "cache",
-            on_step=lambda done, total: bars.update(task, completed=done, total=total),
-        )
-    written = write_report(report, output)
-    _tell(shown, json_output, report.to_json(), markdown_table(report))
+    written = benchmark.write_report(report, output)
+    shown.result(benchmark.markdown_table(report))
     shown.note("written: " + ", ".join(str(path) for path in written))
 
 
@@ -131,41 +151,24 @@ def model(
     ] = "1000:1004",
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
-    json_output: JsonFile = None,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
 ) -> None:
     """Predictions of the lens model where no sample was, against other regressions.
 
-    Examples:
+    Example:
 
         lensmodel bench model --seeds 1000:1001 --photos 1 --methods eff-linear
 
-        lensmodel bench model --json model.json
-
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
-    refuse_existing(_file(json_output), force=force)
-    try:
-        first, last = (int(part) for part in seeds.split(":"))
-        counts = [int(part) for part in photos.split(",")]
-    except ValueError as error:
-        raise UsageError(
-            f"give --seeds like 1000:1004 and --photos like 1,5, got {seeds} and {photos}"
-        ) from error
-    from lab.model.model_benchmark import run_model_benchmark, table  # noqa: PLC0415 - see the top of the module
+    from lab.model_benchmark import run_model_benchmark, table  # noqa: PLC0415 - see the top of the module
 
-    with as_usage(), shown.progress() as bars:
-        task = bars.add_task("fits", total=None)
+    shown, words = Display.of(context), "give --seeds like 1000:1004 and --photos like 1,5"
+    lenses, counts = range(*_parts(words, seeds, int, ":", 2)), _parts(words, photos, int)
+    with _bar(shown, "fits") as on_step:
         result = run_model_benchmark(
-            seeds=range(first, last),
-            photos=counts,
-            methods=None if methods is None else _names(methods),
-            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+            seeds=lenses, photos=counts, methods=None if methods is None else _names(methods), on_step=on_step
         )
-    _tell(shown, json_output, result, table(result))
+    shown.result(table(result))
 
 
 @bench.command()
@@ -186,13 +189,6 @@ def correct(
     roi: Annotated[
         str | None, typer.Option(metavar="T,L,H,W", help="Only this part, in the cells of the whole photo.")
     ] = None,
-    beside: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Compare CPU time with that of N threads.")
-    ] = None,
-    json_output: JsonFile = None,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
 ) -> None:
     """Time and memory of correcting a photo, and of the Richardson-Lucy step against its peers.
 
@@ -200,7 +196,7 @@ def correct(
 
         lensmodel bench correct --methods fast
 
-        lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
+        lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2
 
         lensmodel bench correct --photo scan.png --raw --methods fast,standard
 
@@ -214,16 +210,16 @@ def correct(
     from lensmodel.photo import develop  # noqa: PLC0415 - same
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output == STANDARD_OUTPUT)
-    refuse_existing(_file(json_output), force=force)
+    shown = Display.of(context)
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")
-    window = _window(roi)
+    window = (
+        roi if roi is None else tuple(_parts("--roi must be four whole numbers T,L,H,W", roi, int, length=4))
+    )
     developed = develop(photo or demo_data_path("lake.jpg"))
     if raw and developed.cfa is None:
         developed = as_raw(developed.planes)
-    with as_usage(), shown.progress() as bars:
-        task = bars.add_task("methods", total=None)
+    with _bar(shown, "methods") as on_step:
         result = run_correct_benchmark(
             developed.planes,
             cfa=developed.cfa,
@@ -232,43 +228,29 @@ def correct(
             repeats=repeats,
             peers=PEERS if peers else (),
             roi=window,
-            beside=beside,
-            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+            on_step=on_step,
         )
-    _tell(shown, json_output, result, correct_table(result))
+    shown.result(correct_table(result))
 
 
-def _window(text: str | None) -> tuple[int, int, int, int] | None:
-    if text is None:
-        return None
-    try:
-        top, left, height, width = (int(part) for part in text.split(","))
-    except ValueError as error:
-        raise UsageError(f"--roi must be four whole numbers T,L,H,W, got {text!r}") from error
-    return top, left, height, width
+@contextmanager
+def _bar(shown: Display, what: str) -> Iterator[StepHook]:
+    """Show how many of how many are done; a refused value is wrong usage."""
+    with as_usage(), shown.progress() as bars:
+        task = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
-def _levels(text: str) -> tuple[float, ...]:
+def _parts(words: str, text: str, kind: type, separator: str = ",", length: int | None = None) -> list[Any]:
+    """Read numbers with separators; a refusal says how they look."""
+    parts = text.split(separator)
     try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise UsageError(f"--noise must be numbers such as 0.01,0.003, got {text!r}") from error
-
-
-def _file(json_output: Path | None) -> Path | None:
-    return None if json_output == STANDARD_OUTPUT else json_output
-
-
-def _tell(shown: Display, json_output: Path | None, result: object, words: str) -> None:
-    """Print the table, or the figures where they were asked for; write them where a file was named."""
-    if json_output == STANDARD_OUTPUT:
-        shown.document(result)
-        return
-    shown.result(words)
-    if json_output is not None:
-        json_output.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(json_output, json.dumps(to_json(result), indent=1).encode())
+        if length in (None, len(parts)):
+            return [kind(part) for part in parts]
+    except ValueError:
+        pass
+    raise UsageError(f"{words}, got {text!r}")

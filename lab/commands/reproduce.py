@@ -9,11 +9,11 @@ from typing import Annotated, Literal, cast, get_args
 
 import typer
 
+from lab.commands.benchmarks import told
 from lensmodel.cli.console import Display
 from lensmodel.cli.files import refuse_existing
-from lensmodel.cli.options import Force, Quiet, Verbose, choice
+from lensmodel.cli.options import Force, choice
 
-DATA_VARIABLE = "LENSMODEL_TEST_DATA"
 Size = Literal["quick", "default"]
 PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")
 """What is in the folder of a finished reproduction, beside pictures and stored results."""
@@ -55,15 +55,9 @@ def reproduce(
         ),
     ] = False,
     assert_bars: Annotated[
-        bool,
-        typer.Option(
-            "--assert-bars",
-            help="Fail where a bar is missed, and name each.",
-        ),
+        bool, typer.Option("--assert-bars", help="Fail where a bar is missed, and name each.")
     ] = False,
     force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
 ) -> None:
     """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
 
@@ -79,19 +73,15 @@ def reproduce(
 
     Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context)
     refuse_existing(*(output / name for name in PAGE), force=force)
-    from lab.reproduce.bars import missed  # noqa: PLC0415 - the simulation is slow to import
-    from lab.reproduce.cases import planned  # noqa: PLC0415 - same
+    from lab.reproduce.cases import planned  # noqa: PLC0415 - the simulation is slow to import
     from lab.reproduce.job import run_reproduction  # noqa: PLC0415 - same
     from lab.reproduce.page import collected, write_json, write_page  # noqa: PLC0415 - same
+    from lab.reproduce.tables import missed  # noqa: PLC0415 - same
 
     plan = planned(cast("Size", size), scenes=_external(), lenses=lens or (), compare=compare)
-    began = time.monotonic()
-
-    def on_work(words: str, done: int, total: int) -> None:
-        shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
-
+    on_work = told(shown, time.monotonic())
     result = run_reproduction(plan, output, on_work=on_work, workers=os.cpu_count() or 1)
     result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
     written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
@@ -102,8 +92,5 @@ def reproduce(
 
 
 def _external() -> Path | None:
-    named = os.environ.get(DATA_VARIABLE)
-    if not named:
-        return None
-    folder = Path(named) / "sharp"
+    folder = Path(os.environ.get("LENSMODEL_TEST_DATA", "nowhere")) / "sharp"
     return folder if folder.is_dir() else None

@@ -12,8 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.correction.windows import partition
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, Kernel, Plane
@@ -31,19 +29,11 @@ class _Window(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EfficientFilterFlow:
-    """Blur that changes over the field [1]_.
+    """Blur that changes over the field: y = sum_r place_r(a_r * (w_r . crop_r(x))), sum_r w_r = 1.
 
-    Windows first, then one convolution for each::
-
-        y = sum_r  place_r( a_r * (w_r . crop_r(x)) ),        sum_r w_r = 1
-
-    The windows act on the sharp plane, so each point of the scene keeps one kernel and all of
-    its light. Between window centres the kernels are interpolated linearly.
-
-    References
-    ----------
-    .. [1] M. Hirsch, S. Sra, B. Schölkopf, S. Harmeling, "Efficient filter flow for
-       space-variant multiframe blind deconvolution", CVPR 2010.
+    The windows act on the sharp plane, so each point of the scene keeps one kernel and all of its light.
+    Source: M. Hirsch, S. Sra, B. Schölkopf, S. Harmeling, "Efficient filter flow for space-variant multiframe
+    blind deconvolution", CVPR 2010.
     """
 
     height: int  # size of the frame in pixels
@@ -51,11 +41,6 @@ class EfficientFilterFlow:
     # grid of kernels, row by row, all of one side; `kernels[i][j]` belongs to the centre of window (i, j) of
     # an even partition of the frame
     kernels: tuple[tuple[Kernel, ...], ...]
-
-    def __post_init__(self) -> None:
-        shapes = {kernel.shape for line in self.kernels for kernel in line}
-        if len(shapes) != 1 or len({len(line) for line in self.kernels}) != 1:
-            raise InvalidInputError("the kernels of a filter flow must form a full grid of one size")
 
     @classmethod
     def of_field(
@@ -83,8 +68,6 @@ class EfficientFilterFlow:
 
     def forward(self, latent: Plane) -> Plane:
         """Return F x, `(height, width)`."""
-        if latent.shape != self.latent_shape:
-            raise InvalidInputError(f"latent plane must be {self.latent_shape}, got {latent.shape}")
         reach = self.reach
         # Each window lands with a margin of the kernel's half side; the frame is cut out at the end.
         full = np.zeros((latent.shape[0] + 2 * reach, latent.shape[1] + 2 * reach))
@@ -95,23 +78,6 @@ class EfficientFilterFlow:
             )
         cut = 2 * reach
         return np.asarray(full[cut : cut + self.height, cut : cut + self.width], dtype=np.float32)
-
-    def adjoint(self, blurred: Plane) -> Plane:
-        """Return F^T y on the latent plane."""
-        if blurred.shape != (self.height, self.width):
-            raise InvalidInputError(f"blurred plane must be {self.height, self.width}, got {blurred.shape}")
-        reach = self.reach
-        full = np.pad(blurred, 2 * reach)
-        latent = np.zeros(self.latent_shape)
-        for rows, cols, weight, blur in self._windows():
-            piece = full[rows.start : rows.stop + 2 * reach, cols.start : cols.stop + 2 * reach]
-            latent[rows, cols] += weight * blur.frame(blur.frame(blur.adjoint(piece)))
-        return latent.astype(np.float32)
-
-    def frame(self, latent: Plane) -> Plane:
-        """Return the part of the latent plane that the photo shows."""
-        cut = self.reach
-        return latent[cut : cut + self.height, cut : cut + self.width]
 
     def _windows(self) -> Iterator[_Window]:
         reach = self.reach
@@ -134,3 +100,29 @@ def _widened(
         before = margin if i == 0 else 0
         after = margin if i == len(pieces) - 1 else 0
         yield start + margin - before, np.pad(window, (before, after), mode="edge")
+
+
+def partition(extent: int, parts: int) -> tuple[tuple[int, NDArray[np.float64]], ...]:
+    """Cut `extent` pixels into `parts` overlapping windows, (start, weights), that sum to one everywhere."""
+    centres = (np.arange(parts) + 0.5) * extent / parts - 0.5
+    t = np.arange(extent, dtype=np.float64)
+    pieces = []
+    for i in range(parts):
+        weight = np.ones(extent)
+        if i > 0:
+            weight *= _rise((t - centres[i - 1]) / (centres[i] - centres[i - 1]))
+        if i < parts - 1:
+            weight *= 1.0 - _rise((t - centres[i]) / (centres[i + 1] - centres[i]))
+        inside = np.flatnonzero(weight > 0.0)
+        start, stop = int(inside[0]), int(inside[-1]) + 1
+        pieces.append((start, weight[start:stop]))
+    return tuple(pieces)
+
+
+def _rise(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Left half of the Bartlett-Hann window, stretched onto 0..1, flat outside.
+
+    Of w(s) = 0.62 - 0.48 |s - 1/2| - 0.38 cos(2 pi s): 0 at s = 0, 1 at s = 1, rise(s) + rise(1 - s) = 1.
+    """
+    half = 0.5 * np.clip(s, 0.0, 1.0)
+    return np.asarray(0.62 - 0.48 * (0.5 - half) - 0.38 * np.cos(2.0 * np.pi * half))

@@ -1,54 +1,31 @@
 """Time and peak memory from file to file; prints the figures of docs/lab/performance.md.
 
-    python -m lab.correction.memory [--kind tif] [--megapixels 100] [--photo FILE] [--method fast]
+    python -m lab.correction.memory --photo FILE [--as-it-is] [--method fast]
 
-Makes a file of smooth light with noise, or a RAW photo of the picture FILE, develops it, corrects it with the
-lens of `lensmodel bench correct` and writes a 16-bit TIFF, as `lensmodel correct` does; `--as-it-is` corrects
-FILE itself. Peaks are those of each part, by Linux's own count. 100 megapixels need 2 GiB of disk.
+Makes a RAW photo of the picture FILE, develops it, corrects it with the lens of `lensmodel bench correct` and
+writes a 16-bit TIFF, as `lensmodel correct` does; `--as-it-is` corrects FILE itself. Peaks are those of each
+part, by Linux's own count.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-import tifffile
-from scipy import ndimage
-
 from lab.correction.correction_benchmark import SoftCorners
 from lab.peers import light_numbers, write_raw
 from lensmodel.correction import correct_planes
 from lensmodel.photo import develop, write_image
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.workflow.correcting import lateral_of
-
-
-def write_photo(path: Path, megapixels: float) -> None:
-    """Write a picture of a 4:3 sensor."""
-    rng = np.random.default_rng(0)
-    rows = round(math.sqrt(megapixels * 1e6 * 3 / 4)) // 2 * 2
-    cols = round(rows * 4 / 3) // 2 * 2
-    tile = ndimage.gaussian_filter(rng.random((512, 512)), 3, mode="wrap")
-    tile = (tile - tile.min()) / np.ptp(tile) + 0.01 * rng.standard_normal(tile.shape)
-    numbers = (1000 + 9000 * np.clip(tile, 0, 1)).astype(np.uint16)
-    light = np.tile(numbers, (-(-rows // 512), -(-cols // 512)))[:rows, :cols]
-    if path.suffix == ".dng":
-        write_bayer_dng(path, light, black=512, white=15000)
-    else:
-        tifffile.imwrite(path, np.stack([light * 4] * 3, axis=-1), photometric="rgb")
 
 
 def main() -> None:
     """Run and print the peak after each part."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kind", choices=["tif", "dng"], default="tif")
-    parser.add_argument("--megapixels", type=float, default=100.0)
-    parser.add_argument("--photo", type=Path, metavar="FILE", help="a picture to make a RAW photo of")
+    parser.add_argument("--photo", type=Path, metavar="FILE", required=True, help="a picture")
     parser.add_argument("--as-it-is", action="store_true", help="correct FILE itself")
     parser.add_argument("--method", default="fast")
     parser.add_argument("--workers", type=int, default=1, metavar="N")
@@ -63,20 +40,13 @@ def main() -> None:
         print(f"{part}: peak {peak:.0f} MiB, {cpu:.1f} CPU s, {wall:.1f} s", flush=True)
 
     with tempfile.TemporaryDirectory() as name:
-        source = Path(name) / f"in.{'dng' if wanted.photo else wanted.kind}"
-        if wanted.as_it_is:
-            source = wanted.photo
+        source = wanted.photo if wanted.as_it_is else Path(name) / "in.dng"
         # In a process of its own, so that its memory does not count here.
-        pid = os.fork()
-        if pid == 0:
-            if wanted.as_it_is:
-                pass
-            elif wanted.photo:
+        if not wanted.as_it_is:
+            if (pid := os.fork()) == 0:
                 write_raw(light_numbers(develop(wanted.photo).planes), source)
-            else:
-                write_photo(source, wanted.megapixels)
-            os._exit(0)
-        os.waitpid(pid, 0)
+                os._exit(0)
+            os.waitpid(pid, 0)
         tell("start")
         photo = develop(source)
         tell("developed")

@@ -10,7 +10,6 @@ import typer
 
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import Quiet, Verbose
 
 FILES: Final = frozenset({"before-after.png", "corrected.tif", "report.md", "service.log"})
 """What a demo leaves in its folder."""
@@ -25,8 +24,6 @@ def demo(
         ),
     ] = Path("demo-output"),
     force: Annotated[bool, typer.Option("--force", help="Use a folder that holds other files too.")] = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
 ) -> None:
     """Run the whole process on a simulated lens whose true blur is known.
 
@@ -40,7 +37,7 @@ def demo(
 
     Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
+    shown = Display.of(context)
     _refuse_what_others_wrote(output, force=force)
     from lab.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 

@@ -234,11 +234,7 @@ def _profiles(
     cols: NDArray[np.intp],
     direction: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Lightness across each edge from its dark to its light side, `(n, 2 reach + 1)`.
-
-    Linear between pixels: a spline through an edge as sharp as pixels allow leaves its plateaus by itself,
-    by 4 percent of the step.
-    """
+    """Lightness across each edge from its dark to its light side, `(n, 2 reach + 1)`."""
     t = np.arange(-_REACH, _REACH + 1)[None, :]
     total = np.zeros((rows.size, t.size))
     for along in range(-2, 3):

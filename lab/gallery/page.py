@@ -1,30 +1,36 @@
-"""The gallery's page beside its crops, and the same figures as a table of text."""
+"""What the gallery shows of each picture: figures, and crops of the places that are looked at."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from lab.gallery.crops import SIDE, ZOOM
-from lab.gallery.run import GalleryEntry
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lab.gallery.measure import bars, measured
+from lab.gallery.pictures import Picture, Rendered, taken
+from lab.gallery.work import AFTER, BEFORE, Words, work
+from lab.images import BLOCK, crop_boxes, side_by_side
+from lab.images import Picture as Shown
 from lab.page import Page, table
+from lab.stored import Unit, stored, version_of
 
-PAGE: Final = "index.md"
+SIDE: Final = 96
+ZOOM: Final = 3
+"""Pixels of a crop, and how many times each is shown."""
 
-HEAD: Final = (
-    "picture",
-    "state",
-    "dots",
-    "hue flips",
-    "overshoot %",
-    "grain",
-    "gain dB",
-    "blocks < -0.5 dB",
-    "worst block",
-)
+WORST: Final = 3  # crops of the worst places (chosen)
+_SQUARE: Final = 48  # pixels of a square that is scored: half a crop, so that one shows all of it
+_EVEN: Final = 0.02
+"""Added to the local contrast: a change of an even place counts against it, not against nothing."""
 
-_COLUMN_OF: Final = {
+CACHE, CROPS = "cache", "crops"
+
+_COLUMNS: Final = {
     "dots": "dots",
     "hue flips": "hue flips",
     "overshoot": "overshoot %",
@@ -34,21 +40,135 @@ _COLUMN_OF: Final = {
 }
 """Bar -> column of its figure."""
 
+_HEAD: Final = ("picture", "state", *_COLUMNS.values(), "worst block")
 
-def cells(entry: GalleryEntry) -> list[str]:
-    """One row of the table of figures, in the order of `HEAD`."""
-    found, state = entry.figures, entry.work["state"]
+Place = tuple[str, int, int]
+"""Name, first row and first column."""
+
+
+@dataclass(frozen=True, slots=True)
+class GalleryEntry:
+    """What the page shows of one picture."""
+
+    picture: Picture
+    work: Unit  # how it was made, see `work`
+    figures: dict[str, Any]  # see `measured`; empty for an unreadable file
+    bars: dict[str, bool]  # which it keeps
+    crops: dict[str, str]  # files of crops side by side, relative to the page, by what they show
+
+
+def entries_of(
+    pictures: Sequence[Picture], output: Path, *, workers: int, on_picture: Callable[[str, int, int], None]
+) -> Iterator[GalleryEntry]:
+    """Make what the page shows, one picture after the other."""
+    (output / CROPS).mkdir(parents=True, exist_ok=True)
+    for done, picture in enumerate(pictures):
+
+        def say(words: str, done: int = done, name: str = picture.name) -> None:
+            on_picture(f"{name}: {words}", done, len(pictures))
+
+        yield _entry(picture, output, workers, say)
+        say("done", done + 1)
+
+
+def _entry(picture: Picture, output: Path, workers: int, say: Words) -> GalleryEntry:
+    if picture.unreadable:
+        unit: Unit = {"state": "not read", "reason": picture.unreadable, "note": "", "announced": {}}
+        return GalleryEntry(picture, unit, {}, {}, {})
+    say("taking the photo")
+    taken(picture)
+    folder, unit = work(picture, output / CACHE, workers, say)
+    before = np.load(folder / BEFORE, mmap_mode="r")
+    after = np.load(folder / AFTER, mmap_mode="r") if (folder / AFTER).exists() else before
+    truth = None if picture.truth is None else np.load(picture.truth, mmap_mode="r")
+    say("measuring")
+    name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
+    found = stored(folder / name, lambda: measured(before, after, truth))
+    sheets = {"original": before, "corrected": after} | ({} if truth is None else {"truth": truth})
+    named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
+    named += [("most dots", found["dots_at"]), ("most hue flips", found["hue_flips_at"])]
+    if found["gains"] is not None and found["gains"]["worst_db"] < 0.0:
+        middle = [k + BLOCK // 2 for k in found["gains"]["worst_at"]]
+        named.append((f"worst block, {found['gains']['worst_db']:+.2f} dB", middle))
+    crops = {}
+    for number, (words, row, col) in enumerate(places(before, after, named), start=1):
+        file = f"{CROPS}/{picture.slug}-{number}.png"
+        made = sheet(list(sheets.values()), row, col, side_of(before))
+        Image.fromarray(made).save(output / file, optimize=True)
+        crops[f"{words}: {', '.join(sheets)}; row {row}, column {col}"] = file
+    return GalleryEntry(picture, unit, found, bars(found), crops)
+
+
+def places(
+    before: Rendered, after: Rendered, named: Sequence[tuple[str, Sequence[int] | None]] = ()
+) -> list[Place]:
+    """Centre, corners, the three places where most was changed, and pixels with a name apart from these."""
+    height, width = before.shape[:2]
+    side = side_of(before)
+
+    def around(row: int, col: int) -> tuple[int, int]:
+        return min(max(row - side // 2, 0), height - side), min(max(col - side // 2, 0), width - side)
+
+    found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]
+    for number, peak in enumerate(_peaks(_change(before, after), side), start=1):
+        found.append((f"most changed {number}", *around(*peak)))
+    for name, pixel in named:
+        if pixel is not None:
+            row, col = around(pixel[0], pixel[1])
+            if all(max(abs(row - r), abs(col - c)) > side // 2 for _, r, c in found):
+                found.append((name, row, col))
+    return found
+
+
+def side_of(picture: Rendered) -> int:
+    """Side of the crops of a picture: less where it is small."""
+    return min(SIDE, picture.shape[0] // 2, picture.shape[1] // 2)
+
+
+def sheet(pictures: Sequence[Rendered], row: int, col: int, side: int) -> Shown:
+    """One place of several pictures side by side, each pixel as a square of three."""
+    crops = [(picture[row : row + side, col : col + side] // 257).astype(np.uint8) for picture in pictures]
+    return side_by_side([crop.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1) for crop in crops])
+
+
+def _change(before: Rendered, after: Rendered) -> NDArray[np.float64]:
+    """Mean change of each square over the original's contrast there."""
+    across = before.shape[1] // _SQUARE
+    rows = []
+    for row in range(0, before.shape[0] - _SQUARE + 1, _SQUARE):
+        old, new = (
+            picture[row : row + _SQUARE, : across * _SQUARE].reshape(_SQUARE, across, _SQUARE, 3) / 65535.0
+            for picture in (before, after)
+        )
+        contrast = old.std(axis=(0, 2)).mean(axis=-1)
+        rows.append(np.abs(new - old).mean(axis=(0, 2, 3)) / (contrast + _EVEN))
+    return np.array(rows)
+
+
+def _peaks(score: NDArray[np.float64], side: int) -> list[tuple[int, int]]:
+    """Middles of the highest squares whose crops do not overlap; none where nothing was changed."""
+    apart = -(-side // _SQUARE)
+    left = score.copy()
+    found: list[tuple[int, int]] = []
+    while len(found) < WORST and left.size and left.max() > 0.0:
+        row, col = (int(k) for k in np.unravel_index(int(left.argmax()), left.shape))
+        found.append((row * _SQUARE + _SQUARE // 2, col * _SQUARE + _SQUARE // 2))
+        left[max(row - apart, 0) : row + apart + 1, max(col - apart, 0) : col + apart + 1] = 0.0
+    return found
+
+
+def _cells(entry: GalleryEntry) -> list[str]:
+    """One row of the table of figures, in the order of `_HEAD`."""
+    found, row = entry.figures, [entry.picture.name, entry.work["state"]]
     if not found:
-        return [entry.picture.name, state, *[""] * (len(HEAD) - 2)]
+        return [*row, *[""] * (len(_HEAD) - 2)]
     overshoot, grain, gains = found["overshoot"], found["grain"], found["gains"]
-    row = [
-        entry.picture.name,
-        state,
+    row += [
         str(found["dots"]),
         str(found["hue_flips"]),
         f"few edges ({found['edges']})"
         if overshoot is None
-        else f"{overshoot[1]:.1f} (original {overshoot[0]:.1f})",
+        else "{1:.1f} (original {0:.1f})".format(*overshoot),
         "nothing even" if grain is None else " ".join(f"{ratio:.2f}" for ratio in grain.values()),
     ]
     if gains is None:
@@ -57,10 +177,10 @@ def cells(entry: GalleryEntry) -> list[str]:
     return [*row, zones, f"{100 * gains['loss_share']:.1f} %", f"{gains['worst_db']:+.2f}"]
 
 
-def summary(entries: Sequence[GalleryEntry]) -> list[str]:
+def _summary(entries: Sequence[GalleryEntry]) -> list[str]:
     """Which bars hold, in words: one line for each."""
     lines = []
-    for bar in _COLUMN_OF:
+    for bar in _COLUMNS:
         asked = [entry for entry in entries if bar in entry.bars]
         missed = [entry.picture.name for entry in asked if not entry.bars[bar]]
         kept = f"{len(asked) - len(missed)} of {len(asked)} pictures"
@@ -70,55 +190,39 @@ def summary(entries: Sequence[GalleryEntry]) -> list[str]:
 
 def text(entries: Sequence[GalleryEntry]) -> str:
     """Figures and bars as Markdown, for a terminal."""
-    rows = [cells(entry) for entry in entries]
-    return table(HEAD, rows) + "\n\nBars\n\n" + "\n".join(f"- {line}" for line in summary(entries))
+    lines = "\n".join(f"- {line}" for line in _summary(entries))
+    return f"{table(_HEAD, map(_cells, entries))}\n\nBars\n\n{lines}"
 
 
 def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
     """Write the page as Markdown and HTML; its crops are there already. Returns the path of the HTML."""
     page = Page()
     page.title("Gallery", 1)
-    page.text(_INTRODUCTION)
+    page.text(
+        "Each picture is calibrated from itself and corrected with default settings. "
+        f"Crops show {SIDE} pixels at {ZOOM}:1. What the figures are: docs/lab/gallery.md. "
+        "A figure in bold misses its bar."
+    )
     page.title("Bars")
-    page.text("; ".join(summary(entries)) + ".")
+    page.text("; ".join(_summary(entries)) + ".")
     rows = []
     for entry in entries:
-        missed = {_COLUMN_OF[bar] for bar, kept in entry.bars.items() if not kept}
-        named = zip(HEAD, cells(entry), strict=True)
+        missed = {_COLUMNS[bar] for bar, kept in entry.bars.items() if not kept}
+        named = zip(_HEAD, _cells(entry), strict=True)
         rows.append([f"**{cell}**" if name in missed else cell for name, cell in named])
-    page.table(HEAD, rows)
+    page.table(_HEAD, rows)
     for entry in entries:
         page.title(entry.picture.name)
-        page.text("; ".join(_words(entry)) + ".")
-        if entry.work.get("announced"):
-            gains = ", ".join(
-                f"{zone} {'not known' if value is None else f'{value:+.1f} dB'}"
-                for zone, value in entry.work["announced"].items()
-            )
-            page.text(f"Announced gain: {gains}.")
-        columns = ", ".join(entry.columns)
-        for place in entry.places:
-            page.picture(place.file, f"{place.name}: {columns}; row {place.row}, column {place.col}")
-    return page.write(output / PAGE, "Gallery")[1]
-
-
-_INTRODUCTION: Final = (
-    "Each picture is calibrated from itself and corrected with default settings. "
-    f"Crops show {SIDE} pixels at {ZOOM}:1. Figures are taken from the pictures as shown: dots are single "
-    "pixels outside what the original has around them, hue flips colours that it has nowhere near; overshoot "
-    "is the 99th percentile beside clean edges, in percent of the step; grain is noise power of lightness in "
-    "even places, corrected over original, coarse, middle and fine; gains are against the truth, after each "
-    "block's own best shift. A figure in bold misses its bar."
-)
-
-
-def _words(entry: GalleryEntry) -> list[str]:
-    """How a picture was made."""
-    unit = entry.work
-    words = [unit["state"] + (f" ({unit['reason']})" if unit["reason"] else ""), *unit["notes"]]
-    if entry.figures:
-        words.append(f"{100 * entry.figures['changed']:.1f} % of the pixels changed visibly")
-    if "seconds" in unit:
-        calibrated, corrected = unit["seconds"]
-        words.append(f"calibrated in {calibrated:.0f} s, corrected in {corrected:.0f} s")
-    return words
+        unit = entry.work
+        words = [unit["state"] + (f" ({unit['reason']})" if unit["reason"] else ""), unit["note"]]
+        words += (
+            [f"{100 * entry.figures['changed']:.1f} % of the pixels changed visibly"] if entry.figures else []
+        )
+        words += [
+            f"announced in {zone}: {'not known' if value is None else f'{value:+.1f} dB'}"
+            for zone, value in unit["announced"].items()
+        ]
+        page.text("; ".join(filter(None, words)) + ".")
+        for shown, file in entry.crops.items():
+            page.picture(file, shown)
+    return page.write(output / "index.md", "Gallery")[1]

@@ -13,15 +13,17 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from lab.reproduce.frames import MARGIN
+from lab.reproduce.cases import MARGIN
 from lab.reproduce.shots import JPEG_QUALITY
 from lab.scenes import hard_scene
 from lab.stored import version_of
+from lab.traced import GridLens
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotAnImageError
 from lensmodel.core.files import atomic
+from lensmodel.core.psf import PsfField
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.photo import Encoding, develop, inspect, write_image
-from lensmodel.simulate import SimulatedCamera, draw_lens, photograph, write_photo
+from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, photograph, write_photo
 
 Rendered = NDArray[np.uint16]
 """A picture `(row, col, 3)`, sRGB, 0 to 65535, in sensor orientation."""
@@ -29,7 +31,7 @@ Rendered = NDArray[np.uint16]
 
 def rendered(planes: Planes, encoding: Encoding) -> Rendered:
     """Render linear planes as the program writes them for a viewer: an sRGB TIFF of 16 bits."""
-    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
+    with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "picture.tif"
         write_image(path, planes, encoding, format="tiff16", color_space="srgb")
         return read_rendered(path)
@@ -66,6 +68,22 @@ class SimulatedFrame:
     jpeg: bool = False  # whether it is a camera's JPEG, else a DNG
     full_well_electrons: float = 50_000.0  # of the sensor at this ISO, electrons
     read_noise: float = 50.0
+    grid: Path | None = None  # of a ray-traced lens that takes the place of the drawn one
+
+    @property
+    def optics(self) -> SimulatedLens | GridLens:
+        """The lens."""
+        return draw_lens(self.lens) if self.grid is None else GridLens.read(self.grid)
+
+    @property
+    def settings(self) -> LensSettings:
+        """Wide open."""
+        focal = self.optics.focal_mm[0]
+        return LensSettings(aperture=self.optics.widest(focal), focal_mm=focal)
+
+    def truth(self) -> PsfField:
+        """Return the true PSF field."""
+        return self.optics.field(self.settings)
 
     @property
     def file(self) -> str:
@@ -95,31 +113,19 @@ def take(
         return photo, truth
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([frame.lens, 18])
-    lens = draw_lens(frame.lens)
     camera = SimulatedCamera(
-        height=height,
-        width=width,
-        full_well_electrons=frame.full_well_electrons,
-        read_noise=frame.read_noise,
+        height, width, full_well_electrons=frame.full_well_electrons, read_noise=frame.read_noise
     )
-    focal = lens.focal_mm[0]
-    settings = LensSettings(aperture=lens.at_focal(focal).f_number, focal_mm=focal)
     scene = hard_scene(frame.scene, height + 2 * MARGIN, width + 2 * MARGIN, rng)
-    taken = photograph(scene, lens, settings, camera, rng)
+    taken = photograph(scene, frame.optics, frame.settings, camera, rng)
     raw = folder / f"{frame.name}.dng"
     write_photo(raw, taken)
     developed = develop(raw)
     with atomic(truth) as file:
         np.save(file, rendered(taken.sharp, developed.encoding), allow_pickle=False)
     if frame.jpeg:
-        write_image(
-            photo,
-            developed.planes,
-            developed.encoding,
-            format="jpeg",
-            color_space="srgb",
-            quality=JPEG_QUALITY,
-        )
+        planes, encoding = developed.planes, developed.encoding
+        write_image(photo, planes, encoding, format="jpeg", color_space="srgb", quality=JPEG_QUALITY)
         raw.unlink()
     return photo, truth
 
@@ -176,6 +182,12 @@ def simulated_pictures(cache: Path) -> list[Picture]:
         )
         for frame in FRAMES
     ]
+
+
+def taken(picture: Picture) -> None:
+    """Take a simulated frame whose turn has come."""
+    if picture.truth is not None:
+        take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
 
 
 def chosen(pictures: Sequence[Picture], only: Sequence[str]) -> list[Picture]:

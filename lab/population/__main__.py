@@ -1,4 +1,4 @@
-"""`python -m lab.population`: make scenes and lenses, look at the population, train the network."""
+"""`python -m lab.population`: make scenes and lenses, train the network."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 
 from lab.population import library, scenes, sets
-from lab.population.describe import describe
 from lab.population.grids import grid_of
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.traced import draw
@@ -56,8 +55,6 @@ def _arguments() -> argparse.Namespace:
     judged = commands.add_parser("judge", help="errors on plain lenses by number of photos")
     judged.add_argument("--family", choices=library.FAMILIES, default="traced")
     judged.add_argument("--weights", type=Path, help="others than those of the package")
-    described = commands.add_parser("describe", help="percentiles of what the lenses of a library are like")
-    described.add_argument("--limit", type=int, default=500, help="lenses of each family")
     grid = commands.add_parser("grid", help="PSFs of a copy of a design, to take photos through")
     grid.add_argument("design", nargs="+", choices=sorted(PRESCRIPTIONS), metavar="DESIGN")
     grid.add_argument("--copy", type=int, default=0, help="seed of the copy")
@@ -80,18 +77,6 @@ def _judge(asked: argparse.Namespace) -> None:
     for photos in (1, 2, 5):
         figures = sets.judge(network, (sets.of_photos(lens, photos) for lens in lenses))
         print(f"{photos} photos: " + "  ".join(f"{name} {value:.3f}" for name, value in figures.items()))
-
-
-def _describe(asked: argparse.Namespace) -> None:
-    for family in library.FAMILIES:
-        names = [path.name for path in sorted((asked.folder / "lenses").glob(f"{family}-*.npz"))]
-        every = max(library.SHARD * len(names) // asked.limit, 1)
-        others = set(names) - set(names[::every])
-        lenses = sets.load_library(asked.folder / "lenses", others, families=(family,), limit=asked.limit)
-        if lenses:
-            print(f"{family}, {len(lenses)} lenses: 10, 50 and 90 in a hundred are below")
-            for name, values in describe(lenses).items():
-                print(f"  {name:9s}" + "".join(f"{value:8.2f}" for value in values))
 
 
 def _grid(asked: argparse.Namespace) -> None:
@@ -155,23 +140,15 @@ def _lenses(asked: argparse.Namespace) -> None:
 
 
 def _train(asked: argparse.Namespace) -> None:
-    from lab.population.training import train  # noqa: PLC0415 - needs PyTorch
+    from lab.population import training  # noqa: PLC0415 - needs PyTorch
 
-    train(
-        asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
-        threads=asked.threads, seed=asked.seed, code=asked.code,
-    )  # fmt: skip
-
-
-def _train_errors(asked: argparse.Namespace) -> None:
-    from lab.population.training import train_errors  # noqa: PLC0415 - needs PyTorch
-
-    train_errors(asked.folder, asked.minutes, threads=asked.threads, seed=asked.seed)
+    options = {name: value for name, value in vars(asked).items() if name != "command"}
+    (training.train if asked.command == "train" else training.train_errors)(**options)
 
 
 _COMMANDS: Final = {
-    "scenes": _scenes, "lenses": _lenses, "train": _train, "train-errors": _train_errors, "judge": _judge,
-    "describe": _describe, "grid": _grid, "publish": _publish,
+    "scenes": _scenes, "lenses": _lenses, "train": _train, "train-errors": _train, "judge": _judge,
+    "grid": _grid, "publish": _publish,
 }  # fmt: skip
 
 

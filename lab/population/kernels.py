@@ -146,10 +146,7 @@ def stopped_down(ratio: float) -> NDArray[np.float64]:
 def spots(
     coefficients: NDArray[np.floating], f_number: float, circles: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centroid (n, 2) and r.m.s. radius along one axis (n,) of ray spots, micrometres.
-
-    A ray of the pupil point (x, y) lands at 2 N grad W.
-    """
+    """Centroid (n, 2) and r.m.s. radius along one axis (n,) of ray spots, micrometres."""
     x, y, dx, dy = _slopes()
     rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * f_number)
     weight = np.ones(rays.shape[:2])
@@ -202,9 +199,7 @@ class Renderer:
             tilt = (centre[0] * pupil.x + centre[1] * pupil.y) / np.float32(2.0 * self._f_number)
             phase = (path - tilt) * np.float32(2.0 * np.pi / wavelength_um)
             field = np.zeros((n, 2 * n), np.complex64)
-            wave = np.empty(
-                phase.shape, np.complex64
-            )  # cosine and sine are quicker than a complex exponential
+            wave = np.empty(phase.shape, np.complex64)  # quicker than a complex exponential
             wave.real, wave.imag = inside * np.cos(phase), inside * np.sin(phase)
             field[pupil.rows, pupil.cols] = wave
             # a ray at +2 N grad W: the transform with exp(-i) moves light towards the slope
@@ -264,12 +259,9 @@ def kernels_of(
 
 
 def behind_sensor(kernels: NDArray[np.float32], separation: float, diffusion: float) -> NDArray[np.float32]:
-    """Kernels (..., SIDE, SIDE) with what lies before the pixels, centred as before, sum 1.
+    """Kernels (..., SIDE, SIDE) behind a low-pass filter and charge that spreads, centred as before.
 
-    `separation`, in pixels, is that of the four spots of a birefringent low-pass filter: transfer
-    cos(pi d fx) cos(pi d fy) (J. E. Greivenkamp, "Color dependent optical prefilter for the suppression of
-    aliasing artifacts", Applied Optics 29, 1990). `diffusion` is the standard deviation, in pixels, of the
-    Gaussian by which charge spreads.
+    The filter's four spots have cos(pi d fx) cos(pi d fy) (J. E. Greivenkamp, Applied Optics 29, 1990).
     """
     if not separation and not diffusion:
         return kernels
@@ -295,10 +287,7 @@ def fine_of(kernels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def scaled(kernels: NDArray[np.floating], scale: float) -> NDArray[np.float64]:
-    """Kernels (..., SIDE, SIDE) drawn out by a factor about their middle; sum 1.
-
-    The square pixel that they hold is drawn out with them: less than a tenth of a squared pixel at 1.4.
-    """
+    """Kernels (..., SIDE, SIDE) drawn out by a factor about their middle; sum 1."""
     at = (np.arange(SIDE) - SIDE // 2) / scale + SIDE // 2
     columns = [scipy.ndimage.map_coordinates(row, [at], order=3, mode="constant") for row in np.eye(SIDE)]
     weights = np.stack(columns, 1)  # of each pixel in each drawn one, by cubic splines

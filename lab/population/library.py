@@ -103,10 +103,7 @@ def _magnification(rng: np.random.Generator) -> float:
 
 
 def draw_sensor(rng: np.random.Generator) -> tuple[float, float]:
-    """Separation of the optical low-pass filter's spots and r.m.s. diffusion, both in pixels.
-
-    Of some sensors neither; a few lenses wear a softening filter, whose blur is that of a strong diffusion.
-    """
+    """Separation of the optical low-pass filter's spots and r.m.s. diffusion, both in pixels."""
     separation = rng.uniform(0.35, 1.0) if rng.random() < 0.35 else 0.0
     diffusion = rng.uniform(0.1, 0.4) if rng.random() < 0.5 else 0.0
     if rng.random() < 0.04:
@@ -117,10 +114,7 @@ def draw_sensor(rng: np.random.Generator) -> tuple[float, float]:
 def make_lens(
     family: Family, number: int, scenes: Scenes, *, held_out: bool, plain: bool = False
 ) -> dict[str, Any] | None:
-    """Make one lens with the statistics of its photos; None where they hardly show anything.
-
-    Plain lenses have five RAW photos that nothing spoils.
-    """
+    """Make one lens with the statistics of its photos; None where they hardly show anything."""
     rng = np.random.default_rng([number, FAMILIES.index(family), int(held_out)])
     states = draw_states(family, rng, held_out=held_out)
     if plain:
@@ -146,10 +140,7 @@ def retake(
     plain: bool = False,
     rescaled: bool = False,
 ) -> dict[str, Any] | None:
-    """Take other photos through a lens of the library; None where its kernels hold a file's processing.
-
-    Rescaled, it stands before a sensor of other pixels.
-    """
+    """Take other photos through a lens of the library; None where its kernels hold a file's processing."""
     pitch, kind = stored["facts"]
     if KINDS[int(kind)] != "raw":
         return None

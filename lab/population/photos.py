@@ -23,25 +23,22 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image
 
+from lab.images import to_srgb
 from lab.population.scenes import busiest
 from lensmodel.core.psf import PatchKind
 from lensmodel.neural.network import FINE, SIDE
 from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics
+from lensmodel.simulate import srgb_to_linear
 
 _MARGIN: Final = 8  # pixels around a window that demosaicking and sharpening look at
 _CLIPPED: Final = 0.02  # largest share of clipped samples of a patch that is used
-_SOFTEST: Final = (
-    2.8  # slope of the spectrum beyond which a scene is out of focus (chosen); drawn ones are not
-)
+_SOFTEST: Final = 2.8  # slope of the spectrum beyond which a photograph is out of focus (chosen)
 _OWN_BLUR: Final = 0.35  # px^2 of a scene's own blur that are undone at most (chosen)
 _DEVELOPED_READ: Final = 1e-3  # noise that the statistics expect of developed files: their own is coloured
 
 
 class Scenes:
-    """Crops of the scenes in a folder that `scenes.build` wrote; read from disk by need.
-
-    A tenth of the photographs, by name, is never trained on: these alone if `held_out`, else the others.
-    """
+    """Crops of the scenes in a folder that `scenes.build` wrote; read from disk by need."""
 
     def __init__(self, folder: Path, *, held_out: bool) -> None:
         index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
@@ -115,7 +112,7 @@ class Processing:
     def develop(self, mosaic: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return linear planes (3, n, n) as read back from the file; `planes` where it was scaled down."""
         rgb = demosaic(mosaic) if self.mosaicked else planes
-        v = _encoded(rgb)
+        v = to_srgb(rgb).astype(np.float32)
         if self.contrast:
             v = v + self.contrast * v * (1 - v) * (v - 0.45)
         luma = np.tensordot(_LUMA, v, 1)
@@ -125,28 +122,17 @@ class Processing:
         luma = self._sharpened(luma)
         v = np.clip(luma + chroma, 0.0, 1.0)
         if not self.quality:
-            return _linear(v)
+            return srgb_to_linear(v)
         data = io.BytesIO()
         Image.fromarray((v.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)).save(
             data, "JPEG", quality=self.quality, subsampling="4:2:0"
         )
         data.seek(0)
         with Image.open(data) as picture:
-            return _linear(np.asarray(picture, np.float32).transpose(2, 0, 1) / 255.0)
+            return srgb_to_linear(np.asarray(picture, np.float32).transpose(2, 0, 1) / 255.0)
 
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
-
-
-def _encoded(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    v = np.clip(linear, 0.0, 1.0)
-    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.power(np.maximum(v, 1e-8), 1 / 2.4) - 0.055)
-
-
-def _linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
 
 
 @cache
@@ -234,19 +220,14 @@ class Camera:
             self._balance = np.ones(3)
         self._lateral = rng.normal(0, 0.6, 2) * (1 if rng.random() < 0.8 else 2.5)
         self._offset = rng.normal(0, 0.1, (2, 2))
-        self._noise = (
-            rng.uniform(0, 1) if rng.random() < 0.6 and not self.plain else 0.0
-        )  # 0 base sensitivity, 1 the highest
+        # 0 base sensitivity, 1 the highest
+        self._noise = rng.uniform(0, 1) if rng.random() < 0.6 and not self.plain else 0.0
         self._window = WINDOW + (0 if self.kind == "raw" else 2 * _MARGIN)
         outside = 1.0 - self.kernels[..., 21:-21, 21:-21].sum((-1, -2)).min()
         self._reach = (FINE if outside < 2e-3 else SIDE) // 2
         self._side = scipy.fft.next_fast_len(self._window + 2 * self._reach, real=True)
         fx, fy = scipy.fft.rfftfreq(self._side)[None], scipy.fft.fftfreq(self._side)[:, None]
-        self._fx, self._fy, self._f = (
-            fx.astype(np.float32),
-            fy.astype(np.float32),
-            np.hypot(fx, fy).astype(np.float32),
-        )
+        self._fx, self._fy, self._f = (f.astype(np.float32) for f in (fx, fy, np.hypot(fx, fy)))
         self._otfs: dict[tuple[int, int], NDArray[np.complex64]] = {}
 
     def _expose(self) -> _Exposure:
@@ -258,19 +239,15 @@ class Camera:
             (float(rng.normal(0, 0.15)), float(rng.normal(0, 0.3)) ** 2 - self.scenes.blur[s])
             for s in sources
         )
-        electrons = np.exp(
-            np.log(45_000) - self._noise * np.log(56) + rng.normal(0, 0.3)
-        )  # 45,000 down to 800
+        # 45,000 down to 800
+        electrons = np.exp(np.log(45_000) - self._noise * np.log(56) + rng.normal(0, 0.3))
         error, normal, shake = 0.0, (0.0, 0.0, 1.0), (0.0, 0.0)
         lot = 1.0 if self.plain else rng.random()
         if lot < 0.25:
             error = float(np.exp(rng.uniform(np.log(0.5), np.log(7.0))))
             t = rng.uniform(0, 2 * np.pi)
-            normal = (
-                float(np.cos(t)),
-                float(np.sin(t)),
-                float(rng.uniform(-0.9, 0.7)) if lot < 0.19 else -9.0,
-            )
+            offset = float(rng.uniform(-0.9, 0.7)) if lot < 0.19 else -9.0
+            normal = float(np.cos(t)), float(np.sin(t)), offset
         elif lot < 0.35:
             length, t = np.exp(rng.uniform(np.log(0.7), np.log(7.0))), rng.uniform(0, np.pi)
             shake = (float(length * np.cos(t)), float(length * np.sin(t)))
@@ -304,10 +281,8 @@ class Camera:
         key = (state, place)
         if key not in self._otfs:
             kernel = self.kernels[state, place]
-            half = SIDE // 2
-            inner = kernel[
-                :, half - self._reach : half + self._reach + 1, half - self._reach : half + self._reach + 1
-            ]
+            middle = slice(SIDE // 2 - self._reach, SIDE // 2 + self._reach + 1)
+            inner = kernel[:, middle, middle]
             padded = np.zeros((3, self._side, self._side), np.float32)
             padded[:, : inner.shape[1], : inner.shape[2]] = inner / inner.sum((1, 2), keepdims=True)
             otf = scipy.fft.rfft2(np.roll(padded, (-self._reach, -self._reach), (1, 2)))
@@ -342,9 +317,8 @@ class Camera:
         colours = bayer(self._window, self._window, phase)
         mosaic = np.take_along_axis(planes, colours[None].astype(np.intp), 0)[0]
         sigma = np.sqrt(exposure.read**2 + exposure.shot * mosaic)
-        mosaic = np.minimum(mosaic + sigma * rng.standard_normal(mosaic.shape, np.float32), 1.0).astype(
-            np.float32
-        )
+        noisy = mosaic + sigma * rng.standard_normal(mosaic.shape, np.float32)
+        mosaic = np.minimum(noisy, 1.0).astype(np.float32)
         if (mosaic >= 0.995).mean() > _CLIPPED:
             return None
         if self.processing is None:

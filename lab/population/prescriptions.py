@@ -73,13 +73,9 @@ class Prescription:
 
 
 def partial_dispersion(n_d: float, v_d: float) -> float:
-    """P_gF = (n_g - n_F) / (n_F - n_C) of a glass of which only n_d and V_d are known.
+    """P_gF = (n_g - n_F) / (n_F - n_C) of a glass of which only n_d and V_d are known, to 0.003 r.m.s.
 
-    Notes
-    -----
-    Normal line through K7 and F2 (Schott, TIE-29, eq. 1.2-6), and what glasses of the catalogues of Schott,
-    Ohara, Hoya and Hikari lie beside it: fluoride crowns and dense flints above, lanthanum glasses below;
-    0.003 r.m.s. remain.
+    Normal line through K7 and F2 (Schott, TIE-29, eq. 1.2-6), and what catalogue glasses lie beside it.
     """
     normal = 0.6438 - 0.001682 * v_d
     if v_d > 75.0:
@@ -93,13 +89,10 @@ def partial_dispersion(n_d: float, v_d: float) -> float:
 
 
 def refractive_index(glass: Array, wavelengths_um: Array) -> Array:
-    """Index of glasses `(..., 3)` at wavelengths `(w,)`: `(..., w)`.
+    """Index of glasses `(..., 3)` at wavelengths `(w,)`: `(..., w)`, to 2e-5 r.m.s. between .45 and .63 um.
 
-    Notes
-    -----
     n_d + a w + b w^2 in H. A. Buchdahl's coordinate w = l / (1 + 2.5 l), l counted from the d line (P. N.
-    Robb and R. I. Mercado, Applied Optics 22, 1983), where a and b make n_F - n_C and n_g - n_F exact. Over
-    282 glasses of catalogues it is off by 2e-5 r.m.s. between 0.45 and 0.63 micrometres.
+    Robb and R. I. Mercado, Applied Optics 22, 1983), where a and b make n_F - n_C and n_g - n_F exact.
     """
     n_d, v_d, p_gf = np.moveaxis(np.asarray(glass, dtype=np.float64), -1, 0)
     spread = np.where(n_d > 1.0, (n_d - 1.0) / v_d, 0.0)

@@ -17,17 +17,16 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
+from lab.scenes import dead_leaves, text
 from lensmodel.core.files import write_atomically
 from lensmodel.simulate import srgb_to_linear
 
 Scene = NDArray[np.float16]  # (height, width, 3), linear light, white 1
 
 _LONGEST: Final = 1800  # pixels of the longer side after scaling down: most cameras' own blur is then gone
-_LEAST_FACTOR: Final = (
-    2.2  # a photograph is scaled down by at least this (chosen: blur below a third of a pixel)
-)
+_LEAST_FACTOR: Final = 2.2  # by which a photograph is scaled down at least (chosen: blur below .3 pixels)
 _SHARPEST: Final = 0.10  # least share of gradient energy in the finest band; below it a photograph is soft
 _SCALES: Final = (1.0, 1.5, 2.3)  # further factors that each photograph is scaled down by
 
@@ -167,67 +166,10 @@ def busiest(
     return best
 
 
-def leaves(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
-    """Dead leaves: opaque shapes of a power law of sizes, each in front of those before, some shaded."""
-    oversampled = 2 * side
-    picture = np.empty((oversampled, oversampled, 3), np.float32)
-    picture[:] = rng.uniform(0.05, 0.9, 3)
-    radii = np.sort(np.exp(rng.uniform(np.log(3.0), np.log(220.0), 6000)))[::-1]
-    shaded = rng.random() < 0.7
-    for radius in radii:
-        cx, cy = rng.uniform(0, oversampled, 2)
-        x0, x1 = int(max(cx - radius, 0)), int(min(cx + radius + 1, oversampled))
-        y0, y1 = int(max(cy - radius, 0)), int(min(cy + radius + 1, oversampled))
-        if y1 <= y0 or x1 <= x0:
-            continue
-        x = np.arange(x0, x1, dtype=np.float32)[None] - cx
-        y = np.arange(y0, y1, dtype=np.float32)[:, None] - cy
-        if rng.random() < 0.6:
-            inside = x * x + y * y < radius * radius
-        else:
-            t, thin = rng.uniform(0, np.pi), rng.uniform(0.1, 0.7)
-            u, v = x * np.cos(t) + y * np.sin(t), -x * np.sin(t) + y * np.cos(t)
-            inside = (np.abs(u) < 0.7 * radius) & (np.abs(v) < thin * radius)
-        colour = np.clip(np.exp(rng.normal(-1.2, 0.9)) * (1 + rng.normal(0, 0.25, 3)), 0.004, 1.0)
-        paint = np.broadcast_to(colour, (*inside.shape, 3))
-        if shaded and radius > 6:
-            slope = 1 + (rng.normal(0, 0.15) * x + rng.normal(0, 0.15) * y) / radius
-            paint = paint * slope[..., None]
-        picture[y0:y1, x0:x1] = np.where(inside[..., None], paint, picture[y0:y1, x0:x1])
-    return scaled_down(np.clip(picture, 0, 1), 2.0)
-
-
-def text(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
-    """A printed page: lines of letters of several sizes, dark on light or light on dark, at an angle."""
-    size = 2 * side
-    page = Image.new("L", (size, size), 255)
-    draw, y = ImageDraw.Draw(page), 0
-    letters = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.,;:-()  "
-    while y < size:
-        height = int(np.exp(rng.uniform(np.log(14), np.log(120))))
-        line = "".join(rng.choice(list(letters), size // max(height // 3, 1)))
-        draw.text(
-            (int(rng.uniform(-40, 40)), y),
-            line,
-            fill=int(rng.uniform(0, 90)),
-            font=ImageFont.load_default(height),
-        )
-        y += int(1.25 * height)
-    turned = page.rotate(float(rng.uniform(-20, 20)), Image.Resampling.BICUBIC, fillcolor=255)
-    v = np.asarray(turned, np.float32) / 255.0
-    dark, light = rng.uniform(0.01, 0.08, 3), rng.uniform(0.5, 0.95, 3)
-    if rng.random() < 0.3:
-        dark, light = light, dark
-    return scaled_down((dark + v[..., None] ** 2.2 * (light - dark)).astype(np.float32), 2.0)
-
-
 def build(
     folder: Path, sources: Iterator[Source], drawn: int = 8, side: int = 1100, seed: int = 7
 ) -> list[dict[str, object]]:
-    """Write every scene at all scales as `folder/*.npy` (float16) with `index.json`; return the index.
-
-    Soft photographs (`sharpness`) are left out, those of the test half always.
-    """
+    """Write every scene at all scales as `folder/*.npy` (float16) with `index.json`; return the index."""
     folder.mkdir(parents=True, exist_ok=True)
     index: list[dict[str, object]] = []
     rng = np.random.default_rng(seed)
@@ -255,7 +197,7 @@ def build(
         for scale in _SCALES:
             keep(source.name, scaled_down(scene, scale), scale)
     for number in range(drawn):
-        keep(f"leaves {number}", leaves(rng, side), 1.0)
-        keep(f"text {number}", text(rng, side), 1.0)
+        keep(f"leaves {number}", dead_leaves(side, side, rng).transpose(1, 2, 0), 1.0)
+        keep(f"text {number}", text(np.empty((3, side, side), np.float32), rng).transpose(1, 2, 0), 1.0)
     write_atomically(folder / "index.json", json.dumps(index, indent=1).encode())
     return index

@@ -13,9 +13,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.images import zone_masks
 from lab.population.library import FAMILIES, Family, load_shard
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import KINDS
+from lensmodel.core.types import ZONES
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
 from lensmodel.neural.network import assembled, outer_cells
 from lensmodel.neural.statistics import group
@@ -171,10 +173,7 @@ def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], ND
 
 
 def best_powers(network: FieldNetwork, sets: Iterable[Set]) -> tuple[float, float, float]:
-    """Powers of the kernels of red, green and blue that err least: below 1, what is learned is too sure.
-
-    Red and blue share one, because training exchanges them.
-    """
+    """Powers of the kernels of red, green and blue that err least: below 1, what is learned is too sure."""
     errors = []
     for drawn in sets:
         for answer, truth in _answers(network, drawn):
@@ -211,14 +210,14 @@ def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
     whose told error is within a factor of 1.5.
     """
     made, told = [], []
-    of_lens: dict[str, list[float]] = {"center": [], "mid": [], "corner": []}
-    of_place: dict[str, list[float]] = {zone: [] for zone in of_lens}
+    of_lens: dict[str, list[float]] = {zone: [] for zone in ZONES}
+    of_place: dict[str, list[float]] = {zone: [] for zone in ZONES}
     for drawn in sets:
         errors, expected = answered(network, drawn)
         made.append(errors)
         told.append(expected)
         r = np.hypot(*drawn.query_xy.T)
-        for zone, inside in (("center", r < 0.3), ("mid", (r >= 0.3) & (r <= 0.75)), ("corner", r > 0.75)):
+        for zone, inside in zone_masks(r).items():
             if inside.any():
                 of_lens[zone].append(float(errors[inside, 1].mean()))
                 of_place[zone] += errors[inside, 1].tolist()
@@ -264,11 +263,7 @@ def fixed_set(lenses: Sequence[Lens], *, samples: int = 48, queries: int = 7, co
 def adjusted(
     data: bytes, *, powers: Sequence[float] = (1.0, 1.0, 1.0), raised: float = 0.0, **facts: object
 ) -> bytes:
-    """Weights that differ a little in what they answer, with more facts in their provenance.
-
-    Kernels of red, green and blue are raised to powers, as all their logits are scaled; told errors are
-    exp(`raised`) times as large.
-    """
+    """Weights with more facts in their provenance, all logits of a colour scaled, told errors raised."""
     with np.load(BytesIO(data)) as stored:
         arrays: dict[str, Any] = dict(stored)
     for name in ("kernel.2.weight", "kernel.2.bias"):

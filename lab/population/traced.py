@@ -199,11 +199,7 @@ class TracedLens:
     def wavefronts(
         self, xy: Array, wavelengths_um: Array, f_number: float | None = None
     ) -> NDArray[np.float32]:
-        """Wavefronts at places (p, 2) of the image, right and up, in half diagonals; wide open by default.
-
-        Micrometres (p, w, COLUMNS) per Zernike term of unit r.m.s. over the disc, see `kernels.TERMS`; piston
-        and tilt are removed. A ray of p arrives at +2 N dW/dp.
-        """
+        """See `PopulationLens`; piston and tilt are removed, and a ray of p arrives at +2 N dW/dp."""
         return self._fitted(xy, wavelengths_um, f_number)[0]
 
     def aperture(self, xy: Array, f_number: float | None = None) -> NDArray[np.float32]:
@@ -308,11 +304,7 @@ class TracedLens:
 
 
 def draw(rng: np.random.Generator, designs: Sequence[str], *, opened: bool = False) -> TracedLens:
-    """Draw a copy of one of the designs that `forms_image`.
-
-    With `opened` it opens one to two stops beyond its design, and is soft in the centre: such lenses are rare
-    among the others, and hardest to tell.
-    """
+    """Draw a copy of a design that `forms_image`; if `opened`, one to two stops beyond it and soft."""
     for _ in range(_TRIES * (1 + opened)):
         lens = _candidate(rng, str(rng.choice(list(designs))), opened=opened)
         if (not opened or _is_soft(lens)) and forms_image(lens):
@@ -328,11 +320,7 @@ def _is_soft(lens: TracedLens) -> bool:
 
 
 def forms_image(lens: TracedLens) -> bool:
-    """Whether a lens does what a photo and its wavefronts need.
-
-    Light comes through everywhere, spots up to 0.9 of the half diagonal are not above eight pixels, and the
-    Zernike terms hold the wavefronts.
-    """
+    """Whether light comes through, spots are below eight pixels, and the terms hold the wavefronts."""
     corner = np.array([[math.cos(a), math.sin(a)] for a in (0.6, 2.5, -0.6, -2.5)])
     places = np.concatenate([np.zeros((1, 2)), 0.5 * corner[:2], _EDGE * corner, corner])
     try:
@@ -390,9 +378,8 @@ def _nominal(design: str) -> Nominal:
 def _pupil(L: Array, rims: Array, arrived: Array, f_number: float) -> tuple[Array, Array]:
     """Cosines `(2, p)` at the middle of the stop, and circles `(p, 4, 3)` around the open pupil.
 
-    Each rim is an affine image of a disc, an ellipse E. The stop's is enclosed by the two circles that touch
-    it where it is narrowest; of another rim only the part within the stop's ellipse matters, and one circle
-    follows it there.
+    The stop's ellipse is enclosed by the two circles that touch it where it is narrowest; of another rim one
+    circle follows the part within it.
     """
     count = L.shape[1]
     p = -2.0 * f_number * L

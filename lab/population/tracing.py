@@ -255,10 +255,7 @@ class Nominal:
         )
 
     def working(self, f_number: float, distance: float) -> float:
-        """F-number of the light at the sensor with the stop of `f_number`, focused at a distance.
-
-        Half the reciprocal sine of the axial rim ray: larger than at infinity, as the image is farther.
-        """
+        """F-number of the light at the sensor with the stop of `f_number`, focused at a distance."""
         if not math.isfinite(distance):
             return f_number
         radius = self.marginal(f_number)[0]

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lab.images import zone_masks
 from lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork
@@ -60,11 +61,7 @@ class Attention(nn.Module):
         super().__init__()
         width = WIDTH // HEADS
         self.normal_query, self.normal_memory, self.normal_inner = (nn.LayerNorm(WIDTH) for _ in range(3))
-        self.q, self.kv, self.out = (
-            nn.Linear(WIDTH, WIDTH),
-            nn.Linear(WIDTH, 2 * WIDTH),
-            nn.Linear(WIDTH, WIDTH),
-        )
+        self.q, self.kv, self.out = (nn.Linear(WIDTH, n * WIDTH) for n in (1, 2, 1))
         self.inner, self.outer = nn.Linear(WIDTH, 2 * WIDTH), nn.Linear(2 * WIDTH, WIDTH)
         self.relation_key = nn.Parameter(torch.randn(HEADS, width, RELATION) * 0.02)
         self.relation_value = nn.Parameter(torch.randn(HEADS, RELATION, width) * 0.02)
@@ -161,13 +158,10 @@ class Network(nn.Module):
 
     def exported(self) -> dict[str, NDArray[np.float16]]:
         """Weights under the names that the product uses."""
-        names = {"narrow.linear": "narrow"}
-        out = {}
-        for name, value in self.state_dict().items():
-            for long, short in names.items():
-                name = name.replace(long, short)  # noqa: PLW2901
-            out[name] = value.detach().numpy().astype(np.float16)
-        return out
+        return {
+            name.replace("narrow.linear", "narrow"): value.detach().numpy().astype(np.float16)
+            for name, value in self.state_dict().items()
+        }
 
 
 def _ring_matrix() -> NDArray[np.float32]:
@@ -222,10 +216,8 @@ def collate(sets: list[Set]) -> dict[str, Tensor]:
     missing = np.stack([np.arange(size) >= len(s.xy) for s in sets])
     xy, settings = padded([s.xy for s in sets]), padded([s.settings for s in sets])
     photo = padded([s.photo for s in sets])
-    query_xy, query_settings = (
-        np.stack([s.query_xy for s in sets]),
-        np.stack([s.query_settings for s in sets]),
-    )
+    query_xy = np.stack([s.query_xy for s in sets])
+    query_settings = np.stack([s.query_settings for s in sets])
     apart = (photo[:, :, None] != photo[:, None]) | missing[:, None]
     out = {
         "statistics": padded([s.statistics for s in sets]),
@@ -285,9 +277,8 @@ def held_out(network: Network, lenses: list[Lens], samples: int, seed: int = 1) 
         told.append(told_log[..., :3].exp().reshape(-1, 3))
         radius.append(np.concatenate([np.hypot(*s.query_xy.T) for s in sets]))
     r, t, at = torch.cat(relative).numpy(), torch.cat(told).numpy(), np.concatenate(radius)
-    zones = {"center": at < 0.3, "mid": (at >= 0.3) & (at <= 0.75), "corner": at > 0.75}
     out = {name: float(r[:, i].mean()) for i, name in enumerate("rgb")}
-    out |= {zone: float(r[inside, 1].mean()) for zone, inside in zones.items() if inside.any()}
+    out |= {zone: float(r[inside, 1].mean()) for zone, inside in zone_masks(at).items() if inside.any()}
     right = np.abs(np.log(t[:, 1] / r[:, 1])) < math.log(1.5)
     return {**out, "told": float(t[:, 1].mean()), "told_right": float(right.mean())}
 
@@ -385,11 +376,9 @@ class Sitting:
 def train(
     folder: Path, minutes: float, *, total_minutes: float, rate: float, threads: int, seed: int, code: str
 ) -> None:
-    """Train from where the last sitting ended; saves every few minutes.
+    """Train from where the last sitting ended on `lenses` of the folder, those added meanwhile too.
 
-    `folder` holds `lenses` and `held-out`; lenses that are added meanwhile are trained on, too. `rate` is the
-    highest of learning, and falls as half a cosine over `total_minutes` of all sittings together; `code` goes
-    into the provenance.
+    `rate` is the highest of learning, and falls as half a cosine over `total_minutes` of all sittings.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -401,17 +390,16 @@ def train(
     source = batches(lenses, np.random.default_rng([seed, sitting.step]))
     before, began = sitting.minutes, time.monotonic()
     reported = saved = began
-    recent: list[tuple[int, float]] = []
+    recent: list[float] = []
     while sitting.minutes < before + minutes:
         share = min(sitting.minutes / total_minutes, 1.0)
-        batch = next(source)
-        error = sitting.learn(batch, rate * (0.49 * (1 + math.cos(math.pi * share)) + 0.02))
-        recent.append((batch["statistics"].shape[1], error))
+        recent.append(sitting.learn(next(source), rate * (0.49 * (1 + math.cos(math.pi * share)) + 0.02)))
         now = time.monotonic()
         sitting.minutes = before + (now - began) / 60
         if now - reported > 60:
             reported = now
-            print(_progress(sitting, len(lenses), recent[-300:]), flush=True)
+            green = float(np.mean(recent[-300:]))
+            print(f"{sitting.minutes:.1f} min, {len(lenses)} lenses, green {green:.3f}", flush=True)
         if now - saved > _SAVED_SECONDS or sitting.minutes >= before + minutes:
             facts = {"code": code, "seed": seed, "lenses": len(lenses), "shards": sorted(known)}
             sitting.save(apart, facts)
@@ -420,11 +408,7 @@ def train(
 
 
 def train_errors(folder: Path, minutes: float, *, threads: int, seed: int) -> None:
-    """Train what tells the errors anew, on `lenses-of-errors`, which no sitting has learned kernels from.
-
-    On lenses of training the kernels are nearer to the truth than on others, and what learns its own errors
-    there understates them. `state.pt` stays as it is, and `weights.npz` is written anew.
-    """
+    """Train what tells the errors anew, on lenses that no sitting has learned kernels from."""
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     lenses = load_library(folder / "lenses-of-errors", set())
@@ -458,12 +442,3 @@ def _told_loss(told: Tensor, relative: Tensor, rings: Tensor) -> Tensor:
     ring_told = told[..., 3:].unflatten(-1, (3, RINGS))
     loss = _TOLD_WEIGHT * (told[..., :3] - relative.detach().log()).abs().mean()
     return loss + _RING_WEIGHT * (ring_told - rings.detach().log()).abs().mean()
-
-
-def _progress(sitting: Sitting, lenses: int, recent: list[tuple[int, float]]) -> str:
-    few = [error for n, error in recent if n <= 4]
-    many = [error for n, error in recent if n > 24]
-    return (
-        f"{sitting.minutes:.1f} min, step {sitting.step}, {lenses} lenses, "
-        f"green: few {np.mean(few or [math.nan]):.3f}, many {np.mean(many or [math.nan]):.3f}"
-    )

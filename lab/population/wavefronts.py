@@ -129,10 +129,7 @@ _FOCUS_WEIGHTS: Final = np.array([2.0] * 3 + [1.0] * 4 + [0.4] * 3)
 
 
 class RandomLens:
-    """A lens of the families "wavefront" or "third-order", everything drawn; see `PopulationLens`.
-
-    With `zoom` it has a second state (focal length, focus), reached by `at_state`.
-    """
+    """A lens of the families "wavefront" or "third-order", everything drawn; see `PopulationLens`."""
 
     def __init__(self, rng: np.random.Generator, family: Family = "wavefront", *, zoom: bool = False) -> None:
         self.f_number = float(np.exp(rng.uniform(np.log(1.2), np.log(8.0))))

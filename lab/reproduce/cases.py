@@ -1,4 +1,4 @@
-"""What a reproduction runs: which lenses, behind which frames, learned from how many photos."""
+"""What a reproduction runs: which lenses, behind which frames, learned from how many photos of what."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+import numpy as np
+from PIL import Image
+
 import lensmodel
 from lab import traced as stored
-from lab.reproduce.frames import Layout, content_of, layout_for, scene_files
+from lab.cases import list_photos, photo_half
+from lab.population.prescriptions import LOOKED_AT
 from lab.stored import version_of
 from lab.traced import GridLens
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import LensSettings
-from lensmodel.simulate import CameraLens, SimulatedCamera, SimulatedField, draw_lens
+from lensmodel.core.types import LensSettings, Planes
+from lensmodel.simulate import CameraLens, SimulatedCamera, SimulatedField, draw_lens, load_scene
 
 Size: TypeAlias = Literal["quick", "default"]
 Family: TypeAlias = Literal["third order", "ray-traced"]
-
-FAMILIES: Final[tuple[Family, ...]] = ("third order", "ray-traced")
 
 PROTOCOL: Final = 8
 """Part of every key of a stored result; raised when what is measured changes."""
@@ -49,15 +51,33 @@ SOFT_SEED: Final = 1008
 SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
 """Of those beyond: results of these were looked into during development."""
 
-DESIGNS_LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
-"""Designs of ray-traced lenses that were looked at during development, and trained on."""
-
 # Seeds of ray-traced lenses (chosen): above those of drawn ones, so many that designs hardly share one.
 _TRACED_FROM: Final = 2000
 _TRACED: Final = 100_000
 
 _QUICK_FRAME: Final = (640, 960)  # rows and columns (chosen): 0.6 megapixels
 _PHOTOS: Final = {"quick": (1, 2), "default": (1, 2, 5, 10)}
+
+
+MARGIN: Final = 28
+"""Pixels that a scene reaches beyond the frame on every side: half a kernel."""
+
+_GRIDS: Final = ((1, 1), (1, 2), (2, 2))  # rows and columns of photographs in a frame
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How frames are made of photographs."""
+
+    rows: int  # grid of photographs in one frame
+    cols: int
+    tile: tuple[int, int]  # (height, width) that is cut from the middle of each
+
+    @property
+    def frame(self) -> tuple[int, int]:
+        """Largest (height, width) of a frame that still has its margin; even."""
+        height, width = self.rows * self.tile[0] - 2 * MARGIN, self.cols * self.tile[1] - 2 * MARGIN
+        return height // 2 * 2, width // 2 * 2
 
 
 def learned(number: int | str) -> str:
@@ -96,10 +116,6 @@ class Case:
     layout: Layout  # how frames are made of photographs
     grid: Path | None = None  # PSFs of a ray-traced lens; None means a lens of third order
 
-    def __post_init__(self) -> None:
-        if not self.photos or self.photos[0] < 1 or list(self.photos) != sorted(set(self.photos)):
-            raise InvalidInputError(f"numbers of photos must ascend from 1 or more, got {self.photos}")
-
     @property
     def lens(self) -> CameraLens:
         """The lens."""
@@ -115,7 +131,7 @@ class Case:
         """Whether nothing was developed, chosen or trained on it."""
         if self.grid is None:
             return self.seed >= FIRST_SEED and self.seed not in SEEDS_LOOKED_AT
-        return design(self.grid) not in DESIGNS_LOOKED_AT
+        return design(self.grid) not in LOOKED_AT
 
     @property
     def source(self) -> str:
@@ -174,11 +190,8 @@ class Reproduction:
 
 
 def fingerprint() -> str:
-    """Hash of the code and data that figures depend on: all that is behind the work on one case.
-
-    The rival has a hash of its own; plans and pages leave stored results as they are.
-    """
-    return version_of("lab.reproduce.job", without=("lab.schuler", "lensmodel.report"))
+    """Hash of the code and data that figures depend on; pages leave stored results as they are."""
+    return version_of("lab.reproduce.job")
 
 
 def photos_of(case: Case, plan: Reproduction) -> str:
@@ -188,10 +201,7 @@ def photos_of(case: Case, plan: Reproduction) -> str:
 
 
 def key_of(case: Case, plan: Reproduction, code: str) -> str:
-    """Name under which the results of a case are stored: of all that they depend on.
-
-    The numbers of photos are no part of it, so that a later run with more of them finds what is there.
-    """
+    """Name under which the results of a case are stored: of all that they depend on."""
     parts = (PROTOCOL, code, _lens_of(case), case.layout, content_of(plan.files()))
     return f"{case.name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"
 
@@ -236,3 +246,89 @@ def _case(which: int | Path, photos: tuple[int, ...], frame: tuple[int, int], la
     # a number of the design's name takes the place of a seed, whatever else is run
     number = _TRACED_FROM + int(hashlib.sha256(design(which).encode()).hexdigest(), 16) % _TRACED
     return Case(number, traced(which).focal_mm[0], traced(which).widest(), photos, *frame, layout, which)
+
+
+# --- frames composed of sharp photographs -------------------------------------------------------
+# The photographs of the held-out photo serve in no other. Where there are few of them, those that the lens is
+# learned from serve again, mirrored and in another place of the frame.
+
+
+def scene_files(folder: Path | None) -> tuple[Path, ...]:
+    """Photographs of the test half of a folder; all five of the library when there is no folder."""
+    found = list_photos(folder)
+    if folder is None:
+        return found
+    tested = tuple(path for path in found if photo_half(path.stem) == "test")
+    if not tested:
+        raise InvalidInputError(f"{folder} holds no photograph of the test half; add some")
+    return tested
+
+
+def layout_for(files: Sequence[Path], wanted: tuple[int, int] | None = None) -> Layout:
+    """Decide how to make frames that cover `wanted` rows and columns; the largest where it is None."""
+    grids = [(rows, cols) for rows, cols in _GRIDS if 2 * rows * cols <= len(files)]
+    if not grids:
+        raise InvalidInputError(f"two photographs are needed at least, there are {len(files)}")
+    layouts = [_layout(files, grid) for grid in grids]
+    for layout in layouts if wanted else layouts[-1:]:
+        rows, cols = wanted or (0, 0)
+        if layout.rows * layout.tile[0] >= rows and layout.cols * layout.tile[1] >= cols:
+            return layout
+    raise InvalidInputError(f"the photographs do not cover frames of {wanted}: give larger ones, or more")
+
+
+def _layout(files: Sequence[Path], grid: tuple[int, int]) -> Layout:
+    sizes = np.array([_turned_size(path, upright=grid[1] > grid[0]) for path in files])
+    height, width = (int(n) // 2 * 2 for n in sizes.min(axis=0))
+    return Layout(*grid, (height, width))
+
+
+def frame_scene(files: Sequence[Path], layout: Layout, number: int | None) -> Planes:
+    """Compose a frame from photographs in the given order."""
+    per = layout.rows * layout.cols
+    if number is None:
+        parts = [_part(path, layout, 0) for path in files[:per]]
+    else:
+        others = files[per:]
+        indices = range(number * per, (number + 1) * per)
+        parts = [_part(others[i % len(others)], layout, i // len(others)) for i in indices]
+    rows = [parts[i * layout.cols : (i + 1) * layout.cols] for i in range(layout.rows)]
+    return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1))
+
+
+def centred_cut(scene: Planes, height: int, width: int) -> Planes:
+    """Cut the middle so that the scene exceeds `height` x `width` by twice the margin, or by less, evenly."""
+    cut = []
+    for have, want in zip(scene.shape[1:], (height, width), strict=True):
+        if have < want:
+            raise InvalidInputError(f"a scene of {scene.shape[1:]} does not cover {height} x {width}")
+        spare = min((have - want) // 2, MARGIN)
+        start = (have - want - 2 * spare) // 2
+        cut.append(slice(start, start + want + 2 * spare))
+    return np.ascontiguousarray(scene[:, cut[0], cut[1]])
+
+
+def content_of(files: Sequence[Path]) -> str:
+    """Hash of the photographs' bytes, in order."""
+    total = hashlib.sha256()
+    for path in files:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:16]
+
+
+def _part(path: Path, layout: Layout, use: int) -> Planes:
+    """The middle of a photograph; mirrored in another way each time that it is used."""
+    scene = load_scene(path)
+    if (scene.shape[1] > scene.shape[2]) != (layout.tile[0] > layout.tile[1]):
+        scene = np.rot90(scene, axes=(1, 2))
+    height, width = layout.tile
+    top, left = (scene.shape[1] - height) // 2, (scene.shape[2] - width) // 2
+    return scene[:, top : top + height, left : left + width][
+        :, :: -1 if use & 2 else 1, :: -1 if use & 1 else 1
+    ]
+
+
+def _turned_size(path: Path, *, upright: bool) -> tuple[int, int]:
+    with Image.open(path) as image:
+        short, long = sorted(image.size)
+    return (long, short) if upright else (short, long)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from lab import targets
 from lab.correction.filter_flow import EfficientFilterFlow
-from lab.model.model_benchmark import PATCHES, asked_places, patch_places, predictor
+from lab.model_benchmark import PATCHES, asked_places, patch_places, predictor
 from lab.reproduce.cases import Case
 from lensmodel import measured as measure
 from lensmodel.core.geometry import Frame, zone_of
@@ -41,21 +40,6 @@ _EXPOSURE: Final = 0.8
 _SEED: Final = 77
 
 Predictor = Callable[[FieldPosition], Kernel]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Remembered:
-    """A PSF field whose kernels are made once: several photos are corrected with it."""
-
-    field: PsfField
-    _known: dict[tuple[float, float, Channel, int], Kernel] = dataclass_field(default_factory=dict)
-
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the kernel of a place; see `PsfField`."""
-        key = (position.r, position.phi, channel, size)
-        if key not in self._known:
-            self._known[key] = self.field.kernel_at(position, channel, size)
-        return self._known[key]
 
 
 # --- a general profile of the lens model: what a maker of software has who measured other copies ---
@@ -102,11 +86,7 @@ def general_words(case: Case) -> str:
 
 
 def general_field(case: Case) -> PsfField:
-    """Return what is known of the lens of a case without any photo of it.
-
-    Third order: the mean of lenses of the same kind, drawn from development seeds (below 100).
-    Ray-traced: the lens itself made symmetric, which is kinder than other copies are.
-    """
+    """Return what is known of the lens of a case without any photo of it, see `general_words`."""
     if case.grid is not None:
         return SymmetricField(case.truth())
     kind = case.seed % len(LENS_KINDS)
@@ -122,11 +102,7 @@ def general_field(case: Case) -> PsfField:
 
 
 def measured_field(case: Case, path: Path) -> PsfField:
-    """Photograph the printed target through the lens, measure it, and return the model of what was found.
-
-    The target stands a little turned, aslant and unevenly lit, and its photo is a DNG like the others;
-    the simulator's truth takes no part.
-    """
+    """Photograph the printed target through the lens, measure it, and return the model of what was found."""
     page = measure.TargetPage(round(_FILL * case.height * 2**0.5))  # as many samples as it takes pixels
     scene = targets.target_scene(page, (case.height, case.width), targets.Setup(fill=_FILL))
     rng = np.random.default_rng([case.seed, _SEED])

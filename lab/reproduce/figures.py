@@ -1,77 +1,67 @@
-"""Fig. 2 (interpolation against regression), Fig. 4 (from edges to the field), and crops side by side."""
+"""Fig. 2 (interpolation against regression) and Fig. 4 (from edges to the field)."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
-from lab.images import Picture, as_shown, crop_boxes
+from lab.images import as_shown
 from lab.reproduce import fields
 from lab.reproduce.cases import Case, Reproduction
 from lab.reproduce.shots import take
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width
-from lensmodel.core.types import FieldPosition, Kernel, Plane
+from lensmodel.core.psf import PsfField, distance, rms_width
+from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import LensModel
 from lensmodel.patches import r_map
 from lensmodel.photo import develop
 from lensmodel.workflow import sampling
 
-# Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.
+# Layout (chosen): places that are shown, pixels of a kernel, PSFs down and across.
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))
 _SIZE: Final = 31
-_WIDTH: Final = 720
 _GRID: Final = (6, 9)
 
 
-def version() -> str:
-    """Hash of the code: drawings of another version are drawn again."""
-    total = hashlib.sha256()
-    for path in (Path(__file__), Path(fields.__file__)):
-        total.update(path.read_bytes())
-    return total.hexdigest()[:8]
-
-
 def draw(plan: Reproduction, photos: Path, folder: Path, *, workers: int = 1) -> dict[str, Any]:
-    """Draw both figures into a folder, the second of the first case; return their names and figures."""
-    return {"fig2": _fig2(plan.cases, folder), "fig4": _fig4(plan, photos, folder, workers)}
+    """Draw both figures into a folder, the second of the first case; return what the page says of them."""
+    return {
+        "fig2": _fig2(plan.cases, folder / "fig2.png"),
+        "fig4": _fig4(plan, photos, folder / "fig4.png", workers),
+    }
 
 
-def names(drawn: Mapping[str, Any]) -> list[str]:
-    """Pictures of the figures."""
-    return [
-        name
-        for figure in drawn.values()
-        for name in (*([figure["picture"]] if "picture" in figure else ()), *figure.get("pictures", ()))
-    ]
-
-
-def _fig2(cases: Sequence[Case], folder: Path) -> dict[str, Any]:
+def _fig2(cases: Sequence[Case], path: Path) -> dict[str, Any]:
     """True PSFs of as many patches as one photo has; asked in between: error of each way, and a picture."""
     families = {c.family: [one for one in cases if one.family == c.family] for c in cases}
     # the lens whose corner is worst is the one where it matters
     worst = max(cases, key=lambda one: rms_width(one.truth().kernel_at(_SHOWN[-1], "g", _SIZE)))
-    field = worst.truth()
-    truth = [field.kernel_at(place, "g", _SIZE) for place in _SHOWN]
-    rows, errors = [[kernel_tile(k) for k in truth]], {}
-    for name, predict in fields.predictors(worst).items():
-        found = [predict(place) for place in _SHOWN]
-        errors[name] = [distance(a, b).rel_l2 for a, b in zip(found, truth, strict=True)]
-        rows.append([kernel_tile(k) for k in found])
-    Image.fromarray(_sheet(rows)).save(folder / "fig2.png", optimize=True)
+    truth = [worst.truth().kernel_at(place, "g", _SIZE) for place in _SHOWN]
+    ways = {name: [ask(place) for place in _SHOWN] for name, ask in fields.predictors(worst).items()}
+    figure = Figure(figsize=(2 * len(_SHOWN), 2 * len(ways) + 2), layout="constrained")
+    rows = figure.subplots(1 + len(ways), len(_SHOWN))
+    for row, (name, kernels) in zip(rows, {"truth": truth, **ways}.items(), strict=True):
+        for ax, place, kernel in zip(row, _SHOWN, kernels, strict=True):
+            ax.imshow(shown(kernel), cmap="gray")
+            ax.set(
+                xticks=[], yticks=[], title=f"r = {place.r:g}, phi = {place.phi:g}" if name == "truth" else ""
+            )
+        row[0].set_ylabel(name, fontsize=8)
+    figure.savefig(path)
     return {
-        "picture": "fig2.png",
+        "picture": path.name,
         "lens": worst.title,
-        "rows": ["truth", *errors],
-        "places": [[p.r, p.phi] for p in _SHOWN],
-        "errors": errors,
+        "errors": {
+            name: [distance(a, b).rel_l2 for a, b in zip(kernels, truth, strict=True)]
+            for name, kernels in ways.items()
+        },
         "table": [
             {"family": family, "lenses": len(lenses), **row}
             for family, lenses in families.items()
@@ -80,101 +70,52 @@ def _fig2(cases: Sequence[Case], folder: Path) -> dict[str, Any]:
     }
 
 
-def _sheet(rows: Sequence[Sequence[NDArray[np.uint8]]], gap: int = 4) -> NDArray[np.uint8]:
-    side = rows[0][0].shape[0]
-    sheet = np.full((len(rows) * (side + gap) - gap, len(rows[0]) * (side + gap) - gap), 60, dtype=np.uint8)
-    for i, row in enumerate(rows):
-        for j, tile in enumerate(row):
-            sheet[i * (side + gap) :, j * (side + gap) :][:side, :side] = tile
-    return sheet
-
-
-def _fig4(plan: Reproduction, photos: Path, folder: Path, workers: int) -> dict[str, Any]:
+def _fig4(plan: Reproduction, photos: Path, path: Path, workers: int) -> dict[str, Any]:
     """Confidence map with the patches, the PSF of each patch, and the regressed field."""
     case = plan.cases[0]
     shots = take(case, plan.files(), photos, photos=1)
     developed = develop(shots.learn[0])
     config = sampling.Config()
-    chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method)
+    chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method).patches
     try:
         samples = sampling.samples_of_photo(shots.learn[0], config, workers=workers)
     except LensModelError as error:
         return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]
-    frame, settings = developed.frame, case.settings
-    model = LensModel.fit(samples)
-    boxes = [(p.row, p.col, p.size) for p in chosen.patches]
-    Image.fromarray(_small_photo(as_shown(developed.planes, case.camera.white_balance), boxes)).save(
-        folder / "fig4-patches.png", optimize=True
-    )
-    Image.fromarray(_confidence(developed.planes[1])).save(folder / "fig4-rmap.png", optimize=True)
-    _local(green, frame).save(folder / "fig4-local.png", optimize=True)
-    _field(model.field(settings), frame).save(folder / "fig4-field.png", optimize=True)
-    _field(case.truth(), frame).save(folder / "fig4-truth.png", optimize=True)
-    return {
-        "lens": case.title,
-        "patches": len(boxes),
-        "samples": len(green),
-        "pictures": [f"fig4-{name}.png" for name in ("rmap", "patches", "local", "field", "truth")],
-    }
+    figure = Figure(figsize=(15, 8), layout="constrained")
+    axes = figure.subplots(2, 3).ravel()
+    confidence = np.sqrt(np.clip(r_map(developed.planes[1]), 0.0, None))
+    axes[0].imshow(confidence, cmap="gray", vmax=float(np.percentile(confidence, 99.0)))
+    axes[1].imshow(as_shown(developed.planes, case.camera.white_balance))
+    for p in chosen:
+        axes[1].add_patch(Rectangle((p.col, p.row), p.size, p.size, fill=False, edgecolor="#ffb300"))
+    _kernels(axes[2], developed.frame, [(s.position, s.kernel) for s in green])
+    _kernels(axes[3], developed.frame, _asked(LensModel.fit(samples).field(case.settings), developed.frame))
+    _kernels(axes[4], developed.frame, _asked(case.truth(), developed.frame))
+    titles = ("Confidence map", f"{len(chosen)} patches", "Their PSFs", "Regressed field", "The truth", "")
+    for ax, title in zip(axes, titles, strict=True):
+        ax.set(title=title, xticks=[], yticks=[])
+    axes[5].set_axis_off()
+    figure.savefig(path)
+    return {"lens": case.title, "patches": len(chosen), "samples": len(green), "picture": path.name}
 
 
-def _confidence(plane: Plane) -> NDArray[np.uint8]:
-    values = np.sqrt(np.clip(r_map(plane), 0.0, None))
-    shown = np.clip(values / max(float(np.percentile(values, 99.0)), 1e-9), 0.0, 1.0)
-    return _shrunk(np.rint(shown * 255).astype(np.uint8))
+def _asked(field: PsfField, frame: Frame) -> list[tuple[FieldPosition, Kernel]]:
+    """Kernels of a field on a regular grid."""
+    rows, cols = ((np.arange(n) + 0.5) / n for n in _GRID)
+    places = [frame.position(row * frame.height, col * frame.width) for row in rows for col in cols]
+    return [(place, field.kernel_at(place, "g", _SIZE)) for place in places]
 
 
-def _small_photo(picture: NDArray[np.uint8], boxes: Sequence[tuple[int, int, int]]) -> NDArray[np.uint8]:
-    image = Image.fromarray(picture)
-    pen, width = ImageDraw.Draw(image), max(picture.shape[1] // _WIDTH, 1) * 2
-    for row, col, size in boxes:
-        pen.rectangle((col, row, col + size, row + size), outline="#ffb300", width=width)
-    return _shrunk(np.asarray(image))
+def _kernels(ax: Axes, frame: Frame, kernels: Iterable[tuple[FieldPosition, Kernel]]) -> None:
+    """Draw kernels enlarged where they belong in a frame."""
+    half = 0.45 * frame.width / _GRID[1]
+    for place, kernel in kernels:
+        row, col = frame.pixel(place)
+        ax.imshow(shown(kernel), cmap="gray", extent=(col - half, col + half, row + half, row - half))
+    ax.set(xlim=(0, frame.width), ylim=(frame.height, 0), facecolor="#1e1e1e")
 
 
-def _shrunk(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height = round(picture.shape[0] * _WIDTH / picture.shape[1])
-    return np.asarray(Image.fromarray(picture).resize((_WIDTH, height), Image.Resampling.BOX))
-
-
-def _canvas(frame: Frame) -> tuple[Image.Image, float]:
-    scale = _WIDTH / frame.width
-    return Image.new("L", (_WIDTH, round(frame.height * scale)), 30), scale
-
-
-def _local(samples: Sequence[PsfSample], frame: Frame) -> Image.Image:
-    sheet, scale = _canvas(frame)
-    for sample in samples:
-        row, col = frame.pixel(sample.position)
-        tile = Image.fromarray(kernel_tile(sample.kernel, zoom=2))
-        sheet.paste(tile, (round(col * scale - tile.width / 2), round(row * scale - tile.height / 2)))
-    return sheet
-
-
-def _field(field: PsfField, frame: Frame) -> Image.Image:
-    sheet, scale = _canvas(frame)
-    rows, cols = _GRID
-    for i in range(rows):
-        for j in range(cols):
-            row, col = (i + 0.5) / rows * frame.height, (j + 0.5) / cols * frame.width
-            tile = Image.fromarray(kernel_tile(field.kernel_at(frame.position(row, col), "g", _SIZE), zoom=2))
-            sheet.paste(tile, (round(col * scale - tile.width / 2), round(row * scale - tile.height / 2)))
-    return sheet
-
-
-def strip(picture: Picture, side: int, gap: int = 6) -> Picture:
-    """Put the five crops of `crop_boxes` side by side on white, `(side, 5 side + 4 gap, 3)`."""
-    side = min(side, picture.shape[0] // 2, picture.shape[1] // 2)
-    boxes = crop_boxes(picture.shape[0], picture.shape[1], side)
-    sheet = np.full((side, len(boxes) * (side + gap) - gap, 3), 255, dtype=np.uint8)
-    for i, (row, col) in enumerate(boxes.values()):
-        left = i * (side + gap)
-        sheet[:, left : left + side] = picture[row : row + side, col : col + side]
-    return sheet
-
-
-def kernel_tile(kernel: Kernel, zoom: int = 3, gamma: float = 0.5) -> NDArray[np.uint8]:
-    """Draw a kernel, its peak white, each pixel `zoom` times; the paper's figures use gamma 0.5."""
-    shown = np.rint((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
-    return np.kron(shown, np.ones((zoom, zoom), dtype=np.uint8))
+def shown(kernel: Kernel) -> Kernel:
+    """Scale a kernel to its peak, with gamma 0.5 as in the paper's figures."""
+    return np.sqrt(kernel / kernel.max())

@@ -8,7 +8,7 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
     <key>/paper-<n>.json              the same the paper's own way from end to end
     <key>/measured.json               with PSFs measured on a target
     <key>/general.json                with a general profile of the lens model
-    <key>/rival-<version>.json        corrected with the PSFs of a rival (`lab.schuler`), from the first photo
+    <key>/rival.json                  corrected with the PSFs of a rival (`lab.schuler`), from the first photo
 
 They hold figures only, by the names of states (`cases`), some ten kilobytes a lens. Photos lie in `photos` of
 the output folder, pictures in `pictures`.
@@ -16,6 +16,7 @@ the output folder, pictures in `pictures`.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -26,7 +27,7 @@ from typing import Any, Final, TypeAlias
 from PIL import Image
 
 from lab.cases import photo_half
-from lab.images import as_shown
+from lab.images import as_shown, strip
 from lab.reproduce import figures, measure
 from lab.reproduce.cases import (
     BEFORE,
@@ -42,11 +43,11 @@ from lab.reproduce.cases import (
     learned,
     photos_of,
 )
-from lab.reproduce.fields import Remembered, general_field, general_words, measured_field
+from lab.reproduce.fields import general_field, general_words, measured_field
 from lab.reproduce.learners import Learner, Roi, corrected_with, paper_way
 from lab.reproduce.shots import Container, Shots, in_container, take
 from lab.schuler import Schuler
-from lab.stored import Unit, read, stored, version_of
+from lab.stored import Unit, read, stored
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
@@ -86,10 +87,10 @@ def run_reproduction(
     finished = [job.run(told) for job in jobs]
     drawn: Unit = {}
     if plan.compare:
+        # of all lenses: another choice of them has figures of its own
+        whole = hashlib.sha256(" ".join(job.folder.name for job in jobs).encode()).hexdigest()[:12]
         make = partial(figures.draw, plan, jobs[0].photos, shown, workers=workers)
-        drawn = stored(jobs[0].folder / f"figures-{figures.version()}.json", make)
-        if not all((shown / name).exists() for name in figures.names(drawn)):
-            drawn = make()
+        drawn = stored(cache / f"figures-{whole}.json", make)
         told("figures 2 and 4")
     files = plan.files()
     return {
@@ -119,9 +120,9 @@ class CaseJob:
         return self.taken / photos_of(self.case, self.plan)
 
     @cached_property
-    def truth(self) -> Remembered:
-        """The true PSFs, which are slow to make."""
-        return Remembered(self.case.truth())
+    def truth(self) -> PsfField:
+        """The true PSFs."""
+        return self.case.truth()
 
     @cached_property
     def shots(self) -> Shots:
@@ -142,7 +143,7 @@ class CaseJob:
                 found[f"paper-{n}"] = partial(self._learned, paper, n, name, f"way-paper-n{n}")
             found["measured"] = self._measured
             found["general"] = lambda: self._by_field(general_field(self.case), 0.0, GENERAL, "general")
-            found[f"rival-{version_of('lab.schuler')[:8]}"] = self._rival
+            found["rival"] = self._rival
         return found
 
     def run(self, told: Callable[[str], None]) -> Unit:
@@ -199,14 +200,13 @@ class CaseJob:
         """What the rival makes of the first photo, corrected by our method."""
         began = time.monotonic()
         try:
-            field = Schuler().field([develop(self.shots.learn[0])])
+            field = Schuler().field(develop(self.shots.learn[0]))
         except LensModelError as error:
             return {"states": {RIVAL: self._before}, "refused": {RIVAL: [str(error)]}}
         return self._by_field(field, time.monotonic() - began, RIVAL, "schuler")
 
-    def _by_field(self, psfs: PsfField, seconds: float, name: str, label: str) -> Unit:
+    def _by_field(self, field: PsfField, seconds: float, name: str, label: str) -> Unit:
         """Errors of a PSF field, and what corrections with it come to."""
-        field = Remembered(psfs)
         answers = [(field.kernel_at(*place, measure.PSF_SIZE), float("nan")) for place in measure.places()]
         return {
             **self._corrected(field, name, label),
@@ -242,7 +242,8 @@ class CaseJob:
         after, expected = learner.corrected(shots.held_out, self._parts)
         edges, _ = learner.corrected(shots.chart, measure.chart_parts(case))
         state = measure.state(edges, after, shots, case)
-        state["forecast"] = measure.forecast(self._before["light"], after, expected, shots, case)
+        made = measure.light(after, shots, case)
+        state["forecast"] = measure.forecast(self._before["light"], made, expected)
         answers = learner.answers(measure.places(), case.settings, measure.PSF_SIZE)
         return {
             **unit,
@@ -259,6 +260,6 @@ class CaseJob:
     def _picture(self, label: str, planes: Planes, *, raw: bool = True) -> str:
         name = f"{self.folder.name}-{label}.png"
         gains = self.case.camera.white_balance if raw else (1.0, 1.0, 1.0)
-        crops = figures.strip(as_shown(planes, gains), CROP_PX)
+        crops = strip(as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name

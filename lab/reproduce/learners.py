@@ -77,8 +77,7 @@ class Learner:
     def corrected(self, photo: Path, parts: Sequence[Roi]) -> tuple[Planes, Mapping[str, float | None]]:
         """Correct parts of a photo that takes no part in learning, with what is known now.
 
-        Also the gain in PSNR of linear light that the correction expects of itself, by zone, mean over the
-        parts; None where it is not sure enough to tell.
+        Also the expected gain in PSNR of linear light by zone, mean over the parts; None if not told.
         """
         developed = develop(photo)
         model, settings = self._known(), sampling.settings_of(developed)

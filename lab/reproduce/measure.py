@@ -11,7 +11,7 @@ import numpy as np
 
 from lab.charts import by_zone, measure_edges
 from lab.images import BLOCK, BORDER, fidelity
-from lab.model.model_benchmark import asked_places
+from lab.model_benchmark import asked_places
 from lab.reproduce.cases import Case
 from lab.reproduce.learners import Place, Roi
 from lab.reproduce.shots import Shots, guard_of
@@ -37,31 +37,18 @@ def places() -> list[Place]:
 
 def psf_errors(answers: Sequence[tuple[Kernel, float]], truth: PsfField) -> dict[str, Any]:
     """Compare kernels at `places()`, and the errors expected of them, with the truth after alignment."""
-    rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
-    mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
+    errors: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     right = []
     for (place, channel), (kernel, expected) in zip(places(), answers, strict=True):
-        found = distance(kernel, truth.kernel_at(place, channel, PSF_SIZE))
-        rel_l2[channel][zone_of(place.r)].append(found.rel_l2)
-        mtf[channel][zone_of(place.r)].append(found.mtf_rmse)
-        ratio = expected / max(found.rel_l2, 1e-9)
-        right.append(1.0 / NEAR <= ratio <= NEAR)
-    return {
-        "rel_l2": _medians(rel_l2),
-        "mtf_rmse": _medians(mtf),
-        "predicted_right": float(np.mean(right)),
-    }
-
-
-def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
-    return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
+        error = distance(kernel, truth.kernel_at(place, channel, PSF_SIZE)).rel_l2
+        errors[channel][zone_of(place.r)].append(error)
+        right.append(1.0 / NEAR <= expected / max(error, 1e-9) <= NEAR)
+    medians = {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in errors.items()}
+    return {"rel_l2": medians, "predicted_right": float(np.mean(right))}
 
 
 def parts(frame: Frame) -> list[Roi]:
-    """The parts of a frame that are corrected and compared: centre, two half way out, the four corners.
-
-    A correction of all of a large frame takes minutes and tells no more.
-    """
+    """The parts of a frame that are corrected and compared: centre, two half way out, the four corners."""
     side = min(PART, frame.height // 3 // 2 * 2, frame.width // 3 // 2 * 2)
     bottom, right = frame.height - side, frame.width - side
     inner = [(bottom // 2, right // 2), (bottom // 4, right // 4), (3 * bottom // 4, 3 * right // 4)]
@@ -79,28 +66,18 @@ def _edge_boxes(case: Case) -> list[Roi]:
     return [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges[:_EDGES]]
 
 
-def edges(chart: Planes, case: Case) -> dict[str, Any]:
-    """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
-
-    The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
-    pixel, not a constant 1, whose MTF50 would lie at infinity.
-    """
-    found = by_zone(measure_edges(chart[1], _edge_boxes(case)))
-    return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
-
-
-def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
-    del row["zone"]
-    for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
-        row[name] = None if math.isnan(row[name]) else row[name] * height
-    return row
+def edges(chart: Planes, case: Case) -> dict[Zone, dict[str, Any]]:
+    """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH."""
+    found = {zone: asdict(row) for zone, row in by_zone(measure_edges(chart[1], _edge_boxes(case))).items()}
+    for row in found.values():
+        del row["zone"]
+        for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
+            row[name] = None if math.isnan(row[name]) else row[name] * case.height
+    return found
 
 
 def picture(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dict[Zone, float]:
-    """PSNR of the held-out photo against the sharp scene in `parts`; see `fidelity`.
-
-    Photos of the raw path are white-balanced for it; others are already.
-    """
+    """PSNR of the held-out photo against the sharp scene in `parts`; `raw` ones are white-balanced for it."""
     gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
     seen = photo * gains if raw else photo
     return fidelity(seen, shots.truth() * gains, case.camera.frame, corners=_blocks(case))
@@ -114,22 +91,20 @@ def _blocks(case: Case) -> list[tuple[int, int]]:
     return every
 
 
+def light(photo: Planes, shots: Shots, case: Case) -> dict[Zone, float]:
+    """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
+    return fidelity(photo, shots.truth(), case.camera.frame, srgb=False, corners=_blocks(case))
+
+
 def forecast(
-    before: Mapping[str, float], after: Planes, expected: Mapping[str, float | None], shots: Shots, case: Case
+    before: Mapping[str, float], after: Mapping[Zone, float], expected: Mapping[str, float | None]
 ) -> dict[str, dict[str, float | None]]:
     """Gain in PSNR of linear light that a correction expected of itself in each zone, beside the true one."""
-    found = light(after, shots, case)
     return {
-        zone: {"expected": expected[zone], "true": found[zone] - before[zone]}
-        for zone in found
+        zone: {"expected": expected[zone], "true": db - before[zone]}
+        for zone, db in after.items()
         if zone in expected
     }
-
-
-def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
-    """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
-    made = fidelity(photo, shots.truth(), case.camera.frame, srgb=False, corners=_blocks(case))
-    return dict(made.items())
 
 
 def state(

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lab.page import Page
-from lab.reproduce.bars import Bar, bars, held
 from lab.reproduce.cases import GENERAL, PAPER_WAY
-from lab.reproduce.tables import counts, groups, number, summary
-from lensmodel.core.errors import InvalidInputError
+from lab.reproduce.tables import Bar, bars, counts, groups, held, number, summary
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import ZONES
 
@@ -31,33 +29,54 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
     page = Page()
     page.title("The paper's figures with this software", 1)
     page.text(_conditions(result))
-    _which_lenses(page, result)
-    _bars_table(page, bars(result))
+    _lenses(page, result)
+    _bars(page, bars(result))
     for label, group in groups(result).items():
-        found = summary(group)
-        _table1(page, found, label)
-        _psf_tables(page, found, label)
-        _photo_tables(page, found, label)
-    _refused(page, result)
-    _fig1(page, result["figures"].get("fig1"))
-    _fig2(page, result["figures"].get("fig2"))
-    _fig4(page, result["figures"].get("fig4"))
-    _before_after(page, result)
+        _tables(page, summary(group), label)
+    drawn = result["figures"]
+    if drawn.get("fig1"):
+        page.title("Fig. 1: blind estimators on single patches")
+        page.text("Share of cases whose error ratio stays below a bound; from `lensmodel bench blind`.")
+        page.markdown(drawn["fig1"]["table"])
+        for name in drawn["fig1"]["pictures"]:
+            page.picture(PICTURES + name, "Cumulative error ratio")
+    if drawn.get("fig2"):
+        _fig2(page, drawn["fig2"])
+    if drawn.get("fig4"):
+        _fig4(page, drawn["fig4"])
+    page.title("Figs. 5 and 6: before and after")
+    page.text("1:1 crops of the photo never used for calibration: centre, then the four corners.")
+    for case in result["cases"]:
+        page.title(case["title"], 3)
+        for label, words in _labels(case).items():
+            if label in case["pictures"]:
+                page.picture(PICTURES + case["pictures"][label], words)
     return page.write(folder / "reproduction.md", "Reproduction")
 
 
 def write_json(result: Mapping[str, Any], path: Path) -> Path:
-    """Write every figure, the summary of each group of lenses, the rows of what hurts, and the bars."""
-    found = {label: summary(group) for label, group in groups(result).items()}
+    """Write every figure, the summary of each group of lenses, and the bars."""
     every = bars(result)
     whole = {
         **result,
-        "summary": found,
+        "summary": {label: summary(group) for label, group in groups(result).items()},
         "bars": [bar.plain() for bar in every],
         "bars_held": held(every),
     }
     write_atomically(path, (json.dumps(whole, indent=1) + "\n").encode())
     return path
+
+
+def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
+    """Take table and curves of a finished `lensmodel bench blind`; None where there is none."""
+    if not (folder / "blind.md").exists():
+        return None
+    pictures.mkdir(parents=True, exist_ok=True)
+    curves = sorted(folder.glob("blind-er-*.png"))
+    for curve in curves:
+        shutil.copyfile(curve, pictures / f"fig1-{curve.name}")
+    table = (folder / "blind.md").read_text(encoding="utf-8")
+    return {"table": table, "pictures": [f"fig1-{curve.name}" for curve in curves]}
 
 
 def _conditions(result: Mapping[str, Any]) -> str:
@@ -74,81 +93,23 @@ def _conditions(result: Mapping[str, Any]) -> str:
     )
 
 
-def collected(folder: Path, pictures: Path) -> dict[str, Any] | None:
-    """Take tables and curves of a finished benchmark; None where there is none."""
-    path = folder / "blind.json"
-    if not path.exists():
-        return None
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        settings, rows = stored["settings"], stored["summary"]
-        kept = {name: settings[name] for name in ("half", "patch")}
-    except (OSError, ValueError, KeyError) as error:
-        raise InvalidInputError(f"{path} is no benchmark; run `lensmodel bench blind` again") from error
-    pictures.mkdir(parents=True, exist_ok=True)
-    curves = sorted(folder.glob("blind-er-*.png"))
-    for curve in curves:
-        shutil.copyfile(curve, pictures / f"fig1-{curve.name}")
-    return {"rows": rows, "settings": kept, "pictures": [f"fig1-{curve.name}" for curve in curves]}
+def _lenses(page: Page, result: Mapping[str, Any]) -> None:
+    """Name every lens, where it comes from, whether anything was developed on it, and refused photos."""
+    page.title("The lenses")
+    page.text("Nothing was developed, chosen or trained on photos of an unseen lens.")
+    head = ["family", "lens", "source", "", "general profile", "photos that did not count"]
+    rows = []
+    for case in result["cases"]:
+        refused = [reason for name, reasons in case["refused"].items()
+                   if name.startswith(("n = ", PAPER_WAY)) for reason in reasons]  # fmt: skip
+        seen = "unseen" if case["unseen"] else "looked at during development"
+        own = [case["family"], case["title"], case["source"], seen, case.get("general_profile", "")]
+        rows.append([*own, "; ".join(dict.fromkeys(refused))])
+    page.table(head, rows)
 
 
-# --- tables ---
-
-
-def _table1(page: Page, found: Mapping[str, Any], label: str) -> None:
-    """MTF50 by zone, with what makes it honest."""
-    page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
-    page.text(
-        f"Mean over {found['lenses']} lenses; in each zone the median over its edges, and the largest "
-        "MTF and overshoot (percent of the step), without which MTF50 proves nothing."
-    )
-    head = ["", *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over"))]
-    page.table(head, [[_shown(state), *_edge_cells(row)] for state, row in found["mtf"].items()])
-    page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
-    page.table(["", *ZONES], _rows({f"n = {n}": row for n, row in found["share"].items()}, 2))
-    page.text("The paper, Canon EF 24mm f/1.4 (centre, corner), for comparison of shares, not of values:")
-    page.table(["", "center", "corner"], _PAPER)
-
-
-def _edge_cells(row: Mapping[str, Any]) -> list[str]:
-    cells = []
-    for zone in ZONES:
-        edge = row[zone]
-        cells += [
-            number(edge["mtf50"]),
-            f"{number(edge['tangential_mtf50'])} / {number(edge['sagittal_mtf50'])}",
-            number(edge["mtf_max"], 2),
-            number(edge["overshoot"], 1),
-        ]
-    return cells
-
-
-def _psf_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
-    """Error of the PSF, ours and others'."""
-    page.title(f"Error of the PSF, {label}")
-    page.text(
-        "Relative L2 against the truth after sub-pixel alignment, green; median of the zone, mean over "
-        "lenses."
-    )
-    page.table(["", *ZONES], _rows({_shown(state): row["g"] for state, row in found["psf"].items()}, 3))
-
-
-def _photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
-    """PSNR of the photo never learned from."""
-    page.title(f"A photo never used for calibration, {label}")
-    page.text(
-        "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 pixels at its "
-        "best shift."
-    )
-    page.table(["", *ZONES], _rows({_shown(state): row for state, row in found["psnr"].items()}, 2))
-    page.text("Share of the gain of the true PSF in PSNR, where that is measurable:")
-    page.table(["", *ZONES], _rows({f"n = {n}": row for n, row in found["psnr_kept"].items()}, 2))
-
-
-def _bars_table(page: Page, every: Sequence[Bar]) -> None:
+def _bars(page: Page, every: list[Bar]) -> None:
     """Every bar, its value, and whether it holds: for each family a table, a column for each n."""
-    if not every:
-        return
     page.title("What is asked, and what holds")
     count = held(every)
     page.text(
@@ -157,160 +118,91 @@ def _bars_table(page: Page, every: Sequence[Bar]) -> None:
         "default, means over the lenses of a family."
     )
     for family in dict.fromkeys(bar.family for bar in every):
+        own = [bar for bar in every if bar.family == family]
         page.title(family.capitalize(), 3)
-        rows: dict[tuple[str, str], dict[str, Bar]] = {}
-        for bar in every:
-            if bar.family == family:
-                rows.setdefault((bar.name, bar.place), {})[bar.n] = bar
-        counts = sorted({bar.n for bar in every if bar.family == family})
-        head = ["", "where", *(f"n = {n}" for n in counts)]
-        page.table(head, [[*key, *(_cell(row.get(n)) for n in counts)] for key, row in rows.items()])
+        rows: dict[tuple[str, str], dict[str, str]] = {}
+        for bar in own:
+            value = number(bar.value, 0 if isinstance(bar.value, int) else 2)
+            verdict = {None: "not told", True: "held", False: "MISSED"}[bar.met]
+            rows.setdefault((bar.name, bar.place), {})[bar.n] = f"{value} ({bar.asked}) {verdict}"
+        numbers = sorted({bar.n for bar in own})
+        head = ["", "where", *(f"n = {n}" for n in numbers)]
+        page.table(head, [[*key, *(row.get(n, "") for n in numbers)] for key, row in rows.items()])
 
 
-def _cell(bar: Bar | None) -> str:
-    if bar is None:
-        return ""
-    value = number(bar.value, 0 if isinstance(bar.value, int) else 2)
-    band = f"at most {bar.high:g}" if bar.low is None else f"at least {bar.low:.2g}"
-    verdict = {None: "not told", True: "held", False: "MISSED"}[bar.met]
-    return f"{value} ({band}) {verdict}"
+def _tables(page: Page, found: Mapping[str, Any], label: str) -> None:
+    """Table 1, errors of the PSF and PSNR of a family of lenses."""
 
+    def zones(words: str, rows: Mapping[str, Mapping[str, float | None]], digits: int) -> None:
+        page.text(words)
+        head = ["", *ZONES]
+        page.table(head, [[name, *(number(row[z], digits) for z in ZONES)] for name, row in rows.items()])
 
-def _which_lenses(page: Page, result: Mapping[str, Any]) -> None:
-    """Name every lens, where it comes from, and whether anything was developed on it."""
-    page.title("The lenses")
+    def named(rows: Mapping[str, Any]) -> dict[str, Any]:  # what was learned by default says so
+        return {f"default, {name}" if name.startswith("n = ") else name: row for name, row in rows.items()}
+
+    page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
     page.text(
-        "Nothing was developed, chosen or trained on photos of an unseen lens. Ray-traced lenses are of "
-        "published designs, traced to all orders."
+        f"Mean over {found['lenses']} lenses; in each zone the median over its edges, and the largest "
+        "MTF and overshoot (percent of the step), without which MTF50 proves nothing."
     )
-    rows = [
-        [
-            case["family"],
-            case["title"],
-            case["source"],
-            "unseen" if case["unseen"] else "looked at during development",
-            case.get("general_profile", ""),
-        ]
-        for case in result["cases"]
-    ]
-    page.table(["family", "lens", "source", "", "general profile"], rows)
+    head = ["", *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over"))]
+    page.table(head, [[name, *_edge_cells(row)] for name, row in named(found["mtf"]).items()])
+    by_count = {name: {f"n = {n}": row for n, row in found[name].items()} for name in ("share", "psnr_kept")}
+    words = "Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:"
+    zones(words, by_count["share"], 2)
+    page.text("The paper, Canon EF 24mm f/1.4 (centre, corner), for comparison of shares, not of values:")
+    page.table(["", "center", "corner"], _PAPER)
+    page.title(f"Error of the PSF, {label}")
+    words = "Relative L2 to the truth after sub-pixel alignment, green; median of the zone, mean over lenses."
+    zones(words, {name: row["g"] for name, row in named(found["psf"]).items()}, 3)
+    page.title(f"A photo never used for calibration, {label}")
+    words = "PSNR in dB of the sRGB-encoded picture, each block of 128 pixels at its best shift."
+    zones(words, named(found["psnr"]), 2)
+    zones("Share of the gain of the true PSF in PSNR, where that is measurable:", by_count["psnr_kept"], 2)
 
 
-def _refused(page: Page, result: Mapping[str, Any]) -> None:
-    """Name the photos that did not count."""
-    refused = [
-        f"{case['title']}: {reason}"
-        for case in result["cases"]
-        for reason in dict.fromkeys(
-            reason
-            for state, reasons in case["refused"].items()
-            if state.startswith(("n = ", PAPER_WAY))
-            for reason in reasons
+def _edge_cells(row: Mapping[str, Any]) -> list[str]:
+    return [
+        cell
+        for edge in (row[zone] for zone in ZONES)
+        for cell in (
+            number(edge["mtf50"]),
+            f"{number(edge['tangential_mtf50'])} / {number(edge['sagittal_mtf50'])}",
+            number(edge["mtf_max"], 2),
+            number(edge["overshoot"], 1),
         )
     ]
-    if refused:
-        page.text("Photos that gave no usable patch and did not count: " + "; ".join(refused) + ".")
 
 
-def _rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
-    return [[name, *(number(row[zone], digits) for zone in ZONES)] for name, row in rows.items()]
-
-
-def _shown(state: str) -> str:
-    """Name of a state on pages: what was learned by default says so."""
-    return f"default, {state}" if state.startswith("n = ") else state
-
-
-# --- figures ---
-
-
-def _fig1(page: Page, fig: Mapping[str, Any] | None) -> None:
-    """Error ratio of blind estimators."""
-    if not fig:
-        return
-    page.title("Fig. 1: blind estimators on single patches")
-    page.text(
-        "Share of cases whose error ratio stays below a bound, higher is better; from "
-        f"`lensmodel bench blind`, half {fig['settings']['half']}, "
-        f"patches of {fig['settings']['patch']} pixels."
-    )
-    rows = [
-        [
-            row["method"],
-            f"{100 * row['noise']:g} %",
-            str(row["cases"]),
-            number(100 * row["improved"]),
-            number(100 * row["er_lt_3"]),
-            number(row["er_median"], 2),
-            number(row["rel_l2"], 2),
-        ]
-        for row in fig["rows"]
-    ]
-    page.table(["", "noise", "cases", "improved %", "ER < 3 %", "median ER", "PSF error"], rows)
-    for name in fig["pictures"]:
-        page.picture(PICTURES + name, "Cumulative error ratio")
-
-
-def _fig2(page: Page, fig: Mapping[str, Any] | None) -> None:
+def _fig2(page: Page, fig: Mapping[str, Any]) -> None:
     """Interpolation against regression."""
-    if not fig:
-        return
     page.title("Fig. 2: interpolation against regression")
     page.text(
         "Ways to answer between 24 true PSFs of one lens: of a regular grid of windows, blurred by the "
         "operator of efficient filter flow (half overlap, Bartlett-Hann windows), and regressions of one PSF "
         "at a random place of each window. Relative L2, mean over the lenses of a family:"
     )
-    page.table(
-        ["family", "", *ZONES],
+    rows = [
         [
-            [
-                f"{row['family']} ({row['lenses']})",
-                row["method"],
-                *(number(row["errors"].get(zone), 3) for zone in ZONES),
-            ]
-            for row in fig["table"]
-        ],
-    )
-    places = "; ".join(f"r = {r:g}, phi = {phi:g}" for r, phi in fig["places"])
-    page.picture(
-        PICTURES + fig["picture"],
-        f"Rows: {', '.join(fig['rows'])}. Columns: {places}. {fig['lens']}, gamma 0.5",
-    )
+            f"{row['family']} ({row['lenses']})",
+            row["method"],
+            *(number(row["errors"].get(z), 3) for z in ZONES),
+        ]
+        for row in fig["table"]
+    ]
+    page.table(["family", "", *ZONES], rows)
+    page.picture(PICTURES + fig["picture"], f"{fig['lens']}, gamma 0.5")
 
 
-def _fig4(page: Page, fig: Mapping[str, Any] | None) -> None:
+def _fig4(page: Page, fig: Mapping[str, Any]) -> None:
     """From edges to the field."""
-    if not fig:
-        return
     page.title("Fig. 4: from edges to the field")
     if "failed" in fig:
         page.text(f"The photo told nothing about the blur: {fig['failed']}.")
         return
-    words = (
-        "Confidence map",
-        f"The {fig['patches']} patches",
-        f"Local PSFs of {fig['samples']} patches",
-        "Regressed field",
-        "The truth",
-    )
-    page.text(f"{fig['lens']}, one photo, green, calibrated in the library. Kernels with gamma 0.5.")
-    for name, label in zip(fig["pictures"], words, strict=True):
-        page.picture(PICTURES + name, label)
-
-
-def _before_after(page: Page, result: Mapping[str, Any]) -> None:
-    """Crops of the photo never learned from."""
-    page.title("Figs. 5 and 6: before and after")
-    page.text(
-        "1:1 crops of the photo never used for calibration: centre, upper left, upper right, lower left, "
-        "lower right."
-    )
-    for case in result["cases"]:
-        page.title(case["title"], 3)
-        for label, words in _labels(case).items():
-            if label in case["pictures"]:
-                page.picture(PICTURES + case["pictures"][label], words)
+    words = f"{fig['lens']}, one photo: {fig['samples']} green PSFs of {fig['patches']} patches, gamma 0.5"
+    page.picture(PICTURES + fig["picture"], words)
 
 
 def _labels(case: Mapping[str, Any]) -> dict[str, str]:

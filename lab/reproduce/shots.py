@@ -12,8 +12,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from lab.reproduce.cases import Case
-from lab.reproduce.frames import centred_cut, frame_scene
+from lab.reproduce.cases import Case, centred_cut, frame_scene
 from lensmodel.core.files import atomic, save_array
 from lensmodel.core.types import Planes
 from lensmodel.photo import develop, write_image

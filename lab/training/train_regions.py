@@ -11,9 +11,9 @@ two halves differ as well.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -39,7 +39,6 @@ SIZE: Final = 192  # pixels of a window: that of a calibration
 KERNEL_SIZE: Final = 55  # pixels: that of patch recurrence
 WINDOWS_A_GROUP: Final = 8  # of one photo behind one lens (chosen)
 FIRST_SEED: Final = {"dev": 7000, "test": 8000}  # of the lenses of each half: they differ (chosen)
-_ARGUMENTS = 4  # of `collect` with GROUPS; one less at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,20 +110,8 @@ def read_table(table: Path) -> list[Labelled]:
     return [Labelled(**{**row, "features": tuple(row["features"])}) for row in rows]
 
 
-@dataclass(frozen=True, slots=True)
-class RegionsReport:
-    """Spearman's rank correlations of scores with S: over all held-out windows, and the mean over groups."""
-
-    windows: int
-    groups: int
-    overall: float
-    within: float
-    r_map_overall: float
-    r_map_within: float
-
-
-def fit(table: Path, model: Path, seed: int = 0) -> RegionsReport:
-    """Learn from the development half, write the trees, report on the test half."""
+def fit(table: Path, model: Path, seed: int = 0) -> dict[str, float]:
+    """Learn from the development half, write the trees; rank correlations with S on the test half."""
     try:
         from sklearn.ensemble import GradientBoostingRegressor  # noqa: PLC0415  # needed for training only
     except ImportError as error:
@@ -142,21 +129,19 @@ def fit(table: Path, model: Path, seed: int = 0) -> RegionsReport:
         max_features=0.3,
         loss="huber",
         random_state=seed,
-    ).fit(_features(learn), np.log([_unlike(row) for row in learn]))
+    ).fit(_features(learn), np.log([max(1.0 - row.ncc, 1e-4) for row in learn]))
     ensemble = _arrays(trees)
     ensemble.save(model)
-    return judged(ensemble, held)
-
-
-def _unlike(row: Labelled) -> float:
-    return max(1.0 - row.ncc, 1e-4)
+    similarity = [row.ncc for row in held]
+    scores = {"learned": -ensemble.predict(_features(held)), "r-map": [row.r_map_score for row in held]}
+    return {name: float(stats.spearmanr(own, similarity).statistic) for name, own in scores.items()}
 
 
 def _features(rows: Sequence[Labelled]) -> NDArray[np.float64]:
     values = np.array([row.features for row in rows])
     if values.shape[1] != len(FEATURES):
         raise InvalidInputError(
-            f"the table has {values.shape[1]} features, the code {len(FEATURES)}; collect anew"
+            f"the table has {values.shape[1]} features, not {len(FEATURES)}; collect anew"
         )
     return values
 
@@ -184,42 +169,23 @@ def _arrays(model: object) -> TreeEnsemble:
     return TreeEnsemble(start, feature, threshold, left, right, value)
 
 
-def judged(ensemble: TreeEnsemble, rows: Sequence[Labelled]) -> RegionsReport:
-    """Compare learned scores and r-map scores on held-out windows."""
-    learned = -ensemble.predict(_features(rows))
-    r_map, similarity = (np.array([getattr(row, name) for row in rows]) for name in ("r_map_score", "ncc"))
-    groups = [np.flatnonzero([row.group == name for row in rows]) for name in sorted({r.group for r in rows})]
-
-    def within(score: NDArray[np.float64]) -> float:
-        return float(np.mean([_spearman(score[g], similarity[g]) for g in groups]))
-
-    return RegionsReport(
-        windows=len(rows),
-        groups=len(groups),
-        overall=_spearman(learned, similarity),
-        within=within(learned),
-        r_map_overall=_spearman(r_map, similarity),
-        r_map_within=within(r_map),
-    )
-
-
-def _spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return float(stats.spearmanr(a, b).statistic)
-
-
-def main(arguments: Sequence[str]) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run `collect` or `fit` from the command line."""
-    if len(arguments) < _ARGUMENTS - 1:
-        raise InvalidInputError(
-            "usage: train_regions collect PHOTOS TABLE [GROUPS [METHOD]] | fit TABLE MODEL"
-        )
-    verb, first, second, *rest = arguments
-    if verb == "collect":
-        groups, method = int(rest[0]) if rest else 240, rest[1] if len(rest) > 1 else "default"
-        collect(Path(first), Path(second), groups, method)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    taken, learned = verbs.add_parser("collect"), verbs.add_parser("fit")
+    for name in ("photos", "table"):
+        taken.add_argument(name, type=Path)
+    taken.add_argument("groups", type=int, nargs="?", default=240)
+    taken.add_argument("method", nargs="?", default="default")
+    for name in ("table", "model"):
+        learned.add_argument(name, type=Path)
+    asked = parser.parse_args(arguments)
+    if asked.verb == "collect":
+        collect(asked.photos, asked.table, asked.groups, asked.method)
     else:
-        sys.stdout.write(json.dumps(asdict(fit(Path(first), Path(second))), indent=1) + "\n")
+        print(json.dumps(fit(asked.table, asked.model), indent=1))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.model.exact import pixel_to_local
+from lab.model_benchmark import pixel_to_local
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition
 

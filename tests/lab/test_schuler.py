@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 
 from lab.scenes import dead_leaves
 from lab.schuler import BasisField, PhotoWindow, RadialBasis, Schuler, load_basis, principal, save_basis
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import distance, gaussian
 from lensmodel.core.types import FieldPosition, NoiseModel
@@ -70,11 +70,6 @@ def test_basis_holds_the_fields_that_it_was_made_of() -> None:
     kept = norms > 1e-12 * norms.max()
     back = ((parts[kept] @ seen) / norms[kept]) @ parts[kept]
     assert np.linalg.norm(back - seen) < 1e-6 * np.linalg.norm(seen) + 1e-9
-
-
-def test_basis_needs_as_many_fields_as_components() -> None:
-    with pytest.raises(InvalidInputError, match="as many fields"):
-        principal(np.array([radial(0.1, 0.2)]), RADII, 3)
 
 
 def test_basis_survives_its_file(tmp_path: object) -> None:

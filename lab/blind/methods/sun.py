@@ -6,6 +6,12 @@ the kernel comes from its gradients on the edges. Source: L. Sun, S. Cho, J. Wan
 
 On mild blur the prior's own sharpness decides the width of the kernel: it is as sharp as a pixel
 allows, which few photographs are.
+
+A window of 5 px on an edge is q = σ z + μ: its own mean μ, a pattern z of zero mean and unit norm, and a
+contrast σ. The patterns are ideal steps, bars and corners; the contrasts follow the distribution that
+edges of sharp scenes have. The paper matches σ itself, in display values; linear light has no such common
+scale, so that here the steepness is matched, σ over the range of values within some pixels: blur lowers
+σ but not the range of an isolated edge.
 """
 
 from __future__ import annotations
@@ -13,18 +19,137 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.edge_patches import SIDE, EdgePatchPrior, default_prior, edge_mask, target
-from lab.blind.steps.kernel_step import Grid, Term, cleaned, least_squares_kernel, unsure
+from lab.blind.steps.kernel_step import (
+    Grid,
+    Term,
+    cleaned,
+    conjugate_gradients,
+    least_squares_kernel,
+    unsure,
+)
 from lab.blind.steps.pyramid import Image, Latents, Level, View, coarse_to_fine
+from lab.cases import DATA
 from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane
+
+SIDE = 5  # pixels of a window, as in the paper
+EDGE_SHARE = 0.03
+"""So many of the pixels lie on the mask, the strongest first."""
+
+_ORIENTATIONS = 8  # of the filters: 22.5 degrees apart (chosen)
+_REACH = 4  # pixels of a filter: two standard deviations along the edge
+_ALONG_PX, _ACROSS_PX = 2.0, 1.0  # standard deviations of a filter (chosen): longer than wide
+_LEAST_LENGTH = 4  # pixels of an edge: shorter ones are noise (chosen)
+_AROUND = 11  # pixels: window of the local range, two patterns wide (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgePatchPrior:
+    """Patterns of sharp edges and the distribution of their contrast."""
+
+    patches: Image  # (n, 25), zero mean, unit norm; closed under turns by 90 degrees and change of sign
+    steepness: Image  # (q,), quantiles at (i + 1/2) / q of σ over the local range
+
+    @classmethod
+    def load(cls, path: Path = DATA / "edge_patches.npz") -> EdgePatchPrior:
+        """Read what `lab.training.blind_data` wrote."""
+        with np.load(path, allow_pickle=False) as stored:
+            return cls(stored["patches"].astype(np.float64), stored["steepness"].astype(np.float64))
+
+    def sharpened(self, windows: Image, ranges: Image) -> Image:
+        """Replace windows `(n, 25)` by sharp ones: best pattern, own mean, contrast by rank, never less."""
+        mean = windows.mean(axis=1, keepdims=True)
+        flat = windows - mean
+        contrast = np.linalg.norm(flat, axis=1)
+        best = (flat @ self.patches.T).argmax(axis=1)
+        steep = contrast / np.maximum(ranges, 1e-9)
+        rank = (steep.argsort(kind="stable").argsort(kind="stable") + 0.5) / max(len(windows), 1)
+        places = (np.arange(len(self.steepness)) + 0.5) / len(self.steepness)
+        wanted = np.maximum(np.interp(rank, places, self.steepness) * ranges, contrast)
+        return np.asarray(wanted[:, None] * self.patches[best] + mean)
+
+
+default_prior = cache(EdgePatchPrior.load)
+
+
+def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
+    """Mark thin edges: strongest responses to elongated derivative filters, local maxima across."""
+    responses = np.stack([np.abs(ndimage.correlate(x, f, mode="nearest")) for f in _bank()])
+    strength, way = responses.max(axis=0), responses.argmax(axis=0)
+    crest = np.zeros(x.shape, dtype=bool)
+    padded = np.pad(strength, 1)
+    for i in range(_ORIENTATIONS):
+        angle = math.pi * i / _ORIENTATIONS
+        down, across = round(-math.sin(angle)), round(math.cos(angle))
+        ahead = padded[1 + down : padded.shape[0] - 1 + down, 1 + across : padded.shape[1] - 1 + across]
+        behind = padded[1 - down : padded.shape[0] - 1 - down, 1 - across : padded.shape[1] - 1 - across]
+        crest |= (way == i) & (strength >= ahead) & (strength >= behind)
+    rim = SIDE // 2
+    inside = np.zeros(x.shape, dtype=bool)
+    inside[rim:-rim, rim:-rim] = True
+    crest &= inside & (strength > 1e-9)
+    count = max(int(share * x.size), 1)
+    if int(crest.sum()) > count:
+        crest &= strength >= np.partition(strength[crest], -count)[-count]
+    label, _ = ndimage.label(crest, np.ones((3, 3), dtype=np.int_))
+    long = np.bincount(label.ravel()) >= _LEAST_LENGTH
+    long[0] = False
+    return np.asarray(long[label])
+
+
+def steepness_of(x: Image) -> Image:
+    """σ of the window around each pixel over the local range, 0 where nothing varies."""
+    mean = ndimage.uniform_filter(x, SIDE, mode="nearest")
+    power = ndimage.uniform_filter(x * x, SIDE, mode="nearest") - mean * mean
+    return np.sqrt(np.maximum(power, 0.0)) * SIDE / np.maximum(local_range(x), 1e-9)
+
+
+def local_range(x: Image) -> Image:
+    """Largest less smallest value within 5 px in each direction."""
+    return np.asarray(
+        ndimage.maximum_filter(x, _AROUND, mode="nearest")
+        - ndimage.minimum_filter(x, _AROUND, mode="nearest")
+    )
+
+
+def target(x: Image, mask: NDArray[np.bool_], prior: EdgePatchPrior) -> tuple[Image, Image]:
+    """Mean of the sharp windows over each pixel, and how many lie over it: q and count, both (H, W)."""
+    rim = SIDE // 2
+    rows, cols = np.nonzero(mask)
+    windows = sliding_window_view(x, (SIDE, SIDE))[rows - rim, cols - rim].reshape(-1, SIDE * SIDE)
+    sharp = prior.sharpened(windows, local_range(x)[rows, cols]).reshape(-1, SIDE, SIDE)
+    total, count = np.zeros_like(x), np.zeros_like(x)
+    for i in range(SIDE):
+        for j in range(SIDE):
+            place = (rows + i - rim, cols + j - rim)
+            np.add.at(total, place, sharp[:, i, j])
+            np.add.at(count, place, 1.0)
+    return np.where(count > 0, total / np.maximum(count, 1.0), x), count
+
+
+@cache
+def _bank() -> tuple[Image, ...]:
+    """Derivatives of Gaussians, long along the edge; each responds to its own direction."""
+    t = np.arange(-_REACH, _REACH + 1, dtype=np.float64)
+    filters = []
+    for i in range(_ORIENTATIONS):
+        angle = math.pi * i / _ORIENTATIONS
+        u = math.cos(angle) * t[None, :] - math.sin(angle) * t[:, None]
+        v = math.sin(angle) * t[None, :] + math.cos(angle) * t[:, None]
+        one = u * np.exp(-0.5 * ((u / _ACROSS_PX) ** 2 + (v / _ALONG_PX) ** 2))
+        filters.append(one / np.abs(one).sum())
+    return tuple(filters)
+
 
 _INTENSITY_WEIGHT = 0.1  # w of values, of differences it is 1 (chosen): noise in values reaches far
 _LEAST_EDGE_PX = 30  # gradients on edges: of fewer a kernel is chance (chosen)
@@ -88,10 +213,7 @@ class _Alternation:
 
 
 def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Term]:
-    """Terms of the kernel step: differences of x on its edges against those of y.
-
-    Only where the kernel stays inside the patch: the latent image is not known beyond it.
-    """
+    """Terms of the kernel step: differences of x on its edges against those of y."""
     covered = ndimage.binary_dilation(edge_mask(x), np.ones((SIDE, SIDE), dtype=bool))
     half = side // 2
     weight = 1.0 / max(view.noise**2, 1e-6)
@@ -110,10 +232,7 @@ def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Ter
 def image_step(
     y: Image, kernel: Kernel, q: Image, count: Image, beta: float, smoothness: float, steps: int = 8
 ) -> Image:
-    """Minimise sum_d w_d |D_d (k * x - y)|² + β sum_p count(p) (x - q)² + α |grad x|² over x.
-
-    By conjugate gradients on a mirrored frame, preconditioned by the Fourier-diagonal part.
-    """
+    """Minimise sum_d w_d |D_d (k * x - y)|² + β sum_p count(p) (x - q)² + α |grad x|² over x."""
     pad = kernel.shape[0]
     rows, cols = (int(fft.next_fast_len(n + 2 * pad, real=True)) for n in y.shape)
     shape = (rows, cols)
@@ -133,20 +252,13 @@ def image_step(
     def applied(x: NDArray[np.float32]) -> NDArray[np.float32]:
         return fft.irfft2(diagonal * fft.rfft2(x), shape) + pull * x
 
-    x = wanted
-    residual = right - applied(x)
-    ready = fft.irfft2(inverse * fft.rfft2(residual), shape)
-    direction, power = ready, float(np.vdot(residual, ready))
-    for _ in range(steps):
-        if power <= 1e-12:
-            break
-        image = applied(direction)
-        length = np.float32(power / max(float(np.vdot(direction, image)), 1e-30))
-        x = x + length * direction
-        residual = residual - length * image
-        ready = fft.irfft2(inverse * fft.rfft2(residual), shape)
-        later = float(np.vdot(residual, ready))
-        direction, power = ready + np.float32(later / power) * direction, later
+    x = conjugate_gradients(
+        applied,
+        right - applied(wanted),
+        wanted,
+        steps,
+        inverse=lambda residual: fft.irfft2(inverse * fft.rfft2(residual), shape),
+    )
     return x[inside].astype(np.float64)
 
 

@@ -44,6 +44,7 @@ from lab.blind.steps.kernel_step import (
     Kernelish,
     Term,
     cleaned,
+    conjugate_gradients,
     least_squares_kernel,
     unsure,
 )
@@ -59,10 +60,7 @@ _FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at f
 
 @dataclass(frozen=True, slots=True)
 class Zhang:
-    """Kernel of least free energy under the coupled adaptive sparse prior.
-
-    Coarse to fine; each sweep updates the gradients and their variances, the kernel and the noise.
-    """
+    """Kernel of least free energy under the coupled adaptive sparse prior."""
 
     iterations: int = 20  # sweeps on each level
     steps: int = 8  # conjugate gradient steps of each image update
@@ -132,31 +130,17 @@ class GradientPosterior:
         return replace(self, variance=(1.0 / precision).astype(np.float32))
 
     def sharpened(self, kernel: Kernelish, noise: float, steps: int) -> GradientPosterior:
-        """Update x = argmin |y - k * x|² / λ + sum_i x_i² / γ_i by preconditioned conjugate gradients.
-
-        The preconditioner is c, the inverse of the diagonal.
-        """
+        """Update x = argmin |y - k * x|² / λ + sum_i x_i² / γ_i by preconditioned conjugate gradients."""
         grid, lam = self.grid, np.float32(noise)
         spectrum = grid.spectrum(kernel)
         precision = 1.0 / self.gamma
-        x = self.x
-        misfit = self.y - grid.valid(spectrum * grid.spectrum(x))
-        residual = grid.back(spectrum, misfit) / lam - precision * x
-        ready = self.variance * residual
-        direction = ready
-        power = float(np.vdot(residual, ready))
-        for _ in range(steps):
-            if power <= _TINY:
-                break
-            applied = grid.back(spectrum, grid.valid(spectrum * grid.spectrum(direction))) / lam
-            applied += precision * direction
-            length = np.float32(power / max(float(np.vdot(direction, applied)), _TINY))
-            x = x + length * direction
-            residual = residual - length * applied
-            ready = self.variance * residual
-            after = float(np.vdot(residual, ready))
-            direction = ready + np.float32(after / power) * direction
-            power = after
+        misfit = self.y - grid.valid(spectrum * grid.spectrum(self.x))
+
+        def applied(x: Floats) -> Floats:
+            return grid.back(spectrum, grid.valid(spectrum * grid.spectrum(x))) / lam + precision * x
+
+        residual = grid.back(spectrum, misfit) / lam - precision * self.x
+        x = conjugate_gradients(applied, residual, self.x, steps, inverse=lambda r: self.variance * r)
         return replace(self, x=x)
 
     def sparser(self) -> GradientPosterior:
@@ -174,60 +158,39 @@ class GradientPosterior:
         spread = float(np.vdot(self.variance, self.grid.reach_of(kernel)))
         return float(np.vdot(residual, residual)) + spread
 
-    def free_energy(self, kernel: Kernelish, noise: float, floor: float) -> float:
-        """F, with d = `floor` times n."""
-        inner = (np.square(self.x) + self.variance) / self.gamma + np.log(self.gamma / self.variance)
-        n = self.y.size
-        data = (self.misfit(kernel) + floor * n) / noise + n * float(np.log(noise))
-        return data + float(inner.sum(dtype=np.float64))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchPosterior:
-    """Posteriors of the two gradient images of one patch, with the noise variance λ of both."""
+    """Posteriors of the gradient images of one patch, down and across, with the noise variance λ of both."""
 
-    down: GradientPosterior  # differences between neighbouring rows and columns
-    across: GradientPosterior
+    parts: tuple[GradientPosterior, ...]
     noise: float  # λ; differences of white noise of variance σ² have 2 σ²
     floor: float  # d over the number of pixels
 
     @classmethod
     def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> PatchPosterior:
         """Start with half of the gradients' power as noise: nearly everything is still open."""
-        down, across = np.diff(y, axis=0), np.diff(y, axis=1)
-        noise = _FIRST_NOISE * 0.5 * float(np.mean(down**2) + np.mean(across**2)) + floor
-        return cls(
-            GradientPosterior.first(down, side, kernel, noise),
-            GradientPosterior.first(across, side, kernel, noise),
-            noise,
-            floor,
-        )
+        slopes = [np.diff(y, axis=axis) for axis in (0, 1)]
+        noise = _FIRST_NOISE * 0.5 * float(np.mean(slopes[0] ** 2) + np.mean(slopes[1] ** 2)) + floor
+        return cls(tuple(GradientPosterior.first(s, side, kernel, noise) for s in slopes), noise, floor)
 
     def improved(self, kernel: Kernelish, steps: int) -> PatchPosterior:
         """Update x, c and γ of both gradients."""
-        down, across = (
-            each.sharpened(kernel, self.noise, steps).spread(kernel, self.noise).sparser()
-            for each in (self.down, self.across)
-        )
-        return replace(self, down=down, across=across)
+        found = (part.sharpened(kernel, self.noise, steps) for part in self.parts)
+        return replace(self, parts=tuple(part.spread(kernel, self.noise).sparser() for part in found))
 
     def scaled(self, factor: float) -> PatchPosterior:
         """Multiply both x by a factor, as k is divided by it."""
-        return replace(self, down=self.down.scaled(factor), across=self.across.scaled(factor))
+        return replace(self, parts=tuple(part.scaled(factor) for part in self.parts))
 
     def with_noise(self, kernel: Kernelish) -> PatchPosterior:
         """Update λ = (|y - k * x|² + sum_i c_i w_i + d) / n."""
-        n = self.down.y.size + self.across.y.size
-        misfit = self.down.misfit(kernel) + self.across.misfit(kernel)
-        return replace(self, noise=misfit / n + self.floor)
+        misfit = sum(part.misfit(kernel) for part in self.parts)
+        return replace(self, noise=misfit / sum(part.y.size for part in self.parts) + self.floor)
 
-    def free_energy(self, kernel: Kernelish) -> float:
-        """F of both gradients."""
-        return sum(b.free_energy(kernel, self.noise, self.floor) for b in (self.down, self.across))
-
-    def weighted(self) -> tuple[tuple[GradientPosterior, float], tuple[GradientPosterior, float]]:
+    def weighted(self) -> list[tuple[GradientPosterior, float]]:
         """Both posteriors with their weight 1 / λ in the kernel step."""
-        return (self.down, 1.0 / self.noise), (self.across, 1.0 / self.noise)
+        return [(part, 1.0 / self.noise) for part in self.parts]
 
 
 def pooled_kernel(posteriors: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.kernel_step import cleaned, unsure
+from lab.blind.steps.kernel_step import cleaned, conjugate_gradients, unsure
 from lab.blind.steps.pyramid import Image, LevelSolver, View, coarse_to_fine
 from lensmodel.blind.estimator import PsfEstimate, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
@@ -42,15 +42,10 @@ def across(image: Image) -> Image:
 
 
 def shock_filtered(image: Image, dt: float, steps: int = 1) -> Image:
-    """Sharpen edges to steps, I <- I - sign(laplacian I) |grad I| dt.
+    """Sharpen edges to steps, I <- I - sign(laplacian I) |grad I| dt; stable for dt <= .7.
 
-    The gradient is the smaller of both one-sided differences, zero where they disagree in sign, so
-    that no pixel passes its neighbours for dt <= 1 / sqrt 2.
-
-    References
-    ----------
-    .. [1] S. Osher and L. I. Rudin, "Feature-oriented image enhancement using shock filters", SIAM
-       J. Numer. Anal. 27, 1990, eq. (2.19).
+    Source: S. Osher and L. I. Rudin, "Feature-oriented image enhancement using shock filters", SIAM J. Numer.
+    Anal. 27, 1990, eq. (2.19).
     """
     sharp = image
     for _ in range(steps):
@@ -68,12 +63,7 @@ def _minmod(a: Image, b: Image) -> Image:
 
 
 def bilateral(image: Image, *, reach: int, sigma_space: float, sigma_range: float) -> Image:
-    """Average neighbours that are near in place and in value.
-
-    References
-    ----------
-    .. [1] C. Tomasi and R. Manduchi, "Bilateral filtering for gray and color images", ICCV 1998.
-    """
+    """Average neighbours that are near in place and in value (C. Tomasi and R. Manduchi, ICCV 1998)."""
     wide = np.pad(image, reach, mode="symmetric")
     total, weights = np.zeros(image.shape), np.zeros(image.shape)
     for row in range(-reach, reach + 1):
@@ -91,11 +81,7 @@ def bilateral(image: Image, *, reach: int, sigma_space: float, sigma_range: floa
 def oriented_threshold(
     rows: Image, cols: Image, least: int, allowed: Mask, *, ranked: Image | None = None
 ) -> float:
-    """Largest threshold at which each of four orientations keeps `least` of the allowed pixels.
-
-    Pixels are ranked by magnitude, or by another image. An orientation that is too poor to have so
-    many is given all that it has.
-    """
+    """Largest threshold at which each of four orientations keeps `least` allowed pixels, or all it has."""
     magnitude = np.hypot(rows, cols)
     rank = magnitude if ranked is None else ranked
     angle = np.mod(np.arctan2(rows, cols), np.pi)
@@ -245,11 +231,7 @@ class KernelEquations:
         *,
         steps: int,
     ) -> NDArray[np.float64]:
-        """Minimise sum w |s * k - b|² + gamma |k|² over kernels of this side, without constraints.
-
-        gamma may differ from pixel to pixel. The autocorrelation of s is all that the product needs, so
-        that steps run on a grid of two kernel sides.
-        """
+        """Minimise sum w |s * k - b|² + gamma |k|² over kernels of this side, unconstrained."""
         n = int(fft.next_fast_len(2 * self.side, real=True))
         lags = np.arange(-(self.side - 1), self.side)
         plane = fft.irfft2(self.power, self.grid)
@@ -262,20 +244,8 @@ class KernelEquations:
             return np.asarray(blurred + gamma * k)
 
         target = self._middle(fft.irfft2(self.cross, self.grid))
-        k = np.array(start)
-        residual = target - applied(k)
-        direction, energy = residual, float(np.vdot(residual, residual))
         enough = _TOLERANCE**2 * float(np.vdot(target, target))
-        for _ in range(steps):
-            if energy <= enough:
-                break
-            product = applied(direction)
-            length = energy / max(float(np.vdot(direction, product)), _TINY * energy)
-            k = k + length * direction
-            residual = residual - length * product
-            before, energy = energy, float(np.vdot(residual, residual))
-            direction = residual + energy / before * direction
-        return k
+        return conjugate_gradients(applied, target - applied(start), start, steps, least=enough)
 
     def _middle(self, plane: Image) -> NDArray[np.float64]:
         lags = np.arange(self.side) - self.side // 2

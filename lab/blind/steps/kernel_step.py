@@ -7,8 +7,9 @@ kernel without its specks, and the estimate that it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,31 @@ class Grid:
         return boxes[::-1, ::-1]
 
 
+def conjugate_gradients(
+    applied: Callable[[Any], Any],
+    residual: NDArray[Any],
+    start: NDArray[Any],
+    steps: int,
+    *,
+    inverse: Callable[[Any], Any] = lambda residual: residual,
+    least: float = _TINY,
+) -> NDArray[Any]:
+    """Solve A x = b from a start with its residual b - A x; `inverse` is about that of A, `least` ends it."""
+    x, ready = start, inverse(residual)
+    direction, power = ready, float(np.vdot(residual, ready))
+    for _ in range(steps):
+        if power <= least:
+            break
+        product = applied(direction)
+        length = power / max(float(np.vdot(direction, product)), 1e-30)
+        x = x + length * direction
+        residual = residual - length * product
+        ready = inverse(residual)
+        before, power = power, float(np.vdot(residual, ready))
+        direction = ready + power / before * direction
+    return x
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
     """One summand w (|y - k * x|² + sum_j q_j k_j²) of the kernel step."""
@@ -142,8 +168,7 @@ def least_squares_kernel(
 def _mean_correlation(term: Term, n: int) -> Kernelish:
     """Mean over u of sum_p x(p - u) x(p - u - d) with p on the frame, for |d| < side, wrapped to n x n.
 
-    A latent pixel counts by the share of shifts u that carry it into the frame; the root of the
-    share goes to either factor, which keeps the result a correlation.
+    A pixel counts by the share of shifts u that carry it into the frame, the root of it in either factor.
     """
     grid = term.grid
     rows, cols = (np.convolve(np.ones(length), np.full(grid.side, 1.0 / grid.side)) for length in grid.frame)
@@ -157,10 +182,7 @@ def _mean_correlation(term: Term, n: int) -> Kernelish:
 
 
 def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
-    """Drop values below `threshold` times the peak and islands below `least_mass` of the sum.
-
-    Not centred. The largest island always stays.
-    """
+    """Drop values below `threshold` times the peak and islands below `least_mass` of the sum."""
     kept = np.maximum(kernel, 0.0)
     if not kept.max() > 0:
         raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")

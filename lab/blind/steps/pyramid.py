@@ -112,14 +112,9 @@ def level_shape(shape: tuple[int, ...], factor: float) -> tuple[int, int]:
 
 
 def resample(image: Image, shape: tuple[int, ...]) -> Image:
-    """Resize by Keys' cubic, stretched when the image shrinks so that nothing aliases.
+    """Resize by the cubic of R. Keys (IEEE TASSP 29, 1981), stretched when the image shrinks.
 
     The extent is kept: pixel i of n lies at (i + 1/2) / n. Beyond the border the image is mirrored.
-
-    References
-    ----------
-    .. [1] R. Keys, "Cubic convolution interpolation for digital image processing", IEEE TASSP 29,
-       1981.
     """
     if image.shape == shape:
         return image
@@ -137,10 +132,7 @@ def noise_gain(shape: tuple[int, ...], target: tuple[int, ...]) -> float:
 
 
 def rescaled(kernel: Kernel, factor: float, side: int) -> Kernel:
-    """Kernel of the same blur on a grid finer by `factor`, cut or padded to the odd `side`.
-
-    The middle pixel stays the middle. Undershoot of the cubic is clipped.
-    """
+    """Kernel of the same blur on a grid finer by `factor`, cut or padded to the odd `side`."""
     if factor == 1.0:
         return resized(kernel, side)
     have = kernel.shape[0]

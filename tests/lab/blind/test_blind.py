@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -200,17 +199,17 @@ def test_untouched_patch_is_in_every_report_and_never_counts_as_improved(report:
 
 
 def test_a_kernel_far_too_wide_does_harm(report: BlindReport) -> None:
-    wide = next(row for row in report.summary if row.method == "wide")
+    wide = next(row for row in report.summary if row["method"] == "wide")
 
-    assert wide.improved == 0.0
-    assert wide.width_ratio > 1.5
+    assert wide["improved"] == 0.0
+    assert wide["width_ratio"] > 1.5
 
 
 def test_a_method_that_declines_leaves_the_patch_as_it_is() -> None:
     report = run_blind_benchmark(BlindBenchmark(methods=("shy",), **SMALL), methods=registry(shy=Declining()))
-    shy = next(row for row in report.summary if row.method == "shy")
+    shy = [row for row in report.results if row.method == "shy"]
 
-    assert shy.declined == shy.cases == 3
+    assert [row.declined for row in shy] == [True] * 3
     assert all(r.error_ratio == r.untouched_ratio for r in report.results)
 
 
@@ -355,18 +354,16 @@ def test_numbers_do_not_depend_on_the_number_of_processes() -> None:
 def result(ratio: float, method: str = "m", untouched: float = 3.0) -> CaseResult:
     return CaseResult(
         case="c", method=method, noise=0.01, error_ratio=ratio, untouched_ratio=untouched, ncc=0.9,
-        rel_l2=0.4, mtf_rmse=0.1, width_px=1.0, true_width_px=2.0, confidence=math.nan,
-        predicted_error=math.nan, declined=False, seconds=1.0,
+        rel_l2=0.4, mtf_rmse=0.1, width_px=1.0, true_width_px=2.0, declined=False, seconds=1.0,
     )  # fmt: skip
 
 
 def test_summary_counts_what_it_says() -> None:
     (row,) = summarised([result(1.0), result(2.5), result(2.9), result(8.0)])
 
-    assert (row.cases, row.improved, row.er_lt_3, row.er_lt_2) == (4, 0.75, 0.75, 0.25)
-    assert row.er_median == pytest.approx(2.7)
-    assert row.width_ratio == 0.5
-    assert row.moment_bias == -3.0
+    assert [row[name] for name in ("cases", "improved", "er_lt_3", "er_lt_2")] == [4, 0.75, 0.75, 0.25]
+    assert row["er_median"] == pytest.approx(2.7)
+    assert row["width_ratio"] == 0.5
 
 
 def test_cumulative_curve_rises_from_nothing_to_all() -> None:
@@ -383,7 +380,7 @@ def test_json_has_the_promised_keys_and_no_nan(report: BlindReport, tmp_path: Pa
     assert {"settings", "summary", "cases"} <= set(stored)
     promised = {
         "method", "noise", "cases", "improved", "er_lt_3", "er_lt_2", "er_median", "ncc", "rel_l2",
-        "mtf_rmse", "moment_bias", "seconds",
+        "mtf_rmse", "width_ratio", "seconds",
     }  # fmt: skip
     assert all(promised <= set(row) for row in stored["summary"])
     assert [row["method"] for row in stored["summary"]] == [UNTOUCHED, "narrow", "wide"]

@@ -8,10 +8,9 @@ from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.sun import Sun, edge_terms, image_step
-from lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
+from lab.blind.methods.sun import SIDE, Sun, default_prior, edge_mask, edge_terms, image_step, target
 from lab.blind.steps.pyramid import View
-from lab.training import make_edge_patches
+from lab.training import blind_data
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.quality.edge import edge_area
@@ -45,7 +44,7 @@ def test_the_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> No
 
 
 def test_stored_patterns_are_those_that_the_command_makes() -> None:
-    made = make_edge_patches.spread(make_edge_patches.primitives(), make_edge_patches.COUNT)
+    made = blind_data.spread(blind_data.primitives(), blind_data.COUNT)
 
     assert np.allclose(default_prior().patches, made, atol=1e-6)
 

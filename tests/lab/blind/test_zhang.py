@@ -16,12 +16,23 @@ pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 FLOOR = 1e-4 + 2 * SIGMA**2
 
 
+def free_energy(found: PatchPosterior, kernel: NDArray[np.floating]) -> float:
+    """F of both gradients."""
+    total = 0.0
+    for part in found.parts:
+        inner = (np.square(part.x) + part.variance) / part.gamma + np.log(part.gamma / part.variance)
+        n = part.y.size
+        data = (part.misfit(kernel) + found.floor * n) / found.noise + n * float(np.log(found.noise))
+        total += data + float(inner.sum(dtype=np.float64))
+    return total
+
+
 def explained(y: NDArray[np.floating], kernel: Kernel, sweeps: int = 10) -> float:
     """Free energy when everything but the kernel is fitted."""
     found = PatchPosterior.of(y.astype(np.float64), kernel.shape[0], kernel, FLOOR)
     for _ in range(sweeps):
         found = found.improved(kernel, 8).with_noise(kernel)
-    return found.free_energy(kernel)
+    return free_energy(found, kernel)
 
 
 def spread_out(kernel: Kernel, variance: float) -> Kernel:
@@ -40,16 +51,16 @@ def test_the_generating_kernel_has_the_least_free_energy(truth: Kernel) -> None:
 def test_every_update_lowers_the_free_energy() -> None:
     y, kernel = shot(stroke(), side=72).astype(np.float64), gaussian(13, np.eye(2))
     found = PatchPosterior.of(y, 13, kernel, FLOOR)
-    energy = found.free_energy(kernel)
+    energy = free_energy(found, kernel)
     for _ in range(6):
         found = found.improved(kernel, 8)
-        after_image = found.free_energy(kernel)
+        after_image = free_energy(found, kernel)
         raw = pooled_kernel(found.weighted(), kernel)
         kernel = as_kernel(raw)
         found = found.scaled(float(raw.sum()))
-        after_kernel = found.free_energy(kernel)
+        after_kernel = free_energy(found, kernel)
         found = found.with_noise(kernel)
-        after_noise = found.free_energy(kernel)
+        after_noise = free_energy(found, kernel)
 
         assert after_noise <= after_kernel < after_image < energy
         energy = after_noise
@@ -59,7 +70,7 @@ def test_scaling_scene_against_kernel_changes_no_free_energy() -> None:
     y, kernel = shot(stroke(), side=72).astype(np.float64), stroke()
     found = PatchPosterior.of(y, 13, kernel, FLOOR).improved(kernel, 4)
 
-    assert found.scaled(2.0).free_energy(kernel / 2.0) == pytest.approx(found.free_energy(kernel), rel=1e-5)
+    assert free_energy(found.scaled(2.0), kernel / 2.0) == pytest.approx(free_energy(found, kernel), rel=1e-5)
 
 
 def test_products_with_the_convolution_are_each_others_transposes() -> None:

@@ -14,13 +14,12 @@ def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFi
 
     missing = Peer("nobody's", "no-such-program", lambda *_: [], (1.0,), 1.0)
 
-    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing], beside=2)
+    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing])
 
     assert report["methods"]["fast"]["cpu_s"] > 0
     assert report["kernel"]["ours"] > 0
     assert report["peers"] == {"nobody's": None}
     assert "| nobody's | not installed |" in correct_table(report)
-    assert "2 threads take" in correct_table(report)
     assert capsys.readouterr().out == ""
 
 
@@ -42,8 +41,3 @@ def test_lens_for_timing_is_softer_in_the_corner() -> None:
     widths = [rms_width(lens.kernel_at(FieldPosition(r, 0.5), "g", 21)) for r in (0.0, 1.0)]
 
     assert widths[0] < 1.0 < widths[1]
-
-
-def test_benchmark_refuses_a_single_plane() -> None:
-    with pytest.raises(InvalidInputError, match="photo must be"):
-        run_correct_benchmark(np.zeros((10, 10), dtype=np.float32))

@@ -1,26 +1,10 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lab.correction.filter_flow import EfficientFilterFlow
-from lab.correction.windows import bartlett_hann, partition
-from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import delta, gaussian
+from lab.correction.filter_flow import EfficientFilterFlow, partition
+from lensmodel.core.psf import gaussian
 from lensmodel.correction.blur import UniformBlur
-
-
-@given(half=st.integers(1, 300))
-@settings(deadline=None)
-def test_bartlett_hann_tiles_exactly_at_half_overlap(half: int) -> None:
-    window = bartlett_hann(2 * half)
-
-    np.testing.assert_allclose(window + np.roll(window, half), 1.0, atol=1e-12)
-
-
-def test_bartlett_hann_refuses_odd_lengths() -> None:
-    with pytest.raises(InvalidInputError, match="even length"):
-        bartlett_hann(7)
 
 
 @given(extent=st.integers(1, 400), parts=st.integers(1, 12))
@@ -41,16 +25,6 @@ def _grid() -> tuple[tuple[np.ndarray, ...], ...]:
     )
 
 
-def test_filter_flow_adjoint_is_the_transpose_of_forward() -> None:
-    flow, rng = EfficientFilterFlow(60, 77, _grid()), np.random.default_rng(2)
-    latent = rng.standard_normal(flow.latent_shape, dtype=np.float32)
-    blurred = rng.standard_normal((60, 77), dtype=np.float32)
-
-    difference = np.vdot(flow.forward(latent), blurred) - np.vdot(latent, flow.adjoint(blurred))
-
-    assert abs(difference) <= 1e-5 * np.linalg.norm(flow.forward(latent)) * np.linalg.norm(blurred)
-
-
 def test_filter_flow_of_one_kernel_is_the_uniform_blur() -> None:
     kernel = _grid()[1][1]
     flow = EfficientFilterFlow(60, 77, ((kernel,) * 4,) * 3)
@@ -62,9 +36,12 @@ def test_filter_flow_of_one_kernel_is_the_uniform_blur() -> None:
 def test_filter_flow_keeps_the_light_of_every_point_inside() -> None:
     flow = EfficientFilterFlow(60, 77, _grid())
 
-    arriving = flow.adjoint(np.ones((60, 77), dtype=np.float32))
+    reach = flow.reach
+    latent = np.zeros(flow.latent_shape, dtype=np.float32)
+    inner = np.s_[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    latent[inner] = np.random.default_rng(2).random(latent[inner].shape)
 
-    np.testing.assert_allclose(arriving[9:-9, 9:-9], 1.0, atol=1e-5)
+    np.testing.assert_allclose(flow.forward(latent).sum(), latent.sum(), rtol=1e-5)
 
 
 def test_filter_flow_spreads_a_point_with_the_kernel_of_its_window() -> None:
@@ -76,8 +53,3 @@ def test_filter_flow_spreads_a_point_with_the_kernel_of_its_window() -> None:
     spread = flow.forward(latent)[6:15, 26:35]
 
     assert np.corrcoef(spread.ravel(), grid[0][1].ravel())[0, 1] > 0.999
-
-
-def test_filter_flow_refuses_a_ragged_grid() -> None:
-    with pytest.raises(InvalidInputError, match="full grid"):
-        EfficientFilterFlow(60, 77, ((delta(3), delta(3)), (delta(3),)))

@@ -13,8 +13,7 @@ from PIL import Image
 from scipy import ndimage, special
 
 import lensmodel
-from lab.gallery import crops
-from lab.gallery.crops import ZOOM, places, sheet
+from lab.gallery import page as shown_page
 from lab.gallery.figures import (
     chromaticity,
     dots,
@@ -25,9 +24,8 @@ from lab.gallery.figures import (
     percentile_of_edges,
 )
 from lab.gallery.measure import TILE, bars, measured
-from lab.gallery.page import text, write_page
+from lab.gallery.page import ZOOM, entries_of, places, sheet, text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
-from lab.gallery.run import entries_of
 from lab.images import gains
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
@@ -387,7 +385,7 @@ def test_crops_are_squares_of_three_pixels_side_by_side() -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Test data of one photo, one stand-in, and files that hold no picture."""
-    monkeypatch.setattr(crops, "ZOOM", 1)  # to pack enlarged crops would take longer than all the rest
+    monkeypatch.setattr(shown_page, "ZOOM", 1)  # to pack enlarged crops would take longer than all the rest
     (tmp_path / "real").mkdir()
     (tmp_path / "meta").mkdir()
     eight = np.rint(255.0 * np.clip(blurred(leaves(224, 256), 1.0), 0.0, 1.0)).astype(np.uint8)
@@ -441,10 +439,10 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
 
     assert entries[0].work["state"] == "corrected"
     assert entries[0].figures["changed"] > 0.01
-    assert len(entries[0].places) >= 6
-    for place in entries[0].places:
-        assert (output / place.file).is_file()
-        assert f'src="{place.file}"' in page
+    assert len(entries[0].crops) >= 6
+    for file in entries[0].crops.values():
+        assert (output / file).is_file()
+        assert f'src="{file}"' in page
     assert "| real/leaves.png | corrected |" in text(entries)
 
 

@@ -482,7 +482,11 @@ REFUSED = {
     "half a place": (["export", PROFILE, "-o", "new.npz", "--phi", "1"], 2, "--phi needs --r"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
     "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
-    "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),
+    "part to time": (
+        ["bench", "correct", "--roi", "1,2,x,4"],
+        2,
+        "four whole numbers T,L,H,W, got '1,2,x,4'",
+    ),
 }
 
 

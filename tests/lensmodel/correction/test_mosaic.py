@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lab.images import psnr, to_srgb
+from lab.images import psnr_of, to_srgb
 from lab.scenes import dead_leaves
 from lensmodel import photo
 from lensmodel.core.psf import as_kernel, delta, gaussian
@@ -83,7 +83,10 @@ def test_no_colour_falls_below_the_photo_or_the_same_with_a_point(
 
     def levels(planes: np.ndarray) -> np.ndarray:
         return np.array(
-            [psnr(to_srgb(p[8:-8, 8:-8]), to_srgb(s[8:-8, 8:-8])) for p, s in zip(planes, sharp, strict=True)]
+            [
+                psnr_of(np.square(to_srgb(p) - to_srgb(s))[8:-8, 8:-8].mean())
+                for p, s in zip(planes, sharp, strict=True)
+            ]
         )
 
     made = levels(corrected(lens))

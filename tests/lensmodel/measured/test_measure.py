@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,58 @@ from lensmodel.workflow.measuring import samples_of_developed
 SHAPE = (360, 540)
 PAIR_SHAPE = (288, 432)  # of less a pair is as good: it needs no lights and no page
 NOISE = NoiseModel(1 / 40000, (4 / 40000) ** 2)
+
+
+def board_scene(square_px: float, shape: tuple[int, int], setup: targets.Setup) -> np.ndarray:
+    """Draw a checkerboard, turned by five degrees more than the setup says, as slanted charts are."""
+    rows, cols = targets.fine_grid(shape)
+    up, right = targets.seen(rows, cols, shape, setup)
+    angle = math.radians(5.0)
+    a = (up * math.cos(angle) - right * math.sin(angle)) / square_px
+    b = (up * math.sin(angle) + right * math.cos(angle)) / square_px
+    dark = (np.floor(a) + np.floor(b)) % 2 > 0
+    light = np.where(dark, np.float32(0.12), np.float32(0.8))
+    plane = np.maximum(targets.to_pixels(light), 0.0) * targets.falloff(shape, setup)
+    return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
+
+
+def light_scene(
+    spacing: int, shape: tuple[int, int], rng: np.random.Generator, *, faint: float = 0.25
+) -> np.ndarray:
+    """Draw points of light anywhere between pixels, of different brightness, over a dark sky.
+
+    A point between pixels is the sinc that a point is to whoever sees no finer than pixels. Its lobes are
+    negative here and gone behind a lens.
+    """
+    height, width = (n + 2 * targets.MARGIN for n in shape)
+    plane = np.zeros((height, width))
+    step_r = np.arange(targets.MARGIN + spacing // 2, height - targets.MARGIN - spacing // 4, spacing)
+    step_c = np.arange(targets.MARGIN + spacing // 2, width - targets.MARGIN - spacing // 4, spacing)
+    for row in step_r:
+        for col in step_c:
+            r, c = np.array([row, col]) + rng.uniform(-0.15, 0.15, 2) * spacing
+            flux = faint * 10.0 ** rng.uniform(0.0, 0.7)
+            reach = 24
+            top, left = round(r) - reach, round(c) - reach
+            t = np.arange(2 * reach + 1)
+            taper = np.cos(np.linspace(-np.pi / 2, np.pi / 2, 2 * reach + 1)) ** 0.5
+            lobe_r, lobe_c = np.sinc(t + top - r) * taper, np.sinc(t + left - c) * taper
+            plane[top : top + 2 * reach + 1, left : left + 2 * reach + 1] += flux * np.outer(lobe_r, lobe_c)
+    plane += 0.003  # a night sky over a suburb
+    return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
+
+
+def moved_scene(scene: np.ndarray, shift: tuple[float, float], turn_deg: float) -> np.ndarray:
+    """What a tripod that gave way a little shows of a scene: moved by parts of a pixel, and turned."""
+    angle = math.radians(turn_deg)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    middle = (np.array(scene.shape[1:]) - 1.0) / 2.0
+    start = middle - turn @ (middle + np.array(shift))
+    planes = [
+        ndimage.affine_transform(plane, turn, start, order=5, mode="mirror", output=np.float32)
+        for plane in scene
+    ]
+    return np.ascontiguousarray(np.maximum(np.stack(planes), 0.0))
 
 
 def lopsided() -> Kernel:
@@ -283,7 +336,7 @@ def test_a_photo_without_a_target_is_refused() -> None:
 
 
 def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
-    scene = targets.light_scene(60, SHAPE, np.random.default_rng(3))[1]
+    scene = light_scene(60, SHAPE, np.random.default_rng(3))[1]
     photo = photo_of(scene, lopsided())
     found = Points(across=2, down=2).measure([photo], size=21, channels=("g",))
     errors = [distance(one.kernel, lopsided()).rel_l2 for one in found]
@@ -315,7 +368,7 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     scene = np.clip(0.4 + 0.12 * rng.standard_normal((height, width)), 0.05, 0.9)
     scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
     sharp = at_f8()
-    moved = targets.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    moved = moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
     found = AperturePair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
     assert found
@@ -334,7 +387,7 @@ def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     )
     scene = np.clip(0.4 + 0.12 * natural / natural.std(), 0.05, 0.9)
     sharp = at_f8()
-    moved = targets.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    moved = moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     pair = [demosaiced(photo_of(scene, lopsided())), demosaiced(photo_of(moved, sharp, 1, 8.0))]
 
     def error() -> float:
@@ -389,7 +442,7 @@ def test_a_pair_of_one_aperture_is_refused() -> None:
 @pytest.mark.parametrize("covariance", [[[3.0, 0.0], [0.0, 0.8]], [[1.9, 1.1], [1.1, 1.9]]])
 def test_squares_give_the_kernel_along_and_between_their_edges(covariance: list[list[float]]) -> None:
     kernel = gaussian(21, np.array(covariance))
-    photo = photo_of(targets.board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1], kernel)
+    photo = photo_of(board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1], kernel)
     found = SlantedEdges().measure([photo], size=21, channels=("g",))
     assert found
     seen = np.median([distance(one.kernel, kernel).rel_l2 for one in found])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.model.model_benchmark import run_model_benchmark
+from lab.model_benchmark import run_model_benchmark
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import special
 
-from lab.model.exact import pixel_to_local
+from lab.model_benchmark import pixel_to_local
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import centroid, distance, rms_width, second_moments
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings

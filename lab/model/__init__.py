@@ -1,1 +1,0 @@
-"""How well a model predicts the PSF where no sample was."""

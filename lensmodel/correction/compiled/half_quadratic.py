@@ -168,7 +168,6 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     factors: Real,
     couplings: Real,
     turns: NDArray[np.bool_],
-    predicts: NDArray[np.bool_],
     drift: Complex,
     down: Real,
     across: Real,
@@ -182,8 +181,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
 
     `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
     `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
-    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`,
-    the prediction of unknown pixels in those marked in `predicts`.
+    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
     `explained` receives what the result makes of the data, blurred again.
     """
     channels, height, width = x.shape
@@ -206,7 +204,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
         for c in range(channels):
             if drift.shape[0] > 0 and turns[step]:
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
-            if not whole and predicts[step]:
+            if not whole:
                 _predict(X[c], K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
                 S[c] = P
                 to_plane(P, work)

@@ -64,7 +64,7 @@ def half_quadratic_on_device(
             moved = forward(x * device.send(p.down[:, None])), forward(x * device.send(p.across[None, :]))
             change = rates[:, 0, ...] * moved[0] + rates[:, 1, ...] * moved[1]
         weight = device.send((coupling * noise)[:, None, None])
-        if not whole and p.predicts[step]:
+        if not whole:
             Y = blurred() + forward(xp.where(mask, data - back(blurred()), zero))
         fit = conjugate * (Y if change is None else Y - change)
         X = (fit + weight * forward(pull)) / (power + weight * smoothness)

@@ -72,8 +72,7 @@ class SparseGradient:
         Half-quadratic steps.
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
-        What a kernel's change within the tile adds is recomputed in the first step and half way, what is
-        predicted for unmeasured pixels in every second step.
+        What a kernel's change within the tile adds is recomputed in the first step and half way.
     light_steps : int
         Steps that estimate the light of clipped pixels, and that from beyond the frame.
 
@@ -225,7 +224,6 @@ class SparseGradient:
             factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
             couplings=couplings.astype(np.float32),
             turns=np.isin(np.arange(self.steps), (0, self.steps // 2)),
-            predicts=np.arange(self.steps) % 2 == 0,
             drift=rates,
             down=ramp(0),
             across=ramp(1),
@@ -267,7 +265,6 @@ class SparseProblem:
     factors: NDArray[np.float32]
     couplings: NDArray[np.float32]
     turns: NDArray[np.bool_]
-    predicts: NDArray[np.bool_]
     drift: NDArray[np.complex64]
     down: NDArray[np.float32]
     across: NDArray[np.float32]
@@ -336,7 +333,6 @@ def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
         p.factors,
         p.couplings,
         p.turns,
-        p.predicts,
         p.drift,
         p.down,
         p.across,

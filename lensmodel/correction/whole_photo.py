@@ -41,7 +41,9 @@ PsfError = Callable[[FieldPosition, Channel], float] | float
 """Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
 
 
-_ENOUGH_CELLS = 24  # of a photo (chosen): a tenth of the work, and sure to a tenth of a decibel
+_ENOUGH_CELLS, _MORE_CELLS = 24, 96
+"""Cells to try of a photo (chosen): a tenth of the work, sure to `_SURE_DB`; more where too few decide."""
+_SURE_DB = 0.1
 KERNEL_SIZE = 55  # pixels: the largest kernel that the paper estimates
 KEPT = 640
 """Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
@@ -224,7 +226,9 @@ def correct_planes(
         pitch = usual_pitch(frame, job.cell_factor)
     window_cells = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     if least_gain_db is not None:
-        unchanged = _unchanged(job, window_cells, window, workers)
+        unchanged = _unchanged(job, window_cells, window, workers, _ENOUGH_CELLS)
+        if abs(unchanged.expected_gain_db - least_gain_db) < _SURE_DB:
+            unchanged = _unchanged(job, window_cells, window, workers, _MORE_CELLS)
         if unchanged.expected_gain_db < least_gain_db:
             return unchanged
     forecasts, audits, left = [], [], Counter[Zone]()
@@ -242,9 +246,11 @@ def correct_planes(
     return Corrected(out, zone_reports(forecasts, left, report), report, step, layer_planes)
 
 
-def _unchanged(job: CorrectionJob, window_cells: Sequence[Cell], window: Roi, workers: int) -> Corrected:
+def _unchanged(
+    job: CorrectionJob, window_cells: Sequence[Cell], window: Roi, workers: int, enough: int
+) -> Corrected:
     """The photo as it is, with what it would gain by some of its cells."""
-    some = window_cells[:: max(1, len(window_cells) // _ENOUGH_CELLS)]
+    some = window_cells[:: max(1, len(window_cells) // enough)]
     forecasts = [restored.forecast for _, restored in _restored(job, some, workers)]
     left = Counter(forecast.zone for forecast in forecasts)
     rows, cols = (

@@ -592,3 +592,17 @@ def test_a_photo_that_gains_too_little_is_found_by_some_cells_and_stays_as_it_wa
     assert made.nothing_to_correct == (not worth)
     assert bool(steps) == worth
     assert np.array_equal(made.planes, seen) == (not worth)
+
+
+def test_more_cells_are_tried_where_few_do_not_decide() -> None:
+    frame, lens = Frame(720, 1024), Soft()
+    seen, _ = photo(lens, BASE, frame)
+
+    def corrected(least: float | None) -> Corrected:
+        return correct_planes(seen, lens, frame, noise=BASE, method="fast", pitch=64, least_gain_db=least)
+
+    few, gained = corrected(99.0).expected_gain_db, corrected(None).expected_gain_db
+    assert few > gained + 0.05
+
+    assert corrected(0.5 * (few + gained)).nothing_to_correct
+    assert not corrected(gained - 0.05).nothing_to_correct

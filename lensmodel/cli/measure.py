@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from rich.progress import TaskID
 
 from lensmodel.cli import files
-from lensmodel.cli.console import Display
+from lensmodel.cli.console import Display, PacedProgress
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.options import (
     AnyLens,
@@ -35,6 +36,13 @@ from lensmodel.workflow import measuring, sampling
 from lensmodel.workflow.calibrating import Admit, Calibration
 
 KINDS: Final = ("target", "pair", "points", "edges")
+# What comes before the first place, by the way of measuring
+PREPARING: Final = {
+    "target": "finding the page",
+    "pair": "aligning the photos",
+    "points": "finding the points",
+    "edges": "finding the edges",
+}
 EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
 PAPERS: Final = ("a2", "a3", "a4", "letter", "tabloid")
 # Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
@@ -117,14 +125,14 @@ def measure(
     with shown.progress() as bars:
         task = bars.add_task("", total=len(groups))
         for number, group in enumerate(groups):
-            # the pace of a single photo is that of its places: reading it and finding the chart has another
-            bars.update(task, description=f"{group[0].name}: measuring", more=len(groups) == 1)
+            on_step = partial(_show_step, bars, task, group[0].name, kind, number, len(groups))
+            on_step(0, 1)
             method = partial(
                 measuring.samples_of_developed,
                 kind,
                 settings=config.settings,
                 size=size,
-                on_step=partial(bars.part, task, number),
+                on_step=on_step,
             )
             try:
                 result = _added(calibration, group, method, show)
@@ -144,6 +152,19 @@ def measure(
             shown.note(f"{result['photos'][0]}: the profile has it already")
     if any(result["state"] == "failed" for result in results):
         raise typer.Exit(1)
+
+
+def _show_step(
+    bars: PacedProgress, task: TaskID, name: str, kind: str, number: int, photos: int, done: int, total: int
+) -> None:
+    """Show how far photo `number` is; `done` 0 is before its first place."""
+    bars.update(
+        task,
+        description=f"{name}: {'measuring' if done else PREPARING[kind]}",
+        completed=number + done / max(total, 1),
+        # the pace of a single photo is that of its places: reading it and finding the page has another
+        more=done == 0 and photos == 1,
+    )
 
 
 def _added(

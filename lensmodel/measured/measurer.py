@@ -60,7 +60,7 @@ class Measurer(Protocol):
         channels : sequence of {"r", "g", "b"}
             Colour planes to measure.
         on_step : StepHook
-            Called after each place.
+            Called after each place, and now and then before the first one, with nothing done of 1.
 
         Returns
         -------

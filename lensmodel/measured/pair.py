@@ -89,7 +89,7 @@ class AperturePair:
         require(self, photos, size)
         _require_pair(*photos)
         opened, closed = _with_bounded_noise(photos)
-        warp = self.register(opened, closed)
+        warp = self.register(opened, closed, on_step)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
         return at_each(
             corners, channels,
@@ -98,7 +98,7 @@ class AperturePair:
             "flat and in focus",
         )  # fmt: skip
 
-    def register(self, opened: LinearPhoto, closed: LinearPhoto) -> Warp:
+    def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook = ignore_step) -> Warp:
         """Lay the closed photo under the open one."""
         plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
         coarse = match(_shrunk(plane), _shrunk(reference))
@@ -118,7 +118,10 @@ class AperturePair:
         half = self.side // 2
         corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
         for degree in (1, 1, 3):
-            warp = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
+            warp = matched(
+                warp, shown, plane, corners, self.side,
+                least_clarity=_CLEAR, degree=degree, on_step=on_step,
+            )  # fmt: skip
         return warp
 
     def _window(

@@ -83,7 +83,8 @@ class Points:
         return at_each(
             good, channels,
             lambda cell, channel: _cell_psf(photo, channel, cell[:_MOST], size, skies[channel]), on_step,
-            none="the points of light are too faint; expose longer",
+            none="what looks like points of light gives no PSF: they are too faint, or parts of an ordinary "
+            "scene; photograph stars or pinholes before a dark ground, and expose longer",
         )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from scipy import fft, ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
+from lensmodel.core.types import StepHook, ignore_step
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 # Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle
@@ -141,10 +142,12 @@ def matched(
     *,
     least_clarity: float,
     degree: int,
+    on_step: StepHook = ignore_step,
 ) -> Warp:
-    """Bend a warp to the matches of all windows that are clear."""
+    """Bend a warp to the matches of all windows that are clear; each calls `on_step(0, 1)`."""
     pixels, shifts = [], []
     for row, col in corners:
+        on_step(0, 1)
         matching = match(plane[row : row + side, col : col + side], render(warp, (row, col), (side, side)))
         if matching.clarity >= least_clarity:
             pixels.append((row + (side - 1) / 2.0, col + (side - 1) / 2.0))

@@ -91,7 +91,7 @@ class Target:
         """Measure the PSF all over the page; see `Measurer`."""
         require(self, photos, size)
         photo = photos[0]
-        placed = self.find(photo)
+        placed = self.find(photo, on_step)
         height, width = photo.planes.shape[1:]
         down = min(self.down, max(height // (3 * self.side // 4), 2))
         across = min(self.across, max(width // (3 * self.side // 4), 2))
@@ -104,23 +104,24 @@ class Target:
         if not corners:
             raise NotEnoughEvidenceError(_TOO_SMALL)
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
-        placed = replace(placed, tones=tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side))
+        tones = tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
+        placed = replace(placed, tones=tones)
         return at_each(
             corners, channels,
             lambda corner, channel: self._window(photo, placed, corner, size, channel), on_step,
             none="no window of the page determines a PSF; is the photo in focus?",
         )  # fmt: skip
 
-    def find(self, photo: LinearPhoto) -> PlacedPage:
+    def find(self, photo: LinearPhoto, on_step: StepHook = ignore_step) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
         plane, side = np.asarray(photo.planes[1]), self.side
-        placed = _identified(photo, plane, find_marks(plane), self.details)
+        placed = _identified(photo, plane, find_marks(plane), self.details, on_step)
         corners = [at for at in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*at, side, 0)]
         warp = placed.warp
         for degree in (1, 3, 5, 5):
             warp = matched(
                 warp, lambda bent, at, shape: replace(placed, warp=bent).window(*at, shape),
-                plane, corners, side, least_clarity=_CLEAR, degree=degree,
+                plane, corners, side, least_clarity=_CLEAR, degree=degree, on_step=on_step,
             )  # fmt: skip
         return replace(placed, warp=warp)
 
@@ -151,7 +152,11 @@ def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
 
 
 def _identified(
-    photo: LinearPhoto, plane: NDArray[np.floating], marks: NDArray[np.float64], details: Sequence[int]
+    photo: LinearPhoto,
+    plane: NDArray[np.floating],
+    marks: NDArray[np.float64],
+    details: Sequence[int],
+    on_step: StepHook,
 ) -> PlacedPage:
     """Say which page it is and which way up, by the noise near the middle of the page."""
     best: tuple[float, PlacedPage] | None = None
@@ -162,6 +167,7 @@ def _identified(
     for detail in details:
         page = TargetPage(detail)
         for turn in range(4):
+            on_step(0, 1)
             warp = Warp.of_homography(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
             if not 0.3 < warp.scale(*middle) < 3.0:
                 break  # no turn makes noise visible that pixels do not resolve
@@ -278,7 +284,11 @@ def solve_window(
 
 
 def tones_of(
-    photo: LinearPhoto, placed: PlacedPage, corners: Sequence[tuple[int, int]], side: int
+    photo: LinearPhoto,
+    placed: PlacedPage,
+    corners: Sequence[tuple[int, int]],
+    side: int,
+    on_step: StepHook = ignore_step,
 ) -> tuple[float, float, float]:
     """Fit the tones of the print where the lens is sharpest: how the photo follows R.
 
@@ -289,6 +299,7 @@ def tones_of(
     precision, weighted = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
     windows = 0
     for corner in corners:
+        on_step(0, 1)
         try:
             information, bent = _tones_in(photo, placed, corner, side)
         except NotEnoughEvidenceError:

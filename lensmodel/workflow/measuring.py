@@ -42,8 +42,9 @@ def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:
     method = measure.methods.create(kind)
     count = method.photos
     if not paths or len(paths) % count:
+        remedy = "; give the open photo and the closed one, two different files" if kind == "pair" else ""
         raise InvalidInputError(
-            f"measuring by {kind} takes {count} photo{'s' * (count > 1)} at a time, got {len(paths)}"
+            f"measuring by {kind} takes {count} photo{'s' * (count > 1)} at a time, got {len(paths)}{remedy}"
         )
     groups = [tuple(paths[i : i + count]) for i in range(0, len(paths), count)]
     return [_by_aperture(group) if count > 1 else group for group in groups]

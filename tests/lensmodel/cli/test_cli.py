@@ -395,6 +395,11 @@ def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
 REFUSED = {
     "nowhere to write": (["calibrate", "one.dng"], 2, "^lensmodel: add --profile and the name of"),
     "nowhere to measure into": (["measure", "edges", "one.dng"], 2, "^lensmodel: add --profile and the name"),
+    "half a pair": (
+        ["measure", "pair", "one.dng", "-p", "new"],
+        2,
+        "takes 2 photos at a time, got 1; give the open photo and the closed one",
+    ),
     "missing photo": (["calibrate", "gone.dng", "-p", "new"], 2, "no photo called gone.dng"),
     "empty folder": (["calibrate", "empty", "-p", "new"], 2, "no photo in the folder empty"),
     "no image": (["correct", "text.dng", "-p", PROFILE, "-o", "out"], 1, "belong to no photo format"),

@@ -107,7 +107,9 @@ def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
     now_s = [0.0]
 
     def measure(*_: Any, on_step: StepHook, **given: Any) -> list[PsfSample]:
-        now_s[0] = 60.0  # the page was found
+        for second in (20.0, 40.0, 60.0):
+            now_s[0] = second
+            on_step(0, 1)  # the page is looked for
         for place in range(1, 11):
             now_s[0] += 2.0
             on_step(place, 40)
@@ -118,7 +120,8 @@ def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
     monkeypatch.setattr("lensmodel.workflow.measuring.samples_of_developed", measure)
     done = lensmodel("measure", "target", "page.dng", "--profile", "a.lensprofile", cwd=tmp_path)
 
-    assert "[1:12]  15 % page.dng: measuring, about 1:08 left" in done.stderr.splitlines()
+    assert "[0:20]   0 % page.dng: finding the page" in done.stderr.splitlines()
+    assert "[1:10]  12 % page.dng: measuring, about 1:10 left" in done.stderr.splitlines()
 
 
 def test_quick_work_says_nothing() -> None:

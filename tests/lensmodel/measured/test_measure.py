@@ -19,7 +19,7 @@ from lensmodel import measured as measure
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
-from lensmodel.core.types import Kernel, LensSettings, NoiseModel
+from lensmodel.core.types import Kernel, LensSettings, NoiseModel, StepHook
 from lensmodel.measured.edges import SlantedEdges, squares_of
 from lensmodel.measured.page import PAPERS, TargetPage
 from lensmodel.measured.pair import AperturePair, diffraction_otf
@@ -313,15 +313,17 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
     placed: list[PlacedPage] = []
     find = Target.find
 
-    def noted(self: Target, photo: LinearPhoto) -> PlacedPage:
-        placed.append(find(self, photo))
+    def noted(self: Target, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
+        placed.append(find(self, photo, on_step))
         return placed[-1]
 
     monkeypatch.setattr(Target, "find", noted)  # to find a page takes longer than all the rest
     method = Target(across=2, down=1, side=88, details=details)
-    found = method.measure([target_photo], size=21, channels=("g",))
+    steps: list[tuple[int, int]] = []
+    found = method.measure([target_photo], size=21, channels=("g",), on_step=lambda *step: steps.append(step))
     assert [page.page.detail for page in placed] == [500]
     assert found
+    assert steps.count((0, 1)) > 50  # a page that is still looked for shows that, too
     for one in found:
         seen = distance(one.kernel, lopsided()).rel_l2
         assert seen < 0.06
@@ -370,7 +372,11 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     sharp = at_f8()
     moved = moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
-    found = AperturePair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
+    steps: list[tuple[int, int]] = []
+    found = AperturePair(across=2, down=1, side=104).measure(
+        [opened, closed], size=21, channels=("g",), on_step=lambda *step: steps.append(step)
+    )
+    assert steps.count((0, 1)) > 50  # aligning them shows, too
     assert found
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.08
 

@@ -159,7 +159,7 @@ class Installation:
     def makers(self) -> set[str]:
         """Return which workers made the samples."""
         with self.store.database.reading() as session:
-            return set(session.scalars(select(SampleRow.estimator)))
+            return {entry["estimator"] for entry in session.scalars(select(SampleRow.entry))}
 
     def send(self, host: int, number: int) -> dict[str, Any]:
         photo = b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + number.to_bytes(4, "big") * 20

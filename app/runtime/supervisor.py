@@ -180,9 +180,12 @@ def listen(host: str, port: int) -> socket.socket:
     """Open a listening socket; port 0 takes a free one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=2048)
+        listener = socket.create_server((host, port), family=family, backlog=2048)
     except OSError as error:
         raise InvalidInputError(
             f"cannot listen on {host}:{port}: {error.strerror or error}; "
             "give another --port (0 takes any free one) or --host"
         ) from error
+    # connections inherit it: else the body of a short answer may wait 40 ms for a receipt of its head
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listener

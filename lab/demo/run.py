@@ -33,7 +33,7 @@ from lensmodel.cli.console import mtf50_words
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import distance
-from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes, Zone
+from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone
 from lensmodel.photo import develop
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
 
@@ -174,7 +174,7 @@ def _cells(values: Zones) -> str:
 
 def _edge_rows(before: Mapping[Zone, ZoneSharpness], after: Mapping[Zone, ZoneSharpness]) -> str:
     return "\n".join(
-        f"| {zone} | {mtf50_words(before[zone].mtf50)} | {mtf50_words(made.mtf50)} "
+        f"| {ZONE_WORDS[zone]} | {mtf50_words(before[zone].mtf50)} | {mtf50_words(made.mtf50)} "
         f"| {made.mtf_max:.2f} | {made.overshoot:.1f} % |"
         for zone, made in after.items()
         if zone in before

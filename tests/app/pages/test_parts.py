@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 import zipfile
@@ -407,6 +408,24 @@ def test_a_photo_that_failed_offers_what_can_help(
     assert [text in page for text in offered] == [again, copy, correct]
     listed = client.get("/").text
     assert (f'name="photo" value="{photo.public_id}"' in listed) == correct
+
+
+@pytest.mark.parametrize(
+    ("code", "detail"),
+    [
+        ("unsupported_format", 'the TIFF\'s colours are "YCbCr"; convert it to RGB'),  # in the sentence
+        ("raw_decode_failed", "LibRaw: data error"),  # only among the details: the sentence is ours
+    ],
+)
+def test_why_a_photo_failed_is_said_once(
+    client: TestClient, steps: Steps, store: Store, code: str, detail: str
+) -> None:
+    photo = steps.receive()
+    store.photos.fail(photo.public_id, photo.epoch, code, detail)
+
+    page = client.get(f"/photos/{photo.public_id}").text
+
+    assert html.unescape(page).count(detail) == 1
 
 
 @pytest.mark.parametrize("kind", ["tiff", "png", "dng"])

@@ -296,7 +296,7 @@ def parts(call: CallDep, page: Open = "home", id: Ids = "") -> Response:  # noqa
     body = templates.get_template(f"_{page}_state.html").render(**_STATES[page](call, id)).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if b"hx-get" not in body:  # it asks no more
+    if b' hx-get="' not in body:  # it asks no more; quotes in names are escaped
         headers["HX-Refresh"] = "true"
     elif call.knows(tag):
         return Response(status_code=304, headers=headers)

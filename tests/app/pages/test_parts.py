@@ -759,6 +759,19 @@ def test_a_page_whose_work_has_ended_is_made_anew(client: TestClient, steps: Ste
     assert "hx-get" in client.get("/").text
 
 
+def test_a_page_is_made_anew_whatever_its_photos_are_called(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.counted(filename='a hx-get="b".dng')
+    row = steps.correct(photo, method="fast", strength=1.0, output={"format": "png8"}, roi=None)
+    asked = {"page": "batch", "id": row.public_id}
+    working = client.get("/ui/parts", params=asked)
+    store.jobs.fail(row.public_id, row.epoch, "outage", "it was so")
+    done = client.get("/ui/parts", params=asked)
+
+    assert ("HX-Refresh" in working.headers, done.headers.get("HX-Refresh")) == (False, "true")
+
+
 @pytest.mark.parametrize(
     "path",
     [

@@ -95,8 +95,7 @@ export function setUpUpload() {
     if (!event.relatedTarget) document.body.classList.remove("over");
   });
   document.addEventListener("drop", (event) => {
-    if (!carriesFiles(event)) return;
     document.body.classList.remove("over");
-    start([...event.dataTransfer.files]);
+    if (carriesFiles(event)) start([...event.dataTransfer.files]);
   });
 }

@@ -258,6 +258,17 @@ def test_a_file_that_is_dropped_on_another_page_does_not_take_its_place(
     assert page.evaluate("window.prevented") is True
 
 
+def test_a_file_that_is_dropped_into_a_field_leaves_the_page_as_it_was(page: Page) -> None:
+    page.goto("/")
+    into = '"#add-lens [type=file]"'
+    page.evaluate(
+        DROP.replace('("main")', f'(kind === "drop" ? {into} : "main")'), ["my.lensprofile", "YW55"]
+    )
+
+    assert page.evaluate("document.body.className") == ""
+    expect(page.locator("#sending")).to_be_hidden()
+
+
 def test_a_tester_begins_with_a_lens_without_photos(page: Page, service: Service) -> None:
     page.goto("/")
     page.get_by_text("Add a lens from a profile").click()

@@ -100,7 +100,7 @@ def respond(
     request_id = getattr(request.state, "request_id", None)
     more = {"instance": request.url.path, "errors": list(errors), "request_id": request_id}
     body = problem_of(code, detail, status, **more).model_dump_json(exclude_none=True)
-    # the id here too: unforeseen errors are answered outside of RequestLog
+    # the id here too: unforeseen errors are answered outside of Guard
     own = {} if request_id is None else {REQUEST_ID: request_id}
     return Response(body, status, {**HEADERS, **(headers or {}), **own}, MEDIA_TYPE)
 

@@ -114,10 +114,8 @@ def _take(call: Call, public_id: str, uploaded: upload.Uploaded, key: str, measu
         if fields.lens_id is not None:
             call.lens(fields.lens_id)
         received = recorded(call, public_id, key, uploaded)
-    except ServiceError:
-        call.storage.delete(
-            f"photos/{public_id}/"
-        )  # refused before there was a photo; afterwards nothing is refused
+    except ServiceError:  # before there was a photo: afterwards nothing is refused
+        call.storage.delete(f"photos/{public_id}/")
         raise
     call.response.status_code = 202 if received.fresh else 200
     call.response.headers["Location"] = f"{V1}/photos/{received.photo.public_id}"

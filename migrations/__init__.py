@@ -1,1 +1,1 @@
-"""Steps from each schema to the next; `app.store.migrate` runs them."""
+"""Steps from each schema to the next; `app.store.database` runs them."""

@@ -101,8 +101,8 @@ def find_owned(session: Session, table: type[Row], public_id: str, owner: Owner)
 def find_to_change(session: Session, table: type[Row], public_id: str, owner: Owner) -> Row | None:
     """Return as `find_owned`, with all that is its owner's locked."""
     if is_id(public_id):
-        of_row = select(table.owner_id).where(table.public_id == public_id).scalar_subquery()
-        _lock(session, OwnerRow.id == of_row)
+        of_row = OwnerRow.id == select(table.owner_id).where(table.public_id == public_id).scalar_subquery()
+        _lock(session, of_row if owner is ANY_OWNER else of_row & (OwnerRow.name == owner))
     return find_owned(session, table, public_id, owner)
 
 

@@ -1,4 +1,4 @@
-"""The first schema: empty databases get the newest one at once, see `app.store.migrate.upgrade`.
+"""The first schema: empty databases get the newest one at once, see `app.store.database.upgrade`.
 
 Revision: 0001, the first
 """

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadline import stretched
 from servers import postgres
 from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError
@@ -23,7 +24,7 @@ from app.errors import BusyError, UnknownError
 from app.runtime.settings import PREFIX, Settings, described
 from app.store import LensName, Store
 from app.store.database import Database, current, head, upgrade
-from app.store.owners import ANY_OWNER
+from app.store.owners import ANY_OWNER, ensure_owner
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian
@@ -567,6 +568,23 @@ def test_two_changes_at_once_wait_for_each_other_on_a_server_and_do_not_deadlock
         folder, again = at_once(on, deleted, partial(there.receive_again, photo))
         assert folder == photo.folder
         assert again.public_id != photo.public_id
+
+
+@pytest.mark.tools
+def test_who_names_a_photo_of_another_owner_does_not_wait_for_that_one(
+    settings: Settings, steps: Steps
+) -> None:
+    with (
+        postgres() as server,
+        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
+    ):
+        upgrade(on.database)
+        theirs = type(steps)(on, "somebody").counted()
+
+        with ThreadPoolExecutor() as others, on.database.writing() as session:
+            ensure_owner(session, "somebody")
+            deleted = others.submit(on.photos.delete, theirs.public_id, OWNER)
+            assert deleted.result(timeout=stretched(10.0)) is None
 
 
 def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:

@@ -215,6 +215,20 @@ class PhotoOut(Model):
         return {"self": f"{V1}/photos/{self.id}", "job": f"{V1}/jobs/{self.id}", "lens": lens}
 
 
+class PatchOut(Model):
+    """One window of a photo, used or rejected."""
+
+    index: int = Field(validation_alias="idx")
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    score: float | None
+    state: str
+    reason: str | None
+
+
 CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 OutputFormat = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
 ColorSpace = Literal["same", "srgb", "camera-linear"]

@@ -19,7 +19,7 @@ from app.http.dependencies import Call, CallDep, OneSession, found
 from app.http.middleware import CLOSE
 from app.routes.common import Answers, Cursor, Limit, OnlyId
 from app.runtime.settings import MIB, Settings
-from app.schemas import V1, Page, PhotoChange, PhotoOut, PhotosChange, PhotoState, UploadFields
+from app.schemas import V1, Page, PatchOut, PhotoChange, PhotoOut, PhotosChange, PhotoState, UploadFields
 from app.store import LensName
 from app.store.accounts import Usage
 from app.store.database import new_id
@@ -217,6 +217,13 @@ def list_photos(
 def get_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
     return views.photo_out(call.photo(photo_id))
+
+
+@router.get("/photos/{photo_id}/patches")
+def list_patches(photo_id: str, call: CallDep) -> Page[PatchOut]:
+    """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
+    photo = call.photo(photo_id)
+    return Page[PatchOut](items=[PatchOut.of(row) for row in call.store.photos.windows(photo.public_id)])
 
 
 @router.delete("/photos/{photo_id}", status_code=204)

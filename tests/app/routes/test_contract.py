@@ -66,6 +66,7 @@ GET /v1/formats
 GET /v1/limits
 GET POST PATCH /v1/photos
 GET PATCH DELETE /v1/photos/{photo_id}
+GET /v1/photos/{photo_id}/patches
 GET /v1/jobs
 GET /v1/jobs/{job_id}
 POST /v1/jobs/{job_id}/cancel

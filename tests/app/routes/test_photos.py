@@ -56,6 +56,9 @@ def test_a_counted_photo_shows_its_lens_and_patches(client: TestClient, steps: S
     assert shown["lens_id"] == steps.lens_id(photo)
     assert shown["links"]["lens"] == f"/v1/lenses/{shown['lens_id']}"
     assert (shown["width"], shown["focal_length_mm"], shown["pixel_pitch_um"]) == (6000, 24.0, 6.0)
+    patches = get(client, f"/v1/photos/{photo.public_id}/patches")["items"]
+    assert [patch["state"] for patch in patches] == ["done", "done", "rejected"]
+    assert patches[2]["reason"] == "flat"
 
 
 def test_no_answer_about_a_photo_holds_the_serial(client: TestClient, steps: Steps) -> None:

@@ -9,6 +9,7 @@ from functools import cache
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI, Security
+from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 
 from app import pages
@@ -59,12 +60,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
+def _operation(route: APIRoute) -> str:
+    """Name an operation by its function: `getPhoto` for `get_photo`."""
+    first, *more = route.name.split("_")
+    return first + "".join(map(str.capitalize, more))
+
+
 @cache
 def _routes() -> tuple[BaseRoute, ...]:
     """All routes, the same for each application of a process."""
     # What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
     # most requests, and need not be done again for an application with other settings
-    router = APIRouter(generate_unique_id_function=lambda route: route.name)
+    router = APIRouter(generate_unique_id_function=_operation)
     router.include_router(health.probes)
     router.include_router(account.sign_ins, prefix="/v1", responses=PROBLEMS)
     # also here, not only in each route: a route without it would be open to all

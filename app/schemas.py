@@ -451,13 +451,10 @@ class PsfOut(Model):
     units: Units
 
 
-_COUNT: Final = r"([1-9]|1\d|2[0-5])"  # 25 at most (chosen): more kernels are too small to be looked at
-
-
 class FieldQuery(Setting):
     """What a field map shows."""
 
-    grid: str = Field("9x6", pattern=f"^{_COUNT}x{_COUNT}$", description="columns x rows, at most 25 x 25")
+    grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
     aspect: float = Field(1.5, ge=0.2, le=5, description="width over height of the picture")
 
 

@@ -31,6 +31,7 @@ MEDIA_TYPES: Final[dict[Format, str]] = {
     "npy": "application/x-npy",
     "tiff": "image/tiff",
 }
+MAX_GRID: Final = 25  # columns and rows of a map at most (chosen): more kernels are too small to be looked at
 # Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s
 # (measured once, no command repeats it)
 MAX_FIELD_PIXELS: Final = 2_000_000
@@ -153,6 +154,8 @@ def _setting(at: Setting) -> LensSettings:
 def get_field_map(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
     """Return a picture of the kernels all over the field, each scaled to its own peak."""
     columns, rows = (int(count) for count in at.grid.split("x"))
+    if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
+        raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
     pixels = columns * rows * at.size**2
     if pixels > MAX_FIELD_PIXELS:
         raise InvalidParameterError(

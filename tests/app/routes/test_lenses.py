@@ -245,6 +245,9 @@ def test_the_field_map_has_a_kernel_for_each_cell(client: TestClient, lens: str)
     picture = np.asarray(Image.open(io.BytesIO(answer.content)))
     assert picture.shape == (3 * 17 + 2, 4 * 17 + 2)
     assert sum(bool(picture[2 + 17 * k : 17 + 17 * k].max() == 255) for k in range(3)) == 3
+    for grid in ("26x1", "1x0"):
+        refused = client.get(f"{lens}/field.png?aperture=1.4&grid={grid}").json()["detail"]
+        assert refused == f"grid {grid}: columns and rows must lie in 1..25, as in 9x6"
 
 
 def test_the_field_map_hatches_what_is_not_known(client: TestClient, lens: str) -> None:

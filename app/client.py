@@ -99,6 +99,13 @@ class Client(AbstractContextManager["Client"]):
         own: `change_photo` corrects one that says them wrongly. With `kind` it was made to measure the lens;
         of a pair it is the open photo, and `reference_id` is the closed one, sent before with
         `calibrate=False`.
+
+        Raises
+        ------
+        ServiceProblemError
+            If the service refuses it.
+        OSError
+            If the file cannot be read.
         """
         given = s.UploadFields.model_validate(fields).model_dump(mode="json", exclude_unset=True)
         with Path(path).open("rb") as file:
@@ -245,7 +252,10 @@ class Client(AbstractContextManager["Client"]):
     def save_report(self, lens_id: str, path: str | Path) -> Path:
         """Save the test report of a lens in the form that `path` ends with: `.json`, `.csv` or `.pdf`.
 
-        ServiceProblemError has the code `not_ready` while a worker has yet to make it.
+        Raises
+        ------
+        ServiceProblemError
+            With the code `not_ready` while a worker has yet to make it.
         """
         target = Path(path)
         return self._save(f"/v1/lenses/{lens_id}/report{target.suffix.lower()}", target)

@@ -119,7 +119,10 @@ def encoded(form: Format, kernel: Kernel, told: PsfOut) -> tuple[bytes, dict[str
         values = np.round(kernel, DIGITS).tolist()
         full = told.model_copy(update={"psf": told.psf.model_copy(update={"data": values})})
         return full.model_dump_json().encode(), {}
-    headers, buffer = dict[str, str](), io.BytesIO()
+    at, buffer = told.query, io.BytesIO()
+    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
+    name = f"psf-v{told.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{form}"
+    headers = {"Content-Disposition": f'inline; filename="{name}"'}
     if form == "npy":
         np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
     elif form == "tiff":

@@ -93,6 +93,7 @@ def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None
     peak = float(png.headers["x-psf-scale"].partition(";")[0].removeprefix("max="))
     np.testing.assert_allclose(picture / 65535 * peak, data, atol=peak / 65535)
     assert [r.headers["content-type"] for r in (tiff, png)] == ["image/tiff", "image/png"]
+    assert 'filename="psf-v1-r0.500-phi2.200-f1.4-g.png"' in png.headers["content-disposition"]
 
 
 @pytest.mark.parametrize(

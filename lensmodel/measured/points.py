@@ -64,7 +64,8 @@ class Points:
         require(self, photos, size)
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
-        lights = isolated_lights(find_lights(plane), size)
+        spots = find_lights(plane)
+        lights = isolated_lights(spots, size)
         usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
         cells: dict[tuple[int, int], list[PointLight]] = {}
         for light in usable:
@@ -72,6 +73,12 @@ class Points:
             col = int(light.col * self.across / photo.frame.width)
             cells.setdefault((row, col), []).append(light)
         good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
+        if not good and len(lights) < len(spots) / 2:
+            raise NotEnoughEvidenceError(
+                f"of {len(spots)} bright spots only {len(lights)} are isolated: this is no photo of points "
+                "of light, or they are too close together; photograph stars or pinholes before a dark "
+                "ground, and learn from ordinary photos with `lensmodel calibrate`"
+            )
         if not good:
             raise NotEnoughEvidenceError(
                 f"{len(lights)} isolated points of light, {len(usable)} of them unsaturated and whole, and "

@@ -16,6 +16,7 @@ from scipy import ndimage, signal
 
 from lab import targets
 from lensmodel import measured as measure
+from lensmodel import simulate
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
@@ -352,6 +353,13 @@ def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
     bright = photo_of(40.0 * scene, lopsided())
     with pytest.raises(NotEnoughEvidenceError, match="expose less"):
         Points().measure([bright], size=21)
+
+
+def test_an_ordinary_photo_is_called_no_photo_of_points() -> None:
+    scene = simulate.demo_scene("city")[1, : SHAPE[0] + 56, : SHAPE[1] + 56]
+    with pytest.raises(NotEnoughEvidenceError, match="no photo of points") as refusal:
+        Points().measure([photo_of(scene, lopsided())], size=21)
+    assert "expose" not in str(refusal.value)
 
 
 def test_lights_beside_others_are_left_out() -> None:

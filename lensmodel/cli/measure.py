@@ -28,7 +28,7 @@ from lensmodel.cli.options import (
 )
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import write_atomically
-from lensmodel.core.psf import PsfSample
+from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
 from lensmodel.measured.edges import chart_edges
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
@@ -185,7 +185,7 @@ def _added(
     green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
     return {
         "state": "measured",
-        "places": len({(s.position.r, s.position.phi) for s in samples}),
+        "places": places_of(samples),
         "samples": len(samples),
         "estimator": samples[0].estimator,
         "error": green[len(green) // 2],

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Literal, Protocol, TypeAlias, get_args
 
@@ -311,6 +313,11 @@ class PsfSample:
                 raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
+
+
+def places_of(samples: Iterable[PsfSample]) -> int:
+    """Count the places that samples show, in the colour that has most of them."""
+    return max(Counter(sample.settings.channel for sample in samples).values(), default=0)
 
 
 class PsfField(Protocol):

@@ -8,7 +8,6 @@ may be is what the model expects of the kernel at its place (`predicted_error`).
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -22,6 +21,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import places_of
 from lensmodel.core.types import (
     ZONES,
     Channel,
@@ -252,7 +252,7 @@ class LensReport:
     name: str  # of the lens
     verdict: str  # for photographers
     photos: int  # that it rests on
-    places: int  # at which these show the blur, each counted once for all colours
+    places: int  # at which these show the blur, in the colour that most of them show
     sensor: SensorGeometry  # for other units than cycles/pixel
     tested: tuple[ApertureReport, ...]  # by aperture, ascending, and by colour, green first
     lateral: LateralColourCurve | None  # None where no photo showed it
@@ -290,7 +290,10 @@ class LensReport:
     def advice(self) -> str:
         """Which photo would help most: of the place and aperture whose blur is known least."""
         if self.measured and self.tested[0].unknown_share:
-            return "Nothing is known beyond the outermost places of the chart: let it fill the frame."
+            return (
+                "Nothing is known beyond the outermost places that were measured: what you photograph to "
+                "measure, let it fill the frame."
+            )
         green = [one for one in self.tested if one.settings.channel == self.tested[0].settings.channel]
         spots = [(spot, one) for one in green for spot in (*one.spots, *one.sides)]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
@@ -402,7 +405,7 @@ def lens_report(
         name=name,
         verdict=verdict(tested[0], _best(tested)),
         photos=len({s.photo for s in model.samples}),
-        places=max(Counter(s.settings.channel for s in model.samples).values(), default=0),
+        places=places_of(model.samples),
         sensor=SensorGeometry(_pitch(model), height_px or guessed),
         tested=tuple(tested),
         lateral=_lateral(lateral),

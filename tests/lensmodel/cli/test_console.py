@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from in_process import lensmodel
 from running import SMALL, write_photo
@@ -15,8 +16,8 @@ from running import SMALL, write_photo
 from lensmodel.cli import console
 from lensmodel.cli.console import Pace, PacedProgress, aligned, clock, mtf50_words
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import StepHook
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, StepHook
 
 
 @pytest.mark.parametrize(
@@ -122,6 +123,32 @@ def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
 
     assert "[0:20]   0 % page.dng: finding the page" in done.stderr.splitlines()
     assert "[1:10]  12 % page.dng: measuring, about 1:10 left" in done.stderr.splitlines()
+
+
+def test_a_measurement_and_its_report_count_the_same_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(*_: Any, **given: Any) -> list[PsfSample]:
+        return [  # points of light: a colour sees others of them, whose middle lies elsewhere
+            PsfSample(
+                gaussian(15, np.eye(2)),
+                FieldPosition(r, 0.1 * k),
+                LensSettings(2.8, channel=channel),
+                estimator="measured-points/1",
+                error=0.1,
+            )
+            for k, channel in enumerate(CHANNELS)
+            for r in (0.2, 0.5, 0.7)[: 3 - k]
+        ]
+
+    write_photo(tmp_path / "stars.dng", 1, shape=SMALL)
+    monkeypatch.setattr("lensmodel.workflow.measuring.samples_of_developed", measure)
+    done = lensmodel("measure", "points", "stars.dng", "--profile", "a.lensprofile", cwd=tmp_path)
+    report = lensmodel("report", "a.lensprofile", cwd=tmp_path)
+
+    assert "3 places measured on stars.dng" in done.stdout
+    assert "blur measured at 3 places" in report.stdout
+    assert "outermost places that were measured" in report.stdout
 
 
 def test_quick_work_says_nothing() -> None:

@@ -40,14 +40,16 @@ corrections/   corrected photos.
 class _Pipe(io.RawIOBase):
     """Keeps what a ZIP file writes until it is fetched."""
 
-    kept = b""
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept = bytearray()  # grows in place: the list at the end comes in pieces, some for each file
 
     def write(self, data: Any) -> int:  # noqa: ANN401 - bytes of any kind
-        self.kept += bytes(data)
+        self._kept += data
         return len(data)
 
     def fetch(self) -> bytes:
-        fetched, self.kept = self.kept, b""
+        fetched, self._kept = bytes(self._kept), bytearray()
         return fetched
 
 

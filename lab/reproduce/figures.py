@@ -30,11 +30,11 @@ _SIZE: Final = 31
 _GRID: Final = (6, 9)
 
 
-def draw(plan: Reproduction, photos: Path, folder: Path, *, workers: int = 1) -> dict[str, Any]:
+def draw(plan: Reproduction, photos: Path, folder: Path, name: str, *, workers: int = 1) -> dict[str, Any]:
     """Draw both figures into a folder, the second of the first case; return what the page says of them."""
     return {
-        "fig2": _fig2(plan.cases, folder / "fig2.png"),
-        "fig4": _fig4(plan, photos, folder / "fig4.png", workers),
+        "fig2": _fig2(plan.cases, folder / f"{name}-fig2.png"),
+        "fig4": _fig4(plan, photos, folder / f"{name}-fig4.png", workers),
     }
 
 

@@ -87,10 +87,10 @@ def run_reproduction(
     finished = [job.run(told) for job in jobs]
     drawn: Unit = {}
     if plan.compare:
-        # of all lenses: another choice of them has figures of its own
+        # of all lenses: another choice of them has figures of its own, stored beside their pictures
         whole = hashlib.sha256(" ".join(job.folder.name for job in jobs).encode()).hexdigest()[:12]
-        make = partial(figures.draw, plan, jobs[0].photos, shown, workers=workers)
-        drawn = stored(cache / f"figures-{whole}.json", make)
+        make = partial(figures.draw, plan, jobs[0].photos, shown, whole, workers=workers)
+        drawn = stored(shown / f"{whole}-figures.json", make)
         told("figures 2 and 4")
     files = plan.files()
     return {

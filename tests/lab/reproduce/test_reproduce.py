@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +54,8 @@ from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
 from lensmodel.workflow.sampling import PRESETS, Preset
+
+DRAW = job.figures.draw
 
 
 def case(**changes: Any) -> Case:
@@ -663,6 +666,29 @@ def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
     made = reproduced(tmp_path / "killed", chosen)
     assert kept_result.stat().st_mtime_ns == written
     assert made == reproduced(tmp_path / "whole", chosen)
+
+
+def test_each_choice_of_lenses_keeps_figures_of_its_own(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+
+    def drawn(cases: Sequence[Case], path: Path) -> dict[str, Any]:
+        path.write_text(cases[0].name)
+        return {"picture": path.name}
+
+    monkeypatch.setattr(job.figures, "draw", DRAW)
+    monkeypatch.setattr(job.figures, "_fig2", drawn)
+    monkeypatch.setattr(job.figures, "_fig4", lambda chosen, _, path, __: drawn(chosen.cases, path))
+    one = plan(case(photos=(1,)), compare=True)
+    other = plan(replace(planned("quick").cases[1], height=480, width=640, photos=(1,)), compare=True)
+    for chosen in (one, other, one):
+        for figure in reproduced(tmp_path, chosen)["figures"].values():
+            shown = tmp_path / "pictures" / figure["picture"]
+            assert shown.read_text() == chosen.cases[0].name
+    shutil.rmtree(tmp_path / "pictures")
+    for figure in reproduced(tmp_path, one)["figures"].values():
+        assert (tmp_path / "pictures" / figure["picture"]).exists()
 
 
 def test_lens_that_learned_nothing_leaves_photos_as_they_are(tmp_path: Path, quick_photos: list[str]) -> None:

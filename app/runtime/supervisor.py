@@ -8,13 +8,15 @@ tables say.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import logging
 import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Final
 
 import uvicorn
@@ -43,7 +45,7 @@ def serve(settings: Settings) -> int:
     """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     file = settings.data_dir / "service.json"  # the address of the service and the ids of its processes
-    with contextlib.closing(listen(settings.host, settings.port)) as listener:
+    with alone(settings.data_dir), contextlib.closing(listen(settings.host, settings.port)) as listener:
         _prepare(settings, api=True, worker=True)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
@@ -70,6 +72,20 @@ def serve(settings: Settings) -> int:
             worker.wait()
             file.unlink(missing_ok=True)
     return 1
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Refuse a second service on a data folder; the lock ends with its process, however that ends."""
+    with (folder / "service.lock").open("w", encoding="ascii") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(
+                f"lensmodel already runs with the data in {folder.resolve()}: open the address it printed "
+                "(service.json there has it too), or stop it first, or give another folder by --data"
+            ) from error
+        yield
 
 
 def run_api(settings: Settings) -> None:

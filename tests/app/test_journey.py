@@ -25,6 +25,7 @@ from running import (
     BRIEF,
     OWN_ACCOUNT,
     PATIENCE_S,
+    PROGRAM,
     SHAPE,
     SMALL,
     Service,
@@ -255,6 +256,25 @@ def test_a_killed_api_ends_the_service_which_starts_again(service: Service, firs
     killed(service, "pid")
 
     assert lens_of(service, first)["serial"] == "L-42"
+
+
+def test_a_second_service_on_the_same_data_is_refused_and_the_first_runs_on(service: Service) -> None:
+    info, pids = service.info(), pids_of(service)
+
+    second = subprocess.run(
+        [*PROGRAM, "serve", "--port", "0", "--data", service.data.name],
+        cwd=service.data.parent,
+        capture_output=True,
+        text=True,
+        timeout=stretched(PATIENCE_S),
+        check=False,
+    )
+
+    assert second.returncode == 2
+    assert f"already runs with the data in {service.data.resolve()}:" in second.stderr
+    assert "or give another folder by --data" in second.stderr
+    assert (service.info(), alive(pids)) == (info, pids)
+    assert service.get("/readyz")["status"] == "ready"
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from lensmodel.cli.options import (
     QUIET,
     WORKERS,
     Aperture,
-    Force,
     HelpAll,
     Photos,
     Verbose,
@@ -26,7 +25,6 @@ from lensmodel.cli.options import (
 from lensmodel.core.types import LensSettings
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.photo import OutputFormat
-from lensmodel.workflow.correcting import SEEN_DB
 from lensmodel.workflow.lens import Lens
 
 # Panels of the options that --help-all adds
@@ -75,7 +73,12 @@ def correct(
         ),
     ] = None,
     aperture: Aperture = None,
-    force: Force = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Replace existing files; with --profile, correct JPEGs whatever they gain."
+        ),
+    ] = False,
     profiles: Annotated[
         Path | None,
         rare(
@@ -148,7 +151,7 @@ def correct(
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
-    Exit status: 0 all photos are corrected, 1 some are not, 2 wrong usage.
+    Exit status: 0 done, 1 some photos failed, 2 wrong usage.
     """
     del help_all
     shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
@@ -174,11 +177,10 @@ def correct(
         "strength": strength,
         "bounds": Bounds(halo, texture, denoise),
         "file_format": file_format,
-        "least_gain_db": SEEN_DB if profile is None else None,
         "keep_location": keep_location,
         "workers": workers,
     }
-    correction = outputs.Correction(targets, options, any_lens, force, shown)
+    correction = outputs.Correction(targets, options, profile is None, any_lens, force, shown)
     document: dict[str, Any] = {"profile": str(profile)}
     if profile is None:
         base = next(iter([*targets.values(), *twice])).parent

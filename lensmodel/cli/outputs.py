@@ -93,15 +93,11 @@ class Correction:
 
     targets: Mapping[Path, Path]  # which file each photo becomes
     options: Mapping[str, Any]  # of `lensmodel.correct`
+    sorted: bool  # by their lens; only those that gain are corrected
     any_lens: bool
     force: bool
     display: Display
     refused: dict[Path, LensModelError | OSError] = field(default_factory=dict)  # photos that taught nothing
-
-    @property
-    def sorted(self) -> bool:
-        """Whether photos were sorted by their lens, and only those that gain are corrected."""
-        return self.options.get("least_gain_db") is not None
 
     def photos(
         self,
@@ -159,8 +155,10 @@ class Correction:
             info = inspect(path)
             self._require_lens(path, info.metadata, lens)
             target.parent.mkdir(parents=True, exist_ok=True)
+            lossy = info.kind == "jpeg"
+            least = SEEN_DB if self.sorted or (lossy and not self.force) else None
             corrected = lensmodel.correct(
-                path, lens, target, siblings=siblings, on_step=on_step, **self.options
+                path, lens, target, least_gain_db=least, siblings=siblings, on_step=on_step, **self.options
             )
         except (LensModelError, OSError) as error:
             return files.failed(error)
@@ -172,8 +170,9 @@ class Correction:
             "audit": corrected.audit,
             "chroma_step": corrected.chroma_step,
         }
-        if self.sorted and corrected.expected_gain_db < self.options["least_gain_db"]:
-            result |= {"state": "left", "reason": _why_left(corrected, lossy=info.kind == "jpeg")}
+        if least is not None and corrected.expected_gain_db < least:
+            insist = "" if self.sorted else "; --force corrects it all the same"
+            result |= {"state": "left", "reason": f"{_why_left(corrected, lossy=lossy)}{insist}"}
         return result
 
     def _require_lens(self, path: Path, said: PhotoMetadata, lens: Lens) -> None:

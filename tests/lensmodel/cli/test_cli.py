@@ -668,12 +668,31 @@ def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Pa
     assert re.search("does not name its lens.*\n.*does not say its aperture", done.stderr)
 
 
+@pytest.mark.parametrize(("seen", "state"), [(True, "corrected"), (False, "left")])
+def test_a_jpeg_that_would_gain_too_little_to_be_seen_is_left_unless_forced(
+    seen: bool, state: str, folder: Path, here: Here
+) -> None:
+    write_jpeg(folder / "one.jpg", 1, blur_px=1.3 if seen else 60.0)
+    words = ("correct", "one.jpg", "-p", PROFILE, "-o", "out.tif", "--method", "fast", "--any-lens")
+    done = here(*words, "--json")
+
+    assert done.returncode == 0, done.stderr
+    (result,) = json.loads(done.stdout)["results"]
+    assert result["state"] == state
+    assert (folder / "out.tif").exists() == seen
+    if not seen:
+        assert "less than 0.3 dB" in result["reason"]
+        assert re.search(r"one\.jpg: left as it is: .*--force", here(*words).stderr)
+        assert here(*words, "--force", "-q").returncode == 0
+        assert (folder / "out.tif").exists()
+
+
 # --- interrupting ------------------------------------------------------------------------------
 
 
-def write_jpeg(path: Path, seed: int) -> None:
+def write_jpeg(path: Path, seed: int, blur_px: float = 1.3) -> None:
     """Write a photo of such a lens as its camera would: nothing is learned of it in the end, all at once."""
-    light = ndimage.gaussian_filter(scene(seed), 1.3)
+    light = ndimage.gaussian_filter(scene(seed), blur_px)
     picture = np.rint(255.0 * light ** (1.0 / 2.2)).astype(np.uint8)
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.FNumber: 2.8, ExifTags.Base.LensModel: "Test 35mm"})

@@ -15,9 +15,11 @@ export function setUpLive() {
   const away = byId("away");
   let within = false;
   const on = (name, act) => document.addEventListener(`htmx:${name}`, act);
-  on("before:request", (event) => {
+  const wait = (event) => {
     if (document.hidden || occupied() || (typing() && !live.contains(document.activeElement))) event.preventDefault();
-  });
+  };
+  on("before:request", wait);
+  on("before:response", wait); // it was asked for before
   on("after:request", ({ detail }) => (away.hidden = detail.ctx.response.status < 500));
   on("error", () => (away.hidden = false));
   on("before:swap", () => (within = live.contains(document.activeElement)));

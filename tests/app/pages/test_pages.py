@@ -65,6 +65,13 @@ RECORD = """() => {
   new MutationObserver(note).observe(
     document.querySelector("#photos"), { childList: true, subtree: true, characterData: true });
 }"""
+LOOK = """(lens) => {
+  const live = document.querySelector("#live");
+  live.setAttribute("hx-get", `/ui/parts?page=lens&id=${lens}`);
+  live.setAttribute("hx-trigger", "every 2s");
+  htmx.process(live);
+}"""
+"""Let the page of a lens look whether its work has ended, as while there is some."""
 STOP = """() => {
   const at = document.activeElement;
   const style = getComputedStyle(at.type === "file" ? at.labels[0] : at);
@@ -724,19 +731,18 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
 
 
 def test_a_page_does_not_go_while_somebody_is_asked(page: Page, learned: dict[str, Any]) -> None:
-    def still_counting(route: Route) -> None:
-        answer = route.fetch()
-        live = 'hx-get="/ui/parts?page=lens&amp;id=' + learned["lens_id"] + '" hx-trigger="every 2s"'
-        route.fulfill(response=answer, body=answer.text().replace('id="live"', f'id="live" {live}'))
-
-    address = f"/lenses/{learned['lens_id']}"
-    page.route(f"**{address}", still_counting)
-    page.goto(address)
+    looks: list[Route] = []
+    page.goto(f"/lenses/{learned['lens_id']}")
+    expect(page.locator("#live[hx-get]")).to_have_count(0)  # complete: it is not loaded anew by itself
     page.evaluate("window.first = true")
+    page.route("**/ui/parts?*", lambda look: looks.append(look), times=1)  # noqa: PLW0108 - playwright marks it
+    with page.expect_request("**/ui/parts?*"):
+        page.evaluate(LOOK, learned["lens_id"])
     page.get_by_text("Rename, merge").click()
     page.get_by_role("button", name="Delete lens").click()
-    page.unroute(f"**{address}")
-    page.wait_for_timeout(2500)  # longer than between two looks, though its work has ended
+    expect(page.get_by_role("dialog")).to_be_visible()
+    looks[0].continue_()  # answered only now, and later ones would be: the work of the page has ended
+    page.wait_for_timeout(2500)  # longer than between two looks
     expect(page.get_by_role("dialog")).to_be_visible()
     assert page.evaluate("window.first")
     with page.expect_navigation():

@@ -470,12 +470,14 @@ def _store_result(context: JobContext, row: CorrectionRow, path: Path, report: d
     base, storage = row.run_folder, context.storage
     key = f"{base}result{path.suffix}"
     storage.put(key, path)
-    for shown in (*SIDES.values(), *LAYER_FILES.values()):
-        if (path.parent / shown).is_file():
-            storage.put(f"{base}{shown}", path.parent / shown)
+    shown = [path.parent / picture for picture in (*SIDES.values(), *LAYER_FILES.values())]
+    shown = [picture for picture in shown if picture.is_file()]
+    for picture in shown:
+        storage.put(f"{base}{picture.name}", picture)
     name = f"{PurePath(row.photo.filename).stem or 'photo'}-corrected{path.suffix}"
     about = {"key": key, "etag": digest, "media_type": f"image/{MEDIA_TYPE[path.suffix]}", "name": name}
-    if not context.store.jobs.finish(row, report, bytes=path.stat().st_size, **about):
+    size, beside = path.stat().st_size, sum(picture.stat().st_size for picture in shown)
+    if not context.store.jobs.finish(row, report, bytes=size, shown_bytes=beside, **about):
         storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
 

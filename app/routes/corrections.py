@@ -46,8 +46,7 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     if not options.any_lens and lens.id != photo.lens_id:
         common.check_same_lens(call, lens, photo, f"{photo.filename} seems to be of another lens")
     version = _version_for(call, lens, options.lens_version)
-    usage = call.store.accounts.usage(call.owner)
-    check_usage(call.settings, usage, usage.working_corrections, "corrections")
+    check_usage(call, "corrections")
     asked = options.model_dump(mode="json", exclude={"photo_id", "lens_id", "lens_version", "any_lens"})
     # with other settings of the photo the same request is a new correction
     params = asked | {"settings": stored_settings(photo)}

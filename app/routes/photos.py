@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import timedelta
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from fastapi import APIRouter
 from starlette.concurrency import run_in_threadpool
@@ -33,7 +33,8 @@ GIB = 1024 * MIB  # bytes
 UPLOAD_S: Final = 3600.0
 # Files that are received at once (chosen): each takes a connection and a file, and hardly any memory
 MAX_UPLOADS: Final = 8
-# Photos of one owner, unless his keys say another number (chosen): all that one photographer has
+# Photos, and corrections, of one owner, unless his keys say another number of photos (chosen): all that one
+# photographer has
 MAX_PHOTOS: Final = 100_000
 # Photos, and corrections, of one owner that wait or are worked on (chosen): a day's work of one machine
 MAX_UNFINISHED: Final = 500
@@ -84,7 +85,9 @@ async def receiving(call: Call) -> AsyncIterator[tuple[str, str]]:
         text = f"{MAX_UPLOADS} files are being received, more may not be: try again in a few seconds"
         raise BusyError(text, headers={"Retry-After": "5", **CLOSE})
     async with call.uploads:
-        await run_in_threadpool(_admit, call)
+        # before the body is read
+        coming = middleware.declared_length(call.request.headers)
+        await run_in_threadpool(check_usage, call, "photos", coming)
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
         prefix, span = f"photos/{public_id}/", timedelta(seconds=UPLOAD_S)
@@ -141,34 +144,29 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         call.photo(fields.reference_id)
 
 
-def _admit(call: Call) -> None:
-    """Refuse an upload before its body is read: no disk space, or a quota is used up."""
-    limits = call.settings
-    free = call.storage.free_bytes()
-    coming = middleware.declared_length(call.request.headers)
+def check_usage(call: Call, what: Literal["photos", "corrections"], coming: int = 0) -> None:
+    """Refuse more where the disk is full, or an owner stores, or has in work, as much as he may."""
+    limits, free = call.settings, call.storage.free_bytes()
     if free is not None and free - coming < limits.min_free_mb * MIB:
         raise QuotaError(
-            f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "
-            f"{coming / MIB:.1f} MiB are to come: delete photos, or make room on the disk",
+            f"{max(free - coming, 0) // MIB} MiB would be left where photos are kept, and "
+            f"{limits.min_free_mb} MiB must be: delete photos, or make room on the disk",
             status=507,
         )
     usage = call.store.accounts.usage(call.owner)
-    check_usage(limits, usage, usage.working_photos, "photos")
-    max_photos = most(limits, usage)[1]
-    if usage.photos >= max_photos:
-        text = f"{usage.photos} photos are stored, and {max_photos} are allowed: delete some"
-        raise QuotaError(text, headers={"Retry-After": "3600"})
-
-
-def check_usage(settings: Settings, usage: Usage, working: int, what: str) -> None:
-    """Refuse more where an owner stores as many bytes, or has as much in work, as he may."""
+    max_bytes, may = most(limits, usage)
+    working, kept = usage.working_photos, usage.photos
+    if what == "corrections":
+        working, kept, may = usage.working_corrections, usage.corrections, MAX_PHOTOS
     if working >= MAX_UNFINISHED:
         text = f"{working} {what} are being worked on, {MAX_UNFINISHED} may be: wait for some to finish"
         raise QuotaError(text, headers={"Retry-After": "30"})
-    stored, max_bytes = usage.stored_bytes, most(settings, usage)[0]
-    if stored >= max_bytes:
-        kept = f"{stored / GIB:.1f} GiB of photos and results are stored, {max_bytes / GIB:g} GiB may be"
-        raise QuotaError(f"{kept}: delete some", headers={"Retry-After": "3600"})
+    text = f"{kept} {what} are stored, and {may} are allowed" if kept >= may else ""
+    if usage.stored_bytes >= max_bytes:
+        stored = f"{usage.stored_bytes / GIB:.1f} GiB of photos and results"
+        text = f"{stored} are stored, {max_bytes / GIB:g} GiB may be"
+    if text:
+        raise QuotaError(f"{text}: delete some", headers={"Retry-After": "3600"})
 
 
 def most(settings: Settings, usage: Usage) -> tuple[int, int]:

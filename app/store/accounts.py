@@ -158,7 +158,8 @@ class Accounts(Repository):
         if row is None:
             return Usage()
         kept = func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None))
-        made = func.sum(CorrectionRow.result_bytes).filter(CorrectionRow.state == "succeeded")
+        results = CorrectionRow.result_bytes + CorrectionRow.result_shown_bytes
+        made = func.sum(results).filter(CorrectionRow.state == "succeeded")
         working = func.count().filter(PhotoRow.state.in_(PHOTO_WORKED_ON))
         running = func.count().filter(CorrectionRow.state.in_(CORRECTION_ACTIVE))
         lenses = select(func.count()).where(LensRow.owner_id == row.id)

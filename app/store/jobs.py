@@ -124,7 +124,7 @@ class Jobs(Works[CorrectionRow]):
         self, session: Session, /, run: CorrectionRow, report: Mapping[str, Any], **result: str | int
     ) -> bool:
         """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
-        # `result`: key, etag, media_type, bytes and name of the file
+        # `result`: key, etag, media_type, bytes and name of the file, and `shown_bytes` of pictures of it
         fields = {f"result_{name}": value for name, value in result.items()}
         return self._move_run(session, run, "succeeded", report=dict(report), **fields)
 

@@ -334,6 +334,7 @@ class CorrectionRow(Work, Base):
     result_etag: Mapped[str | None]
     result_media_type: Mapped[str | None]
     result_bytes: Mapped[Big | None]
+    result_shown_bytes: Mapped[Big] = mapped_column(default=0)  # of the pictures beside it, for pages
     result_name: Mapped[str | None]
     created_at: Mapped[datetime]
     photo: Mapped[PhotoRow] = relationship()

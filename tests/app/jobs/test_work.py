@@ -26,7 +26,7 @@ from sqlalchemy import update
 from app.blobs.storage import Storage
 from app.http import views
 from app.jobs import tasks
-from app.jobs.answers import KERNELS, SAMPLES, SHOWN, THUMBNAIL, JobFailedError, NotWantedError
+from app.jobs.answers import KERNELS, SAMPLES, SHOWN, SIDES, THUMBNAIL, JobFailedError, NotWantedError
 from app.jobs.context import JobContext
 from app.jobs.queue import Handler, durable, end_job
 from app.jobs.sample_files import write_samples
@@ -653,6 +653,7 @@ def measure_once(context: JobContext, lens_id: str) -> None:
 
 def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
     (folder / "result.jpg").write_bytes(b"a picture")
+    (folder / SIDES["before"]).write_bytes(b"tiles")
     return Outcome(
         "ok", value={"file": "result.jpg", "report": {"zones": {"center": {"expected_gain_db": 3.0}}}}
     )
@@ -669,6 +670,7 @@ def test_a_correction_ends_with_a_file(
     row = context.store.jobs.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
+    assert row.result_shown_bytes == len(context.storage.get(f"{row.run_folder}{SIDES['before']}")) == 5
     assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
     assert context.storage.get(row.result_key or "") == b"a picture"
     assert sandbox.files >= {KERNELS, SAMPLES}

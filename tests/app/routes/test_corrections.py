@@ -36,6 +36,7 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
         "etag": etag,
         "media_type": "image/tiff",
         "bytes": len(FILE),
+        "shown_bytes": 77,
         "name": "Größe p1-corrected.tif",
     }
     report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
@@ -302,7 +303,7 @@ def test_results_count_for_the_quota_and_expire(
     client: TestClient, finished: str, steps: Steps, store: Store, settings: Settings
 ) -> None:
     stored = client.get("/v1/account").json()["stored_bytes"]
-    assert stored == 1000 + len(FILE)  # the photo and its result
+    assert stored == 1000 + len(FILE) + 77  # the photo, its result, and the pictures of that
     with store.database.writing() as session:
         session.execute(update(OwnerRow).values(quota_bytes=stored))
     refused = post(client, photo_id=steps.counted().public_id)
@@ -319,6 +320,35 @@ def test_nobody_has_more_unfinished_corrections_than_unfinished_photos(
 ) -> None:
     monkeypatch.setattr("app.routes.photos.MAX_UNFINISHED", 2)
     photo = steps.counted().public_id
-    answers = [post(client, photo_id=photo, strength=strength) for strength in (1.0, 0.5, 0.25)]
+    answers = [post(client, photo_id=photo, nonce=word) for word in ("one", "two", "three")]
 
     assert [answer.status_code for answer in answers] == [202, 202, 429]
+
+
+def test_requests_that_are_cancelled_and_asked_for_under_other_words_fill_no_table(
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.routes.photos.MAX_PHOTOS", 2)
+    photo = steps.counted().public_id
+    for word in ("one", "two"):
+        made = post(client, photo_id=photo, nonce=word).json()["id"]
+        assert client.post(f"/v1/jobs/{made}/cancel").status_code == 202
+
+    refused = post(client, photo_id=photo, nonce="three")
+
+    assert (refused.status_code, refused.json()["code"]) == (429, "quota_exceeded")
+    assert "2 corrections are stored, and 2 are allowed: delete some" in refused.json()["detail"]
+    client.delete(f"/v1/corrections/{made}")
+    assert post(client, photo_id=photo, nonce="three").status_code == 202
+
+
+def test_nothing_is_corrected_where_the_disk_is_full(
+    client: TestClient, steps: Steps, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = steps.counted().public_id
+    storage = client.app.state.services.storage  # type: ignore[attr-defined] # Starlette's own attribute
+    monkeypatch.setattr(storage, "free_bytes", lambda: (settings.min_free_mb << 20) - 1)
+
+    answer = post(client, photo_id=photo, nonce="one")
+
+    assert (answer.status_code, answer.json()["code"]) == (507, "quota_exceeded")

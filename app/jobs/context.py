@@ -65,12 +65,13 @@ class Needs:
     spare_mb: int = SPARE_MB
     compiled: bool = True  # whether it runs compiled loops
     threads: bool = False  # whether it works in as many threads as the worker has slots
+    quick: bool = False  # whether it goes before others: what it finds, its owner may have to answer
 
 
 # Of a pixel mapped planes alone take 12 bytes; a measurement maps two photos, with a float64 plane of each
 NEEDS: Final[Mapping[str, Needs]] = {
-    "locate": Needs(90, answers.LOCATED, compiled=False),
-    "inspect": Needs(90, answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False),
+    "locate": Needs(90, answers.LOCATED, compiled=False, quick=True),
+    "inspect": Needs(90, answers.INSPECTED, spare_mb=2 * SPARE_MB, compiled=False, quick=True),
     "develop": Needs(20, pixel_bytes=120, compiled=False),
     "select": Needs(20, answers.SELECTED, pixel_bytes=120, compiled=False),
     "estimate": Needs(6, pixel_bytes=24),
@@ -160,9 +161,8 @@ class JobContext:
         memory = min(memory, max(self.sandbox.budget.memory_mb, needs.spare_mb))
         threads = self.settings.worker_slots if needs.threads else 0
         # the wall time of a part may be long on a busy machine; it bounds a task that waits for nothing
-        return TaskLimits(
-            memory + THREAD_MB * threads, seconds, cpu_s=math.ceil(seconds / needs.part) * max(threads, 1)
-        )
+        cpu_s = math.ceil(seconds / needs.part) * max(threads, 1)
+        return TaskLimits(memory + THREAD_MB * threads, seconds, cpu_s, quick=needs.quick)
 
     @contextmanager
     def original(self, photo: PhotoRow) -> Iterator[Path]:

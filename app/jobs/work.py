@@ -83,6 +83,16 @@ def work_on(context: JobContext, photo_id: str, epoch: int) -> None:
         _Steps(context, photo).run()
 
 
+def read_ahead(context: JobContext, photo: PhotoRow) -> None:
+    """Read a photo before its turn: its owner may have to say which lens it was, or to send another file."""
+    try:
+        _Steps(context, photo).inspect()
+    except NotWantedError:
+        pass
+    except JobFailedError as error:
+        context.store.photos.fail(photo.public_id, photo.epoch, error.code, error.detail)
+
+
 class _Steps:
     """The work on a photo by rows and tasks: each step does only what the tables do not have yet."""
 
@@ -94,7 +104,7 @@ class _Steps:
 
     def run(self) -> None:
         """Take the photo through all steps."""
-        if self._photo.state == "inspecting" and not self._inspect():
+        if self._photo.state == "inspecting" and not self.inspect():
             return
         self._enter("developing")
         developed = self._context.developed(self._photo)
@@ -120,17 +130,18 @@ class _Steps:
         if not self._move(PHOTO_RUNNING[: PHOTO_RUNNING.index(stage) + 1], stage) and not self._wanted():
             raise NotWantedError
 
-    def _inspect(self) -> bool:
+    def inspect(self) -> bool:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
-        photo = inspect(self._context, self._photo)
-        self._photo = photo
+        photo, states = self._photo, (self._photo.state,)
+        if photo.epoch > 1 or not photo.width:  # else it was read before its turn, or by a worker that died
+            self._photo = photo = inspect(self._context, photo)
         if not photo.calibrate:
-            self._move(("inspecting",), "stored")
+            self._move(states, "stored")
             return False
         missing = _missing(photo)
         if missing:
             why = {"error_code": "metadata_missing", "error_detail": missing}
-            self._move(("inspecting",), "needs_lens", **why)
+            self._move(states, "needs_lens", **why)
         return not missing
 
     def _select(self, developed: Path) -> None:
@@ -257,7 +268,7 @@ class _Steps:
             return []
         row, end = self._photos.get(name, ANY_OWNER), time.monotonic() + WAIT_FOR_REFERENCE_S
         unread = ("received", "inspecting")
-        while row is not None and row.state in unread and time.monotonic() < end and self._wanted():
+        while row and not row.width and row.state in unread and time.monotonic() < end and self._wanted():
             time.sleep(WAIT_S)
             row = self._photos.get(name, ANY_OWNER)
         if row is None or row.owner_id != self._photo.owner_id:

@@ -25,7 +25,7 @@ from app.blobs.storage import Storage
 from app.jobs.answers import SHOWN, THUMBNAIL, JobFailedError
 from app.jobs.context import JobContext, drop_developed
 from app.jobs.queue import OURS, DbosEngine, durable, end_job, insist
-from app.jobs.work import correct, measure, remove_location, work_on
+from app.jobs.work import correct, measure, read_ahead, remove_location, work_on
 from app.runtime import logs, metrics
 from app.runtime.outage import is_outage
 from app.runtime.settings import Settings
@@ -126,6 +126,7 @@ class Worker:
         self._engine.start({kind: durable(kind, partial(job, context), end) for kind, job in JOBS.items()})
         self._start_thread(beat_s, self._take_over_dead)
         self._start_thread(SWEEP_S, self._sweep)
+        self._start_thread(SWEEP_S, self._read_ahead)
         self._start_thread(RECONCILE_S, self._reconcile)
         self._start_thread(TIDY_S, self._tidy)
 
@@ -151,6 +152,11 @@ class Worker:
         """Enqueue the jobs that the tables ask for; those already queued stay as they are."""
         for job in self._store.jobs.to_do():
             self._engine.enqueue(job)
+
+    def _read_ahead(self) -> None:
+        """Read photos while others are worked on, rather than when their turn comes."""
+        while (photo := self._store.photos.unread()) is not None:
+            read_ahead(self._context, photo)
 
     def _keep_lease(self) -> None:
         """Renew the lease; stop at once if this worker was declared dead."""

@@ -67,6 +67,7 @@ class TaskLimits:
     scratch_mb: int = 8192  # all that lies in its folder
     files: int = 10_000
     open_files: int = 256
+    quick: bool = False  # whether it goes before others
 
     @property
     def processor_s(self) -> int:

@@ -39,22 +39,26 @@ POLL_S: Final = 0.25
 
 
 class Budget:
-    """Slots and memory that children share, first come, first served."""
+    """Slots and memory that children share, first come, first served, and quick ones before others."""
 
     def __init__(self, slots: int, memory_mb: int) -> None:
-        self._first, self._changed = threading.Lock(), threading.Condition()
+        self._first, self._quick, self._changed = threading.Lock(), threading.Lock(), threading.Condition()
         self._slots, self._memory, self.memory_mb = slots, memory_mb, memory_mb
 
     @contextlib.contextmanager
-    def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
+    def share(self, memory_mb: int, wanted: Callable[[], bool], *, quick: bool = False) -> Iterator[bool]:
         """Wait for a slot and memory; yield False if the task is no longer wanted."""
         # A task that needs more memory than the whole budget runs alone
         memory, entered = min(memory_mb, self.memory_mb), False
-        with self._first:  # one waits until there is enough for it, the others for their turn
+
+        def fitting() -> bool:
+            return self._slots > 0 and self._memory >= memory and (quick or not self._quick.locked())
+
+        # one of each kind waits until there is enough for it, the others for their turn
+        with self._quick if quick else self._first:
             while not entered and wanted():  # without the lock of the budget: it reads a row
                 with self._changed:
-                    fits = self._changed.wait_for(lambda: self._slots and self._memory >= memory, POLL_S)
-                    entered = bool(fits)
+                    entered = self._changed.wait_for(fitting, POLL_S)
                     self._take(entered, memory)
         try:
             yield entered
@@ -133,7 +137,7 @@ class Sandbox:
         on_progress: child.ProgressHook = ignore_step,
     ) -> Outcome:
         """Run one task to its end."""
-        with self.budget.share(limits.memory_mb, wanted) as entered:
+        with self.budget.share(limits.memory_mb, wanted, quick=limits.quick) as entered:
             if not entered:
                 return ended("cancelled")
             reads = [*reads, self.cache]

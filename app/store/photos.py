@@ -52,6 +52,7 @@ SPARE: Final = timedelta(hours=1)
 # How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen): its
 # owner looks again within a day
 FILE_KEPT: Final = timedelta(days=1)
+SOON: Final = timedelta(seconds=2)  # within it the turn of a photo comes on an idle machine (chosen)
 # Decimals of r and phi (chosen): they round to 0.2 pixels at most in a photo of 24 megapixels, whose half
 # diagonal is 3,600 pixels
 DIGITS: Final = 4
@@ -122,6 +123,14 @@ class Photos(Works[PhotoRow]):
         # Such are those that failed before they were searched, and files that came again
         query = select(PhotoRow).where(_FILED, PhotoRow.location.is_(None), PhotoRow.kind != PROFILE_FILE)
         return list(session.scalars(query.where(PhotoRow.state.not_in(PHOTO_WORKED_ON)).limit(limit)))
+
+    @reads
+    def unread(self, session: Session) -> PhotoRow | None:
+        """Return a photo of which nothing is known yet and whose turn does not come at once."""
+        # any: several workers ask
+        waits = (PhotoRow.state == "received", PhotoRow.stage_at < now() - SOON, PhotoRow.width.is_(None))
+        query = select(PhotoRow).where(*waits, PhotoRow.kind != PROFILE_FILE)
+        return session.scalar(query.order_by(func.random()).limit(1))
 
     @reads
     def siblings(self, session: Session, photo: PhotoRow, limit: int) -> list[PhotoRow]:

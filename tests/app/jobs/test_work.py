@@ -30,7 +30,7 @@ from app.jobs.answers import KERNELS, SAMPLES, SHOWN, SIDES, THUMBNAIL, JobFaile
 from app.jobs.context import JobContext
 from app.jobs.queue import Handler, durable, end_job
 from app.jobs.sample_files import write_samples
-from app.jobs.work import correct, measure, remove_location, work_on
+from app.jobs.work import correct, measure, read_ahead, remove_location, work_on
 from app.runtime.settings import Settings
 from app.sandbox.child import MAX_RESULT, Outcome, ProgressHook, TaskLimits
 from app.sandbox.runner import Budget
@@ -192,6 +192,68 @@ def test_a_photo_goes_all_the_way(work: Handler, context: JobContext, photo: Pho
     assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
     assert lens is not None
     assert (lens.version, lens.sample_count, lens.serial) == (1, 6, "123")
+
+
+@pytest.mark.parametrize(
+    ("answer", "calibrate", "state"),
+    [
+        (ok(INFO), True, "received"),
+        (ok(INFO), False, "stored"),
+        (ok({**INFO, "metadata": {**INFO["metadata"], "aperture": None}}), True, "needs_lens"),
+        (refused("not_an_image"), True, "failed"),
+    ],
+)
+def test_a_photo_is_read_before_its_turn(
+    work: Handler,
+    context: JobContext,
+    sandbox: Scripted,
+    steps: Any,
+    answer: Answer,
+    calibrate: bool,
+    state: str,
+) -> None:
+    sandbox.answers["inspect"] = [answer]
+    photo = received(context, steps, calibrate=calibrate)
+
+    read_ahead(context, photo)
+
+    read = steps.fresh(photo)
+    assert (read.state, read.width is None, read.attempt) == (state, state == "failed", 0)
+    assert sandbox.ran == ["locate", "inspect"]
+    work(photo.public_id, 1)
+    assert steps.fresh(photo).state == ("counted" if state == "received" else state)
+    assert sandbox.ran.count("inspect") == 1
+
+
+def test_a_photo_whose_turn_comes_while_it_is_read_is_not_held_up(
+    context: JobContext, sandbox: Scripted, steps: Any
+) -> None:
+    photo = received(context, steps, calibrate=False)
+
+    def turn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert context.store.photos.start(photo.public_id, 1)
+        return ok(INFO)(arguments, folder)
+
+    sandbox.answers["inspect"] = [turn]
+    read_ahead(context, photo)
+
+    assert steps.fresh(photo).state == "inspecting"
+
+
+def test_only_photos_that_wait_and_were_not_read_are_read_before_their_turn(
+    context: JobContext, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = context.store.photos
+    photo = received(context, steps)
+    assert photos.unread() is None  # its turn may come at once
+    monkeypatch.setattr("app.store.photos.SOON", timedelta(0))
+    found = photos.unread()
+    assert found is not None
+    assert found.public_id == photo.public_id
+
+    read_ahead(context, found)
+
+    assert photos.unread() is None
 
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "r-map"), ({"selector": "good-regions"}, "good-regions")])

@@ -100,6 +100,22 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
     assert store.jobs.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
 
 
+def test_photos_in_the_queue_are_read_while_others_are_worked_on(
+    crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]]
+) -> None:
+    def are_read() -> bool:
+        return all(row.width for row in store.photos.page("local", before=None, limit=12))
+
+    send(12)
+    crew.hire()
+    until(are_read, crew.log)
+    waiting = states(store).count("received")
+    until(lambda: states(store) == ["counted"] * 12, crew.log)
+
+    assert waiting > 0
+    check_counts(store, 12)
+
+
 @pytest.mark.slow
 def test_another_worker_takes_over_from_one_that_died_for_ever(
     crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]]

@@ -487,8 +487,28 @@ def test_waiting_for_the_budget_ends_with_the_interest_in_it() -> None:
         assert not entered
 
 
-def _enter(budget: Budget, memory_mb: int, name: str, order: list[str]) -> None:
-    with budget.share(memory_mb, lambda: True):
+def test_a_quick_task_goes_before_those_that_wait_already() -> None:
+    budget = Budget(1, 100)
+    order: list[str] = []
+    with budget.share(10, lambda: True):
+        waiting = [threading.Thread(target=_enter, args=(budget, 10, name, order)) for name in "ab"]
+        quick = threading.Thread(target=_enter, args=(budget, 10, "quick", order), kwargs={"quick": True})
+        for thread in waiting:
+            thread.start()
+        while not budget._first.locked():
+            time.sleep(0.001)
+        quick.start()
+        while not budget._quick.locked():
+            time.sleep(0.001)
+    for thread in (quick, *waiting):
+        thread.join()
+
+    assert order[0] == "quick"
+    assert sorted(order[1:]) == ["a", "b"]
+
+
+def _enter(budget: Budget, memory_mb: int, name: str, order: list[str], *, quick: bool = False) -> None:
+    with budget.share(memory_mb, lambda: True, quick=quick):
         order.append(name)
 
 

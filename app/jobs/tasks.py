@@ -331,7 +331,7 @@ def _eight_bits(pixels: np.ndarray) -> NDArray[np.uint8]:
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
     """Write planes as upright sRGB tiles."""
-    upright = photo.upright(photo.shown(planes, developed.encoding), developed.encoding.orientation)
+    upright = photo.upright(photo.shown(planes, developed.encoding), developed.info.metadata.orientation)
     write_tiles(path, upright)
 
 

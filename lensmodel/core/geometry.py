@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import FieldPosition, Zone
 
+_Number = TypeVar("_Number", bound=np.floating)
 CENTER_ZONE_R = 0.3  # zone "center" lies below this r
 CORNER_ZONE_R = 0.75  # zone "corner" lies above this r
 
@@ -26,6 +28,12 @@ def zone_of(r: float) -> Zone:
     if r < CENTER_ZONE_R:
         return "center"
     return "corner" if r > CORNER_ZONE_R else "mid"
+
+
+def block_means(plane: NDArray[_Number], side: int) -> NDArray[_Number]:
+    """Means over squares of `side` pixels; what is left over at the end of an axis is left out."""
+    rows, cols = (length // side for length in plane.shape)
+    return plane[: rows * side, : cols * side].reshape(rows, side, cols, side).mean(axis=(1, 3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -200,8 +200,10 @@ def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:
     return header + struct.pack(">I", len(tags)) + table + body
 
 
-def matrix3(matrix: Matrix) -> Matrix3:
+def matrix3(matrix: Matrix | None) -> Matrix3 | None:
     """Return a matrix as nested tuples, which are hashable and travel as JSON."""
+    if matrix is None:
+        return None
     a, b, c = (tuple(float(v) for v in row) for row in matrix[:3, :3])
     return (a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])
 

@@ -110,10 +110,10 @@ def sniff(head: bytes) -> FileKind:
     `inspect` looks into the directories and tells them apart.
     """
     for at, magic, kind in _KINDS:
-        if head[at : at + len(magic)] == magic:
+        if head.startswith(magic, at):
             return kind
     for at, magic, name in _REFUSED:
-        if head[at : at + len(magic)] == magic:
+        if head.startswith(magic, at):
             raise UnsupportedFormatError(f"{name} files are not read; {_READABLE}")
     if not head:
         raise NotAnImageError(f"the file is empty; {_READABLE}")
@@ -265,6 +265,7 @@ _ICC: Final = 34675  # tag of the profile: ICC.1:2022, annex B.4
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 _LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
 _JPEG: Final = {6, 7}  # compression, of TIFF 6.0 and of its technical note 2
+_STRIPS: Final = (273, 324), (279, 325)  # tags of the places of strips and of tiles, and of their lengths
 _RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}  # Sony to Pentax: libtiff, tiff.h
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
@@ -298,12 +299,9 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         channels=photo.integer(277, 1),
         bits=photo.integer(258, 1),
         compression=photo.integer(259, 1),
-        directory=place if kind == "tiff" else 0,
         tiff=(reader,),
         xmp=_block(first, 700),
-        icc=_block(photo, _ICC) if kind == "tiff" else None,
     )
-    header = replace(header, icc_lost=kind == "tiff" and _ICC in photo and header.icc is None)
     check_size(header.width, header.height, len(buffer), limits)
     if kind == "tiff":
         if len(chain) >= MAX_DIRECTORIES:
@@ -312,7 +310,8 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
             )
         _check_colours(photo)  # first: chroma that is stored for several pixels looks cut off
         _check_strips(photo, len(buffer))
-        return header
+        icc = _block(photo, _ICC)
+        return replace(header, directory=place, icc=icc, icc_lost=_ICC in photo and icc is None)
     _check_mosaic(photo)
     if kind == "raw":
         return header
@@ -321,7 +320,7 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         header,
         opcodes_2=_block(photo, 51009) or b"",
         opcodes_3=_block(photo, 51022) or b"",
-        whole=_ends_inside(photo, len(buffer)),
+        whole=_strips(photo, len(buffer))[2],
         coarseness=_coarseness_of_tiles(buffer, photo) if lossy else 0.0,
         white=() if lossy else photo.integers(50717, 3),  # LibRaw stretches those itself
     )
@@ -362,33 +361,27 @@ def _check_mosaic(tags: Tags) -> None:
 
 def _coarseness_of_tiles(buffer: Buffer, tags: Tags) -> float:
     """Step of the quantised coefficients of a DNG by its first JPEG tile, which speaks for all; 0 unknown."""
-    at, size = (tags.integer(tile) or tags.integer(strip) for tile, strip in ((324, 273), (325, 279)))
+    at, size = (tags.integer(tile) or tags.integer(strip) for strip, tile in _STRIPS)
     with contextlib.suppress(NotAnImageError, TruncatedImageError):
         return _read_jpeg(buffer[at : at + min(size, MAX_BLOCK_BYTES)], Limits()).coarseness
     return 0.0
 
 
-def _ends_inside(tags: Tags, file_bytes: int) -> bool:
-    """Whether no strip or tile that a directory lists goes beyond the file's end."""
-    starts, lengths = _strips(tags)
-    return all(start + length <= file_bytes for start, length in zip(starts, lengths, strict=False))
-
-
-def _strips(tags: Tags) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Places and lengths of the strips, else the tiles, of a picture."""
-    places, lengths = (strip if strip in tags else tile for strip, tile in ((273, 324), (279, 325)))
-    return tags.integers(places), tags.integers(lengths)
+def _strips(tags: Tags, file_bytes: int) -> tuple[tuple[int, ...], tuple[int, ...], bool]:
+    """Places and lengths of the strips, else the tiles, of a picture; whether all lie in the file."""
+    starts, lengths = (tags.integers(strip if strip in tags else tile) for strip, tile in _STRIPS)
+    return starts, lengths, all(a + n <= file_bytes for a, n in zip(starts, lengths, strict=False))
 
 
 def _check_strips(tags: Tags, file_bytes: int) -> None:
     """Refuse a picture whose strips or tiles do not lie in the file."""
     width, height = tags.integer(256), tags.integer(257)
-    if width <= 0 or height <= 0 or not ({273, 324} & tags.keys() and {279, 325} & tags.keys()):
+    if width <= 0 or height <= 0 or not all(tags.keys() & either for either in _STRIPS):
         raise NotAnImageError(
             f"the TIFF gives no size ({width} x {height}), or no strips: it holds no picture"
         )
-    starts, lengths = _strips(tags)
-    if not starts or len(starts) != len(lengths) or not _ends_inside(tags, file_bytes):
+    starts, lengths, inside = _strips(tags, file_bytes)
+    if not starts or len(starts) != len(lengths) or not inside:
         raise TruncatedImageError(
             f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
             "damaged; copy it again from the camera or card"

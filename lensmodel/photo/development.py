@@ -250,5 +250,4 @@ def photo_from_array(
         clip=(clip,) * 3,
         info=PhotoInfo("tiff", width, height, metadata),
         encoding=Encoding(bit_depth=32, transfer="linear", metadata=metadata),
-        pipeline="array/1",
     )

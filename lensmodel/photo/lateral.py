@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, optimize
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
+from lensmodel.core.geometry import Frame, block_means
 from lensmodel.core.psf import correlation_peak, whole_peak
 from lensmodel.core.types import Channel, Plane, Planes
 
@@ -129,9 +129,9 @@ def _points(green: Plane, frame: Frame) -> Iterator[tuple[int, int]]:
     """Pixels with structure in both directions, spread over the cells of the frame."""
     # A corner is found as well on a coarser grid, at a fraction of the cost.
     bin_by = max(1, min(frame.height, frame.width) // 1000)
-    rows, cols = frame.height // bin_by, frame.width // bin_by
-    coarse = green[: rows * bin_by, : cols * bin_by].reshape(rows, bin_by, cols, bin_by).mean(axis=(1, 3))
-    coarse = np.sqrt(np.maximum(coarse, 0.0))  # even noise and contrast in shadows and lights
+    # the root evens noise and contrast in shadows and lights
+    coarse = np.sqrt(np.maximum(block_means(green, bin_by), 0.0))
+    rows, cols = coarse.shape
     slope_r = ndimage.gaussian_filter(coarse, 1.0, order=(1, 0))
     slope_c = ndimage.gaussian_filter(coarse, 1.0, order=(0, 1))
     rr, cc, rc = (

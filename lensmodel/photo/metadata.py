@@ -38,15 +38,11 @@ _NO_LENS: Final = re.compile(
 )
 """Focal lengths of zero, and the words in which cameras say that they know no lens."""
 
+# One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format
 _SENSOR_WIDTHS_MM: Final = (
-    (12.8, 13.4),
-    (17.2, 18.1),
-    (22.0, 24.1),
-    (27.5, 29.0),
-    (35.4, 36.4),
-    (43.0, 54.1),
+    *((12.8, 13.4), (17.2, 18.1), (22.0, 24.1)),
+    *((27.5, 29.0), (35.4, 36.4), (43.0, 54.1)),
 )
-"""One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
 
 _LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
 _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm

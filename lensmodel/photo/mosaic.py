@@ -14,6 +14,8 @@ from lensmodel.core.errors import RawDecodeError, TruncatedImageError, Unsupport
 from lensmodel.core.types import BayerPattern, Plane
 from lensmodel.photo.containers import require_known_mosaic
 from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_defects, suspects
+from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.values import PlaneNoise
 
 _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xtrans_interpolate)
 _GREEN: Final = 1  # the number of green among the colours of a mosaic
@@ -107,9 +109,7 @@ class Mosaic:
 
     def repair(self, others: Sequence[Suspects] = ()) -> int:
         """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
-        near = self._near()
-        places = defects_of(suspects(self.values, near), others)
-        return replace_defects(self.values, places, near)
+        return replace_defects(self.values, defects_of(self.suspects(), others), self._near())
 
     def _near(self) -> Neighbours:
         return Neighbours(self.colours, 2 if self.is_bayer else 6)
@@ -160,6 +160,14 @@ class Mosaic:
         first = int(np.argmax(inside >= _EDGE * pile))
         last = np.searchsorted(np.cumsum(counts[low:]), (1.0 - _STRAYS / 2.0) * (pile + above))
         return low + first, low + int(last)
+
+    def noise(self, white: int) -> PlaneNoise | None:
+        """Measure the noise of the sensor in each colour, `white` being 1; `None` for X-Trans."""
+        if not self.is_bayer:
+            return None
+        step = 1.0 / max(white - min(self.black), 1.0)
+        sites = [estimate_noise(site, step=step) for site in self.sites(white)]
+        return (sites[0], sites[1], sites[2]) if len(sites) == 3 else None
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""

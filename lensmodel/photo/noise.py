@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lensmodel.core.geometry import block_means
 from lensmodel.core.types import NoiseModel, Plane, Planes
 
 BLOCK: Final = 8  # side of the blocks in pixels: flat places of this size exist in almost any photo
@@ -80,13 +81,11 @@ def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
     neighbours. Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
     """
     fine = _sampled(np.asarray(plane, dtype=np.float32))
-    rows, cols = (extent // GRAIN for extent in fine.shape)
-    if rows == 0 or cols == 0:
+    if min(fine.shape) < GRAIN:
         return 1.0
-    blocks = fine[: rows * GRAIN, : cols * GRAIN].reshape(rows, GRAIN, cols, GRAIN)
     levels = np.quantile(fine[::GRAIN, ::GRAIN], _GRAIN_LEVELS)
     single = noise.variance(levels)
-    several = estimate_noise(blocks.mean(axis=(1, 3), dtype=np.float32), clip).variance(levels)
+    several = estimate_noise(block_means(fine, GRAIN), clip).variance(levels)
     usable = (single > 0.0) & (several > 0.0)
     return float(np.exp(np.log(GRAIN**2 * several[usable] / single[usable]).mean())) if usable.any() else 1.0
 

@@ -73,7 +73,6 @@ def develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
             icc=icc,
             metadata=info.metadata.without_serials(),
         ),
-        pipeline=f"{info.kind}/{transfer}/1",
         grain=grain_of(planes, (r, g, b), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, green),
         chroma_step=header.chroma_step[::-1] if info.turns else header.chroma_step,
@@ -201,12 +200,19 @@ def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int 
         picture = _lightness(path, header)
     except (LensModelError, *UNDECODABLE):
         return None
-    aspect = picture.shape[0] / picture.shape[1]
-    seen = _sized(_without_bars(np.asarray(thumbnail, dtype=np.float64), aspect), aspect)
-    turned = {k: _sized(np.rot90(picture, k), aspect) for k in ORIENTATION}
-    if min(float(each.std()) for each in (seen, *turned.values())) == 0.0:
+    aspect = picture.height / picture.width
+    # a thumbnail of 4 : 3 holds a wider picture between black bars
+    rows = min(thumbnail.height, round(thumbnail.width / aspect))
+    top = (thumbnail.height - rows) // 2
+    seen = thumbnail.crop((0, top, thumbnail.width, top + rows))
+    lying = [seen, *map(picture.transpose, (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_270))]
+    size = (math.ceil(_ROWS * aspect), _ROWS)
+    small = [np.array(each.resize(size, Image.Resampling.BOX), np.float64).ravel() for each in lying]
+    if min(float(each.std()) for each in small) == 0.0:
         return None
-    alike = {k: float(np.corrcoef(each.ravel(), seen.ravel())[0, 1]) for k, each in turned.items()}
+    alike = {
+        k: float(np.corrcoef(turned, small[0])[0, 1]) for k, turned in zip((1, 3), small[1:], strict=True)
+    }
     best, other = sorted(alike, key=alike.__getitem__, reverse=True)
     return best if alike[best] > _ALIKE and alike[best] - alike[other] > _CLEARER else None
 
@@ -220,13 +226,13 @@ def require_known_turn(info: PhotoInfo) -> None:
         )
 
 
-def _lightness(path: Path, header: Header) -> NDArray[np.float32]:
-    """The picture in grey, `(row, col)`; a JPEG is decoded small."""
+def _lightness(path: Path, header: Header) -> Image.Image:
+    """The picture in grey, of floating-point numbers; a JPEG is decoded small."""
     if header.kind == "jpeg":
         with opened_jpeg(JpegSegments(path.read_bytes())) as image:
             image.draft("L", (256, 256))
-            return np.asarray(image.convert("L"), dtype=np.float32)
-    return read_pixels(path, header)[0] @ _LUMA
+            return image.convert("L").convert("F")
+    return Image.fromarray(read_pixels(path, header)[0] @ _LUMA)
 
 
 def _thumbnail(header: Header) -> Image.Image | None:
@@ -236,18 +242,5 @@ def _thumbnail(header: Header) -> Image.Image | None:
         with suppress(*UNDECODABLE):
             image = opened_jpeg(JpegSegments(reader.buffer[begin : begin + size]))
             if image.width * image.height <= _MOST_PIXELS:
-                return image.convert("L")
+                return image.convert("L").convert("F")
     return None
-
-
-def _without_bars(thumbnail: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
-    """The middle of a thumbnail of 4 : 3 that holds a wider picture between black bars."""
-    rows = min(thumbnail.shape[0], round(thumbnail.shape[1] / aspect))
-    top = (thumbnail.shape[0] - rows) // 2
-    return thumbnail[top : top + rows]
-
-
-def _sized(picture: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
-    size = (math.ceil(_ROWS * aspect), _ROWS)
-    small = Image.fromarray(picture.astype(np.float32)).resize(size, Image.Resampling.BOX)
-    return np.asarray(small, dtype=np.float64)

@@ -101,20 +101,21 @@ def develop_raw(
     defects.
     """
     header, mosaic = said.header, Mosaic.of(raw)
-    white, clip = int(raw.white_level), (1.0, 1.0, 1.0)
+    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
+    kept, lost = [] if header.coarseness else opcodes.read(header.opcodes_2), list[opcodes.Opcode]()
+    white, clip, defects = int(raw.white_level), (1.0, 1.0, 1.0), 0
+    sensor_noise, cfa, stated = None, None, header.white
     if mosaic is not None:
         white, clip = mosaic.saturation()
-    sensor_noise = _sensor_noise(mosaic, white)
-    defects = 0 if mosaic is None else mosaic.repair(others)
+        sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
+        kept, lost = opcodes.demosaiced(kept, cfa)
+        defects = mosaic.repair(others)
     balance = _white_balance(raw, mosaic)
-    planes = _developed(raw, white, balance, header.white if mosaic is None else ())
+    planes = _developed(raw, white, balance, stated)
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
-    cfa = None if mosaic is None else mosaic.bayer_pattern()
-    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
-    steps = [] if header.coarseness else opcodes.read(header.opcodes_2)
-    kept, lost = (steps, []) if mosaic is None else opcodes.demosaiced(steps, cfa)
     to_srgb, xyz_to_camera = _colour(raw, balance)
+    many = " of its sensor is" if defects == 1 else "s of its sensor are"
     return LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
@@ -125,22 +126,19 @@ def develop_raw(
             bit_depth=max(1, white.bit_length()),
             metadata=info.metadata.without_serials(),
             white_balance=balance,
-            to_srgb=None if to_srgb is None else matrix3(to_srgb),
-            xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
+            to_srgb=matrix3(to_srgb),
+            xyz_to_camera=matrix3(xyz_to_camera),
             baseline_exposure=said.baseline_exposure(),
             opcodes_2=opcodes.written(kept),
             opcodes_3=opcodes.written(opcodes.read(header.opcodes_3)),
         ),
-        pipeline=f"raw/{'none' if mosaic is None else 'ahd' if mosaic.is_bayer else 'xtrans'}/1",
-        white_balance=balance,
         sensor_noise=sensor_noise,
         coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1]),
         cfa=cfa,
         grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
         remarks=(
             *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
-            *((f"{defects} defective pixels of its sensor are replaced",) if defects > 1 else ()),
-            *(("1 defective pixel of its sensor is replaced",) if defects == 1 else ()),
+            *((f"{defects} defective pixel{many} replaced",) if defects else ()),
         ),
     )
 
@@ -191,14 +189,6 @@ def _developed(
     if float(planes.max()) <= 0.0:
         raise RawDecodeError("the developed photo is black everywhere; the file holds no picture")
     return planes
-
-
-def _sensor_noise(mosaic: Mosaic | None, white: int) -> PlaneNoise | None:
-    if mosaic is None or not mosaic.is_bayer:
-        return None
-    step = 1.0 / max(white - min(mosaic.black), 1.0)
-    sites = [estimate_noise(site, step=step) for site in mosaic.sites(white)]
-    return (sites[0], sites[1], sites[2]) if len(sites) == 3 else None
 
 
 def _plane_noise(

@@ -181,11 +181,6 @@ class Encoding:
     opcodes_2: bytes = b""
     opcodes_3: bytes = b""
 
-    @property
-    def orientation(self) -> int:
-        """EXIF orientation, 1 to 8, by which the picture stands upright."""
-        return self.metadata.orientation
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearPhoto:
@@ -205,10 +200,6 @@ class LinearPhoto:
         What the file says.
     encoding : Encoding
         The way back to a file.
-    pipeline : str
-        How the planes were made; samples of different pipelines must not be mixed.
-    white_balance : tuple of float
-        Multipliers of the camera's own white balance, green 1.
     sensor_noise : tuple of NoiseModel or None
         Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
         planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
@@ -231,8 +222,6 @@ class LinearPhoto:
     clip: tuple[float, float, float]
     info: PhotoInfo
     encoding: Encoding
-    pipeline: str
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     sensor_noise: PlaneNoise | None = None
     coding_noise: NoiseModel | None = None
     cfa: BayerPattern | None = None

@@ -111,7 +111,7 @@ def write_image(
             }
             if description:
                 chunks[b"tEXt"] = b"Description\0" + description.encode("latin-1", "replace")
-            _write_png(file, upright(pixels, encoding.orientation), chunks)
+            _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
             sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point
             tags = {262: shorts(2), 339: shorts(*(sample_format,) * 3)}  # RGB

@@ -81,7 +81,6 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
         clip=(1.0, 1.0, 1.0),
         info=PhotoInfo("dng", 80, 60),
         encoding=Encoding(),
-        pipeline="test",
     )
     sampling.save_developed(shot, tmp_path / "developed")
     monkeypatch.setattr(tasks.lens_measure, "methods", Registry("way of measuring", {"quick": AtTwoPlaces}))

@@ -126,7 +126,6 @@ def photo_of(
         clip=(1.0, 1.0, 1.0),
         info=PhotoInfo("dng", width, height, metadata),
         encoding=Encoding(),
-        pipeline="test",
         sensor_noise=(NOISE,) * 3,
         cfa=((0, 1), (1, 2)),
     )

@@ -59,7 +59,7 @@ def test_a_real_crw_names_its_settings_and_is_balanced_for_its_light() -> None:
         datetime.fromisoformat("2018-01-01T13:03:32"),
     )
     # The scene is lit by bulbs; the camera's own multipliers for them, in its table, are 1.20 and 1.93.
-    assert photo.develop(path).white_balance == pytest.approx((1.2, 1.0, 1.93), rel=0.05)
+    assert photo.develop(path).encoding.white_balance == pytest.approx((1.2, 1.0, 1.93), rel=0.05)
 
 
 @dataclass(frozen=True)

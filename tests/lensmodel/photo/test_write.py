@@ -156,7 +156,7 @@ def test_a_linear_dng_is_read_back_by_libraw_with_its_numbers(tmp_path: Path) ->
     developed = photo.develop(tmp_path / "x.dng")
 
     agree(developed.planes, planes(), atol=1e-4)
-    assert developed.white_balance == pytest.approx((2.0, 1.0, 1.6), rel=1e-4)
+    assert developed.encoding.white_balance == pytest.approx((2.0, 1.0, 1.6), rel=1e-4)
     with rawpy.imread(str(tmp_path / "x.dng")) as raw:
         shown = raw.postprocess(use_camera_wb=True, no_auto_bright=True)
     assert shown.shape == (48, 64, 3)

@@ -174,7 +174,6 @@ def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
         clip=(1.0, 1.0, 1.0),
         info=photo.PhotoInfo("dng", 4, 4, photo.PhotoMetadata(aperture=2.8, focal_mm=35.0)),
         encoding=photo.Encoding(),
-        pipeline="test",
     )
 
     chosen = sampling.settings_of(developed, LensSettings(aperture=4.0, focus_m=2.0))
@@ -203,7 +202,6 @@ def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.
         clip=(1.0, 1.0, 1.0),
         info=photo.PhotoInfo("dng", 4, 4),
         encoding=photo.Encoding(),
-        pipeline="test",
     )
     kernel = np.zeros((5, 5))
     kernel[2, 2] = 1.0

@@ -32,7 +32,6 @@ from lensmodel.model import LensModel
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
-    Side,
     compare,
     exporters,
     filled_aspect,
@@ -180,8 +179,7 @@ def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
     """Write two reports beside each other."""
     from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
 
-    both = compare(*(Side(one_of.name, one_of.tested[0], one_of.facts) for one_of in (one, two)))
-    write_atomically(folder / COMPARED, to_pdf([comparison_page(both)]))
+    write_atomically(folder / COMPARED, to_pdf([comparison_page(compare(one, two))]))
 
 
 def export(

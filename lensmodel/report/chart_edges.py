@@ -67,31 +67,28 @@ def edge_pages(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> list[Figure]:
 
 def edges_csv(photo: LinearPhoto, edges: Sequence[FoundEdge]) -> str:
     """Write a row for each edge: where it is, along what it was measured, and its figures."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        [
-            "edge",
-            "row",
-            "col",
-            "r",
-            "phi",
-            "place",
-            "direction",
-            "normal_deg",
-            "mtf50_c_px",
-            "overshoot_percent",
-        ]
-    )
+    rows = []
     for number, edge in enumerate(edges, start=1):
-        place, response = photo.frame.position(*edge.middle), edge.response
-        where = (f"{value:.5g}" for value in (*edge.middle, place.r, place.phi))
-        figures = (
-            f"{math.degrees(response.normal):.2f}",
-            f"{min(response.mtf50, NYQUIST):.4f}",
-            f"{response.overshoot:.2f}",
+        (row, col), response = edge.middle, edge.response
+        place = photo.frame.position(row, col)
+        rows.append(
+            {
+                "edge": number,
+                "row": f"{row:.5g}",
+                "col": f"{col:.5g}",
+                "r": f"{place.r:.5g}",
+                "phi": f"{place.phi:.5g}",
+                "place": place_in_words(place),
+                "direction": _direction(photo, edge),
+                "normal_deg": f"{math.degrees(response.normal):.2f}",
+                "mtf50_c_px": f"{min(response.mtf50, NYQUIST):.4f}",
+                "overshoot_percent": f"{response.overshoot:.2f}",
+            }
         )
-        writer.writerow([number, *where, place_in_words(place), _direction(photo, edge), *figures])
+    out = io.StringIO()
+    writer = csv.DictWriter(out, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return out.getvalue()
 
 

@@ -22,15 +22,7 @@ from scipy.spatial import Delaunay, QhullError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import places_of
-from lensmodel.core.types import (
-    ZONES,
-    Channel,
-    FieldPosition,
-    LensSettings,
-    StepHook,
-    Zone,
-    ignore_step,
-)
+from lensmodel.core.types import ZONES, Channel, FieldPosition, LensSettings, StepHook, Zone, ignore_step
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.photo.lateral import LateralColour
@@ -69,20 +61,11 @@ _EVEN: Final = 0.95
 _FALLS: Final = ((0.8, "nearly as sharp"), (0.5, "clearly softer"), (0.0, "much softer"))
 # MTF50 in cycles/pixel of the centre, and what it is called (chosen: an ideal pixel behind an ideal lens
 # reaches .6, a demosaiced photo about .3)
-_LEVELS: Final = (
-    (0.35, "very sharp"),
-    (0.2, "sharp"),
-    (0.1, "a little soft"),
-    (0.0, "soft"),
-)
+_LEVELS: Final = ((0.35, "very sharp"), (0.2, "sharp"), (0.1, "a little soft"), (0.0, "soft"))
 _ASPECTS: Final = (1.0, 4 / 3, 1.5, 16 / 9)
 _FILLED: Final = 0.85  # of the way to a side that samples reach at least (chosen: patches end short of it)
 _ALIKE: Final = 0.05  # share by which zones may differ and still be called alike: less is not seen (chosen)
-_ZONE_WORDS: Final[dict[Zone, str]] = {
-    "center": "in the centre",
-    "mid": "halfway out",
-    "corner": "in the corners",
-}
+_ZONE_WORDS: Final = dict(zip(ZONES, ("in the centre", "halfway out", "in the corners"), strict=True))
 
 CAUTION: Final = "Caution"  # name among the details of a report of what to allow for in its figures
 _NAMED: Final = 8  # photos that a report names (chosen: two lines)
@@ -417,17 +400,15 @@ def lens_report(
 
 def _tested(model: LensModel, settings: LensSettings, rows: int, aspect: float, size: int) -> ApertureReport:
     cols = max(3, round(rows * aspect))
-    mapped = [(place_in_words(place), place) for place in grid(rows, cols, aspect)]
-    named = [("the centre", FieldPosition(0.0, 0.0))]
-    named += [(place_in_words(place), place) for place in corner_places(aspect)]
-    named += [(f"the {direction_in_words(place.phi)}", place) for place in side_places(aspect)]
-    asked = [*mapped, *named]
-    outside = _outside_chart(model, [place for _, place in asked])
+    mapped = grid(rows, cols, aspect)
+    count, named = len(mapped), (FieldPosition(0.0, 0.0), *corner_places(aspect))
+    places = (*mapped, *named, *side_places(aspect))
+    words = [place_in_words(place) for place in (*mapped, *named)]
+    words += [f"the {direction_in_words(place.phi)}" for place in side_places(aspect)]
     spots = [
-        _spot(model, words, place, settings, size, outside=bool(out))
-        for (words, place), out in zip(asked, outside, strict=True)
+        _spot(model, name, place, settings, size, outside=bool(outside))
+        for name, place, outside in zip(words, places, _outside_chart(model, places), strict=True)
     ]
-    count = len(mapped)
     return ApertureReport(
         settings=settings,
         aspect=aspect,
@@ -571,8 +552,8 @@ def _best(tested: Sequence[ApertureReport]) -> float | None:
     return max(means, key=lambda n: (means[n], -(n or 0.0))) if len(own) > 1 else None
 
 
-def _shared(values: object) -> float | None:
-    known = set(values)  # type: ignore[call-overload]
+def _shared(values: Iterable[float | None]) -> float | None:
+    known = set(values)
     return next(iter(known)) if len(known) == 1 else None
 
 
@@ -615,25 +596,16 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
-    """One of two that are compared: what to call it, what was found, and what that rests on."""
-
-    name: str
-    found: ApertureReport
-    facts: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two copies of a lens, or two apertures of one, side by side."""
+    """Two copies of a lens side by side, each at the first aperture of its report."""
 
-    first: Side
-    second: Side
+    first: LensReport
+    second: LensReport
 
     @property
     def changes(self) -> dict[Zone, float]:
         """Difference of MTF50 over the first, from the centre outwards."""
-        one, two = self.first.found.zones, self.second.found.zones
+        one, two = self.first.tested[0].zones, self.second.tested[0].zones
         return {zone: (two[zone] - one[zone]) / one[zone] for zone in ZONES}
 
     @property
@@ -649,8 +621,8 @@ def _change_in_words(zone: Zone, share: float) -> str:
     return f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'} {_ZONE_WORDS[zone]}"
 
 
-def compare(first: Side, second: Side) -> Comparison:
-    """Compare two copies at one aperture, or two apertures of one copy; those of one name are numbered."""
+def compare(first: LensReport, second: LensReport) -> Comparison:
+    """Compare two copies; those of one name are numbered."""
     if first.name == second.name:
         first, second = replace(first, name=f"{first.name} (1)"), replace(second, name=f"{second.name} (2)")
     return Comparison(first, second)

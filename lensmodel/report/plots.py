@@ -6,7 +6,7 @@ import base64
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import Channel, Zone
+from lensmodel.core.types import Channel
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
@@ -121,26 +121,6 @@ def overview(report: LensReport) -> list[Chart]:
     return [_chart(panel) for panel in _simple(report)]
 
 
-def comparison_charts(comparison: Comparison) -> list[Chart]:
-    """Contrast of both at the lowest and the highest frequency they share, and the map of the difference."""
-    return [_chart(panel) for panel in _compared(comparison)]
-
-
-def error_history(versions: Sequence[int], errors: Mapping[Zone, Sequence[float | None]]) -> Chart:
-    """Draw how the expected error of a lens fell from version to version, in each zone."""
-
-    def draw(ax: Axes) -> None:
-        for ink, (zone, shares) in zip(_INKS, errors.items(), strict=False):
-            percent = [math.nan if share is None else 100.0 * share for share in shares]
-            ax.plot(versions, percent, "o-", color=ink, label=zone)
-        ax.set(xlabel="version of the lens", ylabel="error, %")
-        ax.set_ylim(bottom=0.0)
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _legend(ax)
-
-    return _chart(("Error after each version", _on(draw)))
-
-
 def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     drawn = [_photographer(report)]
@@ -155,7 +135,7 @@ def pages(report: LensReport) -> list[Figure]:
 def comparison_page(comparison: Comparison) -> Figure:
     """Draw a comparison on one page."""
     sides = (comparison.first, comparison.second)
-    words = [comparison.verdict, *(f"{side.name}: {side.facts}" for side in sides if side.facts)]
+    words = [comparison.verdict, *(f"{side.name}: {side.facts}" for side in sides)]
     return _page(" and ".join(side.name for side in sides), "\n".join(words), _compared(comparison))
 
 
@@ -214,7 +194,7 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
 def _compared(comparison: Comparison) -> list[Panel]:
     """Two lenses beside each other, at the lowest and the highest frequency that both have."""
     first, second = comparison.first, comparison.second
-    one, two = first.found, second.found
+    one, two = first.tested[0], second.tested[0]
     shared = [(a, b) for a in one.curves for b in two.curves if a.name == b.name]
     pairs = shared or [(one.curves[0], two.curves[0])]
     panels: list[Panel] = [
@@ -334,10 +314,10 @@ def _error_map(ax: Axes, found: ApertureReport) -> None:
 
 def _difference(ax: Axes, comparison: Comparison) -> None:
     """MTF50 of the second less that of the first."""
-    one, two = ([spot.mean for spot in s.found.map] for s in (comparison.first, comparison.second))
+    one, two = ([spot.mean for spot in one.tested[0].map] for one in (comparison.first, comparison.second))
     values = np.subtract(two, one)
     top = max(0.02, float(np.abs(values).max()))
-    _map(ax, comparison.first.found, values, [f"{v:+.2f}" for v in values], _CHANGES, (-top, top))
+    _map(ax, comparison.first.tested[0], values, [f"{v:+.2f}" for v in values], _CHANGES, (-top, top))
     ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 

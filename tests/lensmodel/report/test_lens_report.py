@@ -27,7 +27,6 @@ from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import (
     LensReport,
     SensorGeometry,
-    Side,
     compare,
     filled_aspect,
     lens_report,
@@ -355,15 +354,15 @@ def test_maps_are_in_the_unit_that_was_asked_for(soft: LensReport) -> None:
 def test_two_copies_are_compared(soft: LensReport) -> None:
     sharp = report_of(corner=1.0, spread=0.02)
 
-    found = compare(Side("soft", soft.tested[0]), Side("sharp", sharp.tested[0], sharp.facts))
+    found = compare(soft, replace(sharp, name="Another lens"))
 
     assert found.changes["corner"] > 0.3
     assert "sharper in the corners" in found.verdict
-    same = compare(Side("one", soft.tested[0]), Side("one", soft.tested[0]))
-    assert same.verdict.startswith("Compared with one (1), one (2) is about the same in the centre")
+    same = compare(soft, soft)
+    assert same.verdict.startswith("Compared with A lens (1), A lens (2) is about the same in the centre")
     assert to_pdf([comparison_page(found)]).startswith(b"%PDF-")
     # a name as long as makers give leaves room for the chart: matplotlib would warn
-    long = compare(*[Side("Simulated Optics Simulated Astigmatism 85mm f/2", soft.tested[0])] * 2)
+    long = compare(*[replace(soft, name="Simulated Optics Simulated Astigmatism 85mm f/2")] * 2)
     assert to_pdf([comparison_page(long)]).startswith(b"%PDF-")
 
 

@@ -78,7 +78,7 @@ def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness
             mtf50=float(np.median(middle)),
             tangential_mtf50=float(np.median(along)) if along else math.nan,
             sagittal_mtf50=float(np.median(across)) if across else math.nan,
-            mtf_max=max(m.response.mtf_max for m in here),
+            mtf_max=max(float(m.response.mtf[m.response.frequencies <= 0.5].max()) for m in here),
             overshoot=max(m.response.overshoot for m in here),
         )
     return table

@@ -15,7 +15,6 @@ symmetry", ICCV 1987.
 
 from __future__ import annotations
 
-import logging
 import math
 import warnings
 from dataclasses import dataclass
@@ -27,10 +26,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import LensModelError
+from lensmodel.core.geometry import block_means
 from lensmodel.core.types import NoiseModel
 from lensmodel.quality.edge import Box, EdgeResponse, slanted_edge
-
-logger = logging.getLogger(__name__)
 
 SIDES: Final = (128, 96, 64)
 """Sides of a window in pixels: the largest that holds the edge and nothing else is taken."""
@@ -123,23 +121,21 @@ def _edge_on(
     for share in (0.0, -0.5, 0.5):
         row, col = segment.at(share)
         for side in SIDES:
-            box = (round(row) - side // 2, round(col) - side // 2, side, side)
-            if not _inside(box, plane.shape):
+            top, left = round(row) - side // 2, round(col) - side // 2
+            if min(top, left) < 0 or top + side > plane.shape[0] or left + side > plane.shape[1]:
                 continue
-            response = _edge_of(plane, box, noise, clip)
+            response = _edge_of(plane[top : top + side, left : left + side], noise, clip)
             if response is not None:
-                return FoundEdge(box, response, (segment.at(-1.0), segment.at(1.0)))
+                return FoundEdge((top, left, side, side), response, (segment.at(-1.0), segment.at(1.0)))
     return None
 
 
-def _measured(plane: NDArray[np.floating], box: Box) -> EdgeResponse | None:
-    row, col, height, width = box
+def _measured(crop: NDArray[np.float64]) -> EdgeResponse | None:
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a fit that is not determined is no edge either
-            response = slanted_edge(plane[row : row + height, col : col + width])
-    except (LensModelError, ArithmeticError, ValueError, IndexError) as error:
-        logger.debug("no edge in box %s: %s", box, error)
+            response = slanted_edge(crop)
+    except (LensModelError, ArithmeticError, ValueError, IndexError):
         return None
     known = (response.mtf50, response.overshoot, response.undershoot, response.step, response.normal)
     return response if all(map(math.isfinite, known)) else None
@@ -236,18 +232,12 @@ def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(sliding_window_view(blocks, (parts, parts)).sum(axis=(2, 3)), dtype=np.float32)
 
 
-def _inside(box: Box, shape: tuple[int, ...]) -> bool:
-    row, col, height, width = box
-    return row >= 0 and col >= 0 and row + height <= shape[0] and col + width <= shape[1]
-
-
-def _edge_of(plane: NDArray[np.floating], box: Box, noise: NoiseModel, clip: float) -> EdgeResponse | None:
+def _edge_of(window: NDArray[np.floating], noise: NoiseModel, clip: float) -> EdgeResponse | None:
     """Measure a window that holds one straight edge between two flat grounds, and nothing else."""
-    row, col, height, width = box
-    crop = np.asarray(plane[row : row + height, col : col + width], dtype=np.float64)
+    crop = np.asarray(window, dtype=np.float64)
     if not np.isfinite(crop).all() or crop.max() >= 0.98 * clip or np.mean(crop <= 0.0) > 0.01:
         return None
-    response = _measured(plane, box)
+    response = _measured(crop)
     if response is None or response.step < _LEAST_STEP:
         return None
     slant = math.radians(response.angle_deg)
@@ -256,7 +246,7 @@ def _edge_of(plane: NDArray[np.floating], box: Box, noise: NoiseModel, clip: flo
     step = response.step
     level = (response.esf - response.esf.min()) / step
     rising = response.esf_distance[(level > 0.15) & (level < 0.85)]  # between the overshoots
-    if rising.size and float(np.ptp(rising)) > min(height, width) / 3:
+    if rising.size and float(np.ptp(rising)) > min(crop.shape) / 3:
         return None
     third = response.esf.size // 6
     for ground in (response.esf[: 2 * third], response.esf[-2 * third :]):
@@ -268,7 +258,7 @@ def _edge_of(plane: NDArray[np.floating], box: Box, noise: NoiseModel, clip: flo
     explained = (
         float(left.var()) < (_UNEXPLAINED * step) ** 2 + 2.0 * scatter
         # noise averages out over 8 x 8 pixels, what a photo shows besides the edge does not
-        and float(_coarse(left).var()) < (_UNEXPLAINED / 2 * step) ** 2 + 4.0 * scatter / 64
+        and float(block_means(left, 8).var()) < (_UNEXPLAINED / 2 * step) ** 2 + 4.0 * scatter / 64
     )
     return response if explained else None
 
@@ -284,8 +274,3 @@ def _unexplained(crop: NDArray[np.float64], normal: float) -> NDArray[np.float64
     total = np.bincount(index.ravel(), weights=crop.ravel(), minlength=count.size)
     filled = count > 0
     return crop - np.interp(place, middle[filled] / count[filled], total[filled] / count[filled])
-
-
-def _coarse(plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    rows, cols = plane.shape[0] // 8, plane.shape[1] // 8
-    return plane[: rows * 8, : cols * 8].reshape(rows, 8, cols, 8).mean(axis=(1, 3))

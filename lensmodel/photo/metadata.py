@@ -140,11 +140,7 @@ class Said:
         )
 
     def is_centred(self, metadata: PhotoMetadata) -> bool:
-        """Tell whether a picture shows its whole sensor or the middle of it, not what a program cut.
-
-        Cameras leave widths of common sensors (DX, APS-C, 16:9), a square of the full height, or a digital
-        zoom.
-        """
+        """Tell whether a picture shows its whole sensor or the middle of it, as cameras crop, no program."""
         pitch, width, height = metadata.pixel_pitch_um, self.header.width, self.header.height
         if self.header.kind in {"raw", "dng"} or pitch is None:
             return True

@@ -186,10 +186,8 @@ _CLEARER: Final = 0.2  # by which the other turn correlates less, at least (chos
 def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int | None:
     """Quarter turns, counter-clockwise, from the stored pixels to the sensor's; None if nothing tells.
 
-    Cameras store pixels as the sensor lies, wider than high, and say by EXIF how to turn them. A program that
-    turns them and sets the orientation to 1 hides which side of the picture was the top of the sensor. Most
-    leave the camera's thumbnail as it was: of both quarter turns that one is right which lays the picture
-    over it.
+    Programs that turn them and set the orientation to 1 mostly leave the camera's thumbnail as it was, wider
+    than high: of both quarter turns that one is right which lays the picture over it.
     """
     if header.height <= header.width or metadata.orientation != 1 or metadata.camera_model is None:
         return 0

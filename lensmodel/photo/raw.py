@@ -96,9 +96,8 @@ def develop_raw(
 ) -> LinearPhoto:
     """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced.
 
-    No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
-    1.0 is the level at which the sensor saturates. `others` tell what other photos of the body show of its
-    defects.
+    No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates. `others`
+    tell what other photos of the body show of its defects.
     """
     header, mosaic = said.header, Mosaic.of(raw)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
@@ -148,10 +147,9 @@ def _developed(
 ) -> Planes:
     """Demosaic with white balance, then take the balance off again.
 
-    Demosaicing fills in the fine detail of red and blue from green, as if their contrasts were
-    equal. That is roughly so after white balance only: without it the red of a camera whose
-    red is 0.4 of its green gets detail that is 2.5 times too strong. `stated` is the white that a DNG without
-    a mosaic states: LibRaw takes the black of such files off their values, but not off their white.
+    Demosaicing fills in the fine detail of red and blue from green as if their contrasts were equal, as they
+    roughly are after white balance only. `stated` is the white that a DNG without a mosaic states: LibRaw
+    takes the black of such files off their values, but not off their white.
     """
     share = np.maximum(np.asarray(balance) / max(balance), _LEAST_SHARE)
     full, colours = share, min(raw.num_colors, 3)
@@ -265,11 +263,9 @@ def balance_of_rendition(
 ) -> tuple[float, float] | None:
     """Estimate the white balance from the JPEG that the camera put beside its RAW data.
 
-    Some cameras (the EOS D30 with automatic white balance) write no multipliers into their RAW files. What
-    they chose stands in that JPEG.
-
-    With J the JPEG in linear light, C the matrix from balanced camera colours to sRGB, and s the means of
-    the sensor over the same block, the multipliers of red and blue relative to green are::
+    Some cameras, as the EOS D30, write no multipliers into their RAW files. With J the JPEG in linear light,
+    C the matrix from balanced camera colours to sRGB, and s the means of the sensor over the same block, the
+    multipliers of red and blue relative to green are::
 
         m_k = median over near-neutral blocks of (C^-1 J)_k s_g / ((C^-1 J)_g s_k)
     """

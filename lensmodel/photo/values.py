@@ -236,11 +236,7 @@ class LinearPhoto:
 
     @property
     def coarse_noise(self) -> PlaneNoise:
-        """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens.
-
-        Flat places of a photo that was denoised show little noise from pixel to pixel and all of it in
-        coarser grain; what compression adds is seen only where there is detail.
-        """
+        """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens."""
         if self.sensor_noise is not None:
             return self._noise_of(self.sensor_noise, _DEMOSAICED)
         return self._noise_of(self.noise, [min(max(grain, 1.0), _COARSEST_POWER) for grain in self.grain])
@@ -249,10 +245,8 @@ class LinearPhoto:
     def correction_noise(self) -> PlaneNoise:
         """Noise of each plane as a correction must count it, as if it were white.
 
-        That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
-        a pixel than there is in a patch, and make errors of their own where there is detail. Where a
-        camera's denoising took the fine grain and left the coarse one, that counts, or a correction that
-        knew the fine one alone would take it for a scene and sharpen it.
+        That of the sensor where it is known; else processing left less of it in a pixel than there is in a
+        patch, and where a camera took the fine grain, the coarse one would be sharpened as if it were scene.
         """
         if self.sensor_noise is not None:
             return self.sensor_noise

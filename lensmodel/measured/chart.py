@@ -7,15 +7,15 @@ since printers make greys of dots, which a photo would show along the edges.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.PdfParser import PdfName, PdfParser
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.files import write_atomically
+from lensmodel.core.files import atomic
 from lensmodel.measured.page import require_paper
 
 ROWS: Final = 5
@@ -57,33 +57,19 @@ def print_chart(path: str | Path, *, paper: str = "a3") -> None:
     ]
     # turned counter-clockwise, the squares leave room below on the right
     words = f"BT /F 7 Tf {0.6 * width:.0f} 8 Td ({name}: print at full size, black, on matte paper) Tj ET"
-    write_atomically(path, _pdf("\n".join([*shapes, words]), (width, height), name))
-
-
-def _pdf(drawing: str, size: Sequence[float], title: str) -> bytes:
-    """Wrap a drawing of one page (ISO 32000-1:2008, section 7.5)."""
-    width, height = size
-    objects = [
-        "<< /Type /Catalog /Pages 2 0 R >>",
-        "<< /Type /Pages /Kids [ 3 0 R ] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [ 0 0 {width:.2f} {height:.2f} ] /Contents 4 0 R "
-        "/Resources << /Font << /F << /Type /Font /Subtype /Type1 /BaseFont /Helvetica >> >> >> >>",
-        f"<< /Length {len(drawing)} >>\nstream\n{drawing}\nendstream",
-        f"<< /Title ({title}) >>",
-    ]
-    return b"".join(_file(objects))
-
-
-def _file(objects: Sequence[str]) -> Iterator[bytes]:
-    yield (part := b"%PDF-1.4\n")
-    places, at = [], len(part)
-    for number, text in enumerate(objects, start=1):
-        places.append(at)
-        yield (part := f"{number} 0 obj\n{text}\nendobj\n".encode("ascii"))
-        at += len(part)
-    count = len(objects) + 1
-    rows = "".join(f"{place:010d} 00000 n \n" for place in places)
-    yield (
-        f"xref\n0 {count}\n0000000000 65535 f \n{rows}"
-        f"trailer\n<< /Size {count} /Root 1 0 R /Info {count - 1} 0 R >>\nstartxref\n{at}\n%%EOF\n"
-    ).encode("ascii")
+    letters = {"Type": PdfName("Font"), "Subtype": PdfName("Type1"), "BaseFont": PdfName("Helvetica")}
+    with atomic(path) as file:
+        pdf = PdfParser(f=file)
+        pdf.info[b"Title"] = name.encode()
+        page, drawing = (pdf.next_object_id(0) for _ in range(2))
+        pdf.pages.append(page)
+        pdf.write_header()
+        pdf.write_catalog()
+        pdf.write_page(
+            page,
+            MediaBox=[0, 0, round(width, 2), round(height, 2)],
+            Contents=drawing,
+            Resources={"Font": {"F": letters}},
+        )
+        pdf.write_obj(drawing, stream="\n".join([*shapes, words]).encode("ascii"))
+        pdf.write_xref_and_trailer()

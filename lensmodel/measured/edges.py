@@ -36,8 +36,8 @@ from scipy.sparse.csgraph import connected_components
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require
-from lensmodel.measured.solve import even_variance, measured_pixels, on_simplex
+from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.measured.solve import Window, on_simplex
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality.edge import OVERSAMPLING, EdgeResponse, crossing, edge_area, slanted_edge
 from lensmodel.quality.edge_finder import FoundEdge, find_edges
@@ -195,17 +195,16 @@ class _Corner:
         side = 2 * half + 1
         if min(row, col) < 0 or row + side > photo.frame.height or col + side > photo.frame.width:
             return None
-        good = measured_pixels(photo, channel, row, col, (side, side))
-        window = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side].astype(np.float64)
-        if good.sum() < side:
+        window = Window.of(photo, channel, (int(row), int(col)), side)
+        if (good := window.measured).sum() < side:
             return None
-        noise = math.sqrt(float(even_variance(photo, channel, window, good)[0, 0]))
+        noise = math.sqrt(float(window.variance[0, 0]))
         slope = np.column_stack([np.ones(int(good.sum())), np.argwhere(good) / half - 1.0])
         count = int(fft.next_fast_len(side + 2 * _SPARE_PX, real=True))
         seen = np.zeros((count, count), dtype=np.bool_)
         seen[_SPARE_PX : _SPARE_PX + side, _SPARE_PX : _SPARE_PX + side] = good
         first = corner - (row - _SPARE_PX, col - _SPARE_PX)
-        return cls(seen, window[good] / noise, slope, _drawn(first, [e.normal for e in edges], count))
+        return cls(seen, window.light[good] / noise, slope, _drawn(first, [e.normal for e in edges], count))
 
     def misfit(self, mixture: _Mixture) -> NDArray[np.float64]:
         """What the best levels, shifts of the edges and slope of the light leave, over the noise."""
@@ -317,10 +316,8 @@ def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge
     if not corners:
         raise NotEnoughEvidenceError("no corner of the square is seen")
     middle = np.mean([edge.middle for edge in square], axis=0)
-    pixel = float(middle[0]), float(middle[1])
     side = max(max(edge.box[2:]) for edge in square)
-    kernel = _fitted(lines, corners).kernel(size)
-    return MeasuredPsf(kernel, photo.frame.position(*pixel), channel, FLOOR, pixel, side)
+    return psf_at(photo, channel, _fitted(lines, corners).kernel(size), middle, side, FLOOR)
 
 
 def _fitted(lines: Sequence[_Line], corners: Sequence[_Corner]) -> _Mixture:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, as_kernel
@@ -144,8 +148,17 @@ def at_each(
     return psfs
 
 
-def sure(psf: MeasuredPsf, most: float) -> MeasuredPsf:
-    """Return a PSF; refuse one whose expected error is as large as that of a blind one."""
-    if psf.error >= most:
-        raise NotEnoughEvidenceError(f"the kernel is expected to be wrong by {psf.error:.0%}")
-    return psf
+def psf_at(
+    photo: LinearPhoto,
+    channel: Channel,
+    kernel: Kernel,
+    pixel: NDArray[np.floating],
+    side: int,
+    error: float,
+    most: float = math.inf,
+) -> MeasuredPsf:
+    """Say where a kernel was measured; refuse one whose expected error is as large as that of a blind one."""
+    if error >= most:
+        raise NotEnoughEvidenceError(f"the kernel is expected to be wrong by {error:.0%}")
+    row, col = map(float, pixel)
+    return MeasuredPsf(kernel, photo.frame.position(row, col), channel, error, (row, col), side)

@@ -31,10 +31,11 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import block_means
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
+from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
 from lensmodel.measured.registration import Warp, match, matched
-from lensmodel.measured.solve import measured_pixels, window_corners, window_psf, window_terms
+from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
@@ -101,14 +102,16 @@ class AperturePair:
     def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook = ignore_step) -> Warp:
         """Lay the closed photo under the open one."""
         plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
-        coarse = match(_shrunk(plane), _shrunk(reference))
-        if coarse.clarity < _CLEAR:
+        shift, clarity = match(
+            *(block_means(np.asarray(each, np.float64), _COARSE) for each in (plane, reference))
+        )
+        if clarity < _CLEAR:
             raise NotEnoughEvidenceError(
                 "the two photos do not show the same scene; take them from a tripod, one after the other"
             )
         start = np.eye(3)
-        start[:2, 2] = -_COARSE * np.array(coarse.shift)
-        warp = Warp.of_homography(start, opened.frame)
+        start[:2, 2] = -_COARSE * np.array(shift)
+        warp = Warp(start, opened.frame)
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
             pixels = (at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True))
@@ -134,9 +137,9 @@ class AperturePair:
         channel: Channel,
     ) -> MeasuredPsf:
         """PSF of one window."""
-        around = size // 2
+        around, window = size // 2, Window.of(opened, channel, corner, self.side)
         scene = _Scene(closed, warp, corner, self.side, around, channel)
-        light = _falloff(opened, scene, corner, self.side, around, channel)
+        light = _falloff(window, scene, around)
 
         def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
             cut = around - margin
@@ -144,13 +147,9 @@ class AperturePair:
             return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
 
         noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
-        kernel, solved, _ = window_psf(
-            opened, channel, corner, (self.side, self.side), latent, size, latent_noise=noise
-        )
-        error = float(np.hypot(solved.error, FLOOR))
-        pixel = corner[0] + (self.side - 1) / 2.0, corner[1] + (self.side - 1) / 2.0
-        position = opened.frame.position(*pixel)
-        return sure(MeasuredPsf(kernel, position, channel, error, pixel, self.side), _SURE)
+        kernel, solved, _ = window_psf(window, latent, size, latent_noise=noise)
+        middle, error = np.add(corner, (self.side - 1) / 2.0), float(np.hypot(solved.error, FLOOR))
+        return psf_at(opened, channel, kernel, middle, self.side, error, _SURE)
 
 
 def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
@@ -257,21 +256,17 @@ def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.fl
     return lambda f: np.exp(np.interp(np.log(np.maximum(f, 1e-3)), at, np.log(mean)))
 
 
-def _falloff(
-    opened: LinearPhoto, scene: _Scene, corner: tuple[int, int], side: int, around: int, channel: Channel
-) -> NDArray[np.float64]:
+def _falloff(window: Window, scene: _Scene, around: int) -> NDArray[np.float64]:
     """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
-    row, col = corner
+    side, good = len(window.light), window.measured
     basis = window_terms(side, around)
     # smoothed, the two differ by the light alone, however one of them is blurred
     smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
     inner = slice(around, around + side)
-    good = measured_pixels(opened, channel, row, col, (side, side))
-    plane = opened.planes[CHANNELS.index(channel), row : row + side, col : col + side]
     if good.sum() < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
     columns = (basis[inner, inner] * smooth[inner, inner, None])[good]
-    terms, *_ = np.linalg.lstsq(columns, np.asarray(plane[good], dtype=np.float64), rcond=None)
+    terms, *_ = np.linalg.lstsq(columns, window.light[good], rcond=None)
     light = basis @ terms
     level = float(light[inner, inner].mean())
     if not level > 0.0:
@@ -301,12 +296,6 @@ def _detailed(
                 k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
                 corners.append((int(rows[k]), int(cols[l])))
     return list(dict.fromkeys(corners))
-
-
-def _shrunk(plane: NDArray[np.floating]) -> NDArray[np.float64]:
-    rows, cols = (n // _COARSE for n in plane.shape)
-    part = np.asarray(plane[: rows * _COARSE, : cols * _COARSE], dtype=np.float64)
-    return part.reshape(rows, _COARSE, cols, _COARSE).mean(axis=(1, 3))
 
 
 def diffraction_otf(

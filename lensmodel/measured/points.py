@@ -26,8 +26,8 @@ from scipy import ndimage
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
-from lensmodel.measured.solve import NEAR_CLIP, Solved, measured_pixels, photo_noise, solve
+from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.measured.solve import NEAR_CLIP, Solved, Window, solve
 from lensmodel.photo import LinearPhoto
 
 # Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by over a
@@ -66,12 +66,11 @@ class Points:
         plane = np.asarray(photo.planes[1], dtype=np.float64)
         spots = find_lights(plane)
         lights = isolated_lights(spots, size)
-        usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
-        cells: dict[tuple[int, int], list[PointLight]] = {}
-        for light in usable:
-            row = int(light.row * self.down / photo.frame.height)
-            col = int(light.col * self.across / photo.frame.width)
-            cells.setdefault((row, col), []).append(light)
+        usable = [(row, col) for row, col, _ in lights if _is_usable(photo, row, col, size)]
+        cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        for row, col in usable:
+            cell = int(row * self.down / photo.frame.height), int(col * self.across / photo.frame.width)
+            cells.setdefault(cell, []).append((row, col))
         good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
         if not good and len(lights) < len(spots) / 2:
             raise NotEnoughEvidenceError(
@@ -95,23 +94,22 @@ class Points:
         )  # fmt: skip
 
 
-def _whole(light: PointLight, photo: LinearPhoto, size: int) -> bool:
-    half = size // 2 + 1
-    return half <= light.row < photo.frame.height - half and half <= light.col < photo.frame.width - half
-
-
-def _saturated(light: PointLight, photo: LinearPhoto) -> bool:
-    row, col = round(light.row), round(light.col)
-    near = np.asarray(photo.planes[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4])
-    return any(bool((plane >= NEAR_CLIP * clip).any()) for plane, clip in zip(near, photo.clip, strict=True))
+def _is_usable(photo: LinearPhoto, row: float, col: float, size: int) -> bool:
+    """Whether the window of a light lies in the frame, and nothing near it is saturated."""
+    half, (height, width) = size // 2 + 1, photo.planes.shape[1:]
+    if not (half <= row < height - half and half <= col < width - half):
+        return False
+    top, left = max(round(row) - 3, 0), max(round(col) - 3, 0)
+    near = photo.planes[:, top : round(row) + 4, left : round(col) + 4]
+    return all(bool((plane < NEAR_CLIP * clip).all()) for plane, clip in zip(near, photo.clip, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stamp:
-    """One light: its window without sky, which pixels count, where it is in it, and the sky's level."""
+    """One light: its window, that without sky, where it is in it, and the sky's level."""
 
+    window: Window
     observed: NDArray[np.float64]
-    measured: NDArray[np.bool_]
     place: tuple[float, float]
     flux: float
     pixel: tuple[float, float]
@@ -129,60 +127,52 @@ class _Stamp:
 
 
 def _cell_psf(
-    photo: LinearPhoto, channel: Channel, lights: Sequence[PointLight], size: int, sky: NDArray[np.float64]
+    photo: LinearPhoto,
+    channel: Channel,
+    lights: Sequence[tuple[float, float]],
+    size: int,
+    sky: NDArray[np.float64],
 ) -> MeasuredPsf:
     """Stack the lights of a cell, and solve for their kernel."""
     stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
-    stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.measured.sum() > size]
+    stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.window.measured.sum() > size]
     if len(stamps) < _FEWEST:
         raise NotEnoughEvidenceError("fewer lights than a cell must have are seen in this colour")
-    solved = _stacked(photo, channel, stamps, size, None)
+    solved = _stacked(stamps, size, None)
     for _ in range(_ROUNDS - 1):
         kernel = np.asarray(solved.kernel)
         stamps = [_refined(stamp, kernel) for stamp in stamps]
-        solved = _stacked(photo, channel, stamps, size, kernel)
+        solved = _stacked(stamps, size, kernel)
     error = float(np.hypot(solved.error, FLOOR))
     weights = np.array([stamp.flux for stamp in stamps])
     middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
-    pixel = float(middle[0]), float(middle[1])
-    position = photo.frame.position(*pixel)
-    return sure(MeasuredPsf(centred(solved.kernel), position, channel, error, pixel, size), _SURE)
+    return psf_at(photo, channel, centred(solved.kernel), middle, size, error, _SURE)
 
 
 def _stamp(
-    photo: LinearPhoto, channel: Channel, light: PointLight, size: int, sky: NDArray[np.float64]
+    photo: LinearPhoto, channel: Channel, pixel: tuple[float, float], size: int, sky: NDArray[np.float64]
 ) -> _Stamp:
-    half = size // 2
-    top, left = round(light.row) - half, round(light.col) - half
-    index = CHANNELS.index(channel)
-    box = slice(top, top + size), slice(left, left + size)
-    observed = np.asarray(photo.planes[index][box], dtype=np.float64) - sky[box]
-    measured = measured_pixels(photo, channel, top, left, (size, size))
-    flux = float(observed.sum())
-    place, level = (light.row - top, light.col - left), max(float(sky[box].mean()), 0.0)
-    return _Stamp(observed, measured, place, flux, (light.row, light.col), level)
+    top, left = round(pixel[0]) - size // 2, round(pixel[1]) - size // 2
+    window = Window.of(photo, channel, (top, left), size)
+    behind = sky[top : top + size, left : left + size]
+    observed, level = window.light - behind, max(float(behind.mean()), 0.0)
+    place = pixel[0] - top, pixel[1] - left
+    return _Stamp(window, observed, place, float(observed.sum()), pixel, level)
 
 
-def _stacked(
-    photo: LinearPhoto,
-    channel: Channel,
-    stamps: Sequence[_Stamp],
-    size: int,
-    kernel: NDArray[np.float64] | None,
-) -> Solved:
+def _stacked(stamps: Sequence[_Stamp], size: int, kernel: NDArray[np.float64] | None) -> Solved:
     """Solve for the kernel of all stamps at once: they stand below each other, apart by what pads them.
 
     `kernel` is that of the round before, by which the noise of each pixel is known.
     """
-    shot, read = photo_noise(photo, channel)
     latent = np.concatenate([stamp.latent(size) for stamp in stamps])
     observed = np.zeros((latent.shape[0] - size + 1, size))
     measured, variance = np.zeros(observed.shape, dtype=bool), np.ones(observed.shape)
     for number, stamp in enumerate(stamps):
         rows = slice(number * (2 * size - 1), number * (2 * size - 1) + size)
-        observed[rows], measured[rows] = stamp.observed, stamp.measured
+        observed[rows], measured[rows] = stamp.observed, stamp.window.measured
         light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
-        variance[rows] = shot * (stamp.sky + np.maximum(light, 0.0)) + read
+        variance[rows] = stamp.window.shot * (stamp.sky + np.maximum(light, 0.0)) + stamp.window.read
     return solve(observed, latent, measured, variance, size, even=True)
 
 
@@ -197,9 +187,9 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
         (moved(*d).blurred(kernel) - moved(*np.negative(d)).blurred(kernel)) / (2 * step)
         for d in ((step, 0.0), (0.0, step))
     )
-    predicted = stamp.blurred(kernel)
-    basis = np.stack([predicted, by_row, by_col, np.ones_like(predicted)], axis=-1)[stamp.measured]
-    terms, *_ = np.linalg.lstsq(basis, stamp.observed[stamp.measured], rcond=None)
+    predicted, good = stamp.blurred(kernel), stamp.window.measured
+    basis = np.stack([predicted, by_row, by_col, np.ones_like(predicted)], axis=-1)[good]
+    terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
     if not terms[0] > 0.0:
         return stamp
     row, col = np.clip(terms[1:3] / terms[0], -0.5, 0.5)
@@ -210,15 +200,6 @@ _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainte
 # Of its flux, that another light beside it may have: a fainter one is an error like those of noise (chosen)
 _NEIGHBOUR: Final = 0.1
 _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
-
-
-@dataclass(frozen=True, slots=True)
-class PointLight:
-    """A point of light: middle `(row, col)` in pixels, and its peak above the sky."""
-
-    row: float
-    col: float
-    peak: float
 
 
 def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
@@ -235,8 +216,8 @@ def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     return sky, max(scatter, 1e-7)
 
 
-def find_lights(plane: NDArray[np.floating]) -> list[PointLight]:
-    """Find points of light, brightest first.
+def find_lights(plane: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Find points of light, brightest first: (n, 3), row, col and the peak above the sky.
 
     They are the highest of their 5 x 5 neighbours after a little smoothing, at the centroid of 5 x 5 pixels.
     """
@@ -255,18 +236,15 @@ def find_lights(plane: NDArray[np.floating]) -> list[PointLight]:
         part = np.maximum(smooth[row - 2 : row + 3, col - 2 : col + 3], 0.0)
         down, across = (float(part.sum(axis=axis) @ t / part.sum()) for axis in (1, 0))
         peak = float(clean[row - 1 : row + 2, col - 1 : col + 2].max())
-        lights.append(PointLight(row + down, col + across, peak))
-    return sorted(lights, key=lambda light: -light.peak)
+        lights.append((row + down, col + across, peak))
+    return np.array(sorted(lights, key=lambda light: -light[2])).reshape(-1, 3)
 
 
-def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
-    """Lights that have no other beside them that would disturb, within `reach` pixels."""
-    if not lights:
-        return []
-    places = np.array([(light.row, light.col) for light in lights])
-    peaks = np.array([light.peak for light in lights])
-    return [
-        light
-        for light, place in zip(lights, places, strict=True)
-        if ((np.abs(places - place).max(axis=1) < reach) & (peaks > _NEIGHBOUR * light.peak)).sum() == 1
+def isolated_lights(lights: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """Lights of `find_lights` that have no other beside them that would disturb, within `reach` pixels."""
+    places, peaks = lights[:, :2], lights[:, 2]
+    alone = [
+        ((np.abs(places - place).max(axis=1) < reach) & (peaks > _NEIGHBOUR * peak)).sum() == 1
+        for place, peak in zip(places, peaks, strict=True)
     ]
+    return lights[np.array(alone, dtype=bool)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Final
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame
+from lensmodel.core.geometry import Frame, block_means
 from lensmodel.core.types import StepHook, ignore_step
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -39,13 +39,9 @@ class Warp:
     """Pixels of a photo to places of a reference."""
 
     homography: NDArray[np.float64]  # (3, 3), of (row, col, 1) to the reference's (row, col, 1)
-    bend: NDArray[np.float64]  # (DEGREE + 1, DEGREE + 1, 2), c_ij in reference units
     frame: Frame  # of the photo
-
-    @classmethod
-    def of_homography(cls, homography: NDArray[np.float64], frame: Frame) -> Warp:
-        """Return a warp without a bend."""
-        return cls(homography, np.zeros((DEGREE + 1, DEGREE + 1, 2)), frame)
+    # (DEGREE + 1, DEGREE + 1, 2), c_ij in reference units
+    bend: NDArray[np.float64] = field(default_factory=lambda: np.zeros((DEGREE + 1, DEGREE + 1, 2)))
 
     def __call__(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> Places:
         """Places of the reference that the pixels show."""
@@ -100,16 +96,8 @@ def homography_of(from_: NDArray[np.float64], to: NDArray[np.float64]) -> NDArra
     return np.asarray(h / h[2, 2])
 
 
-@dataclass(frozen=True, slots=True)
-class Match:
-    """Where one picture lies in another: the shift (row, col) and how far its peak stands out."""
-
-    shift: tuple[float, float]
-    clarity: float
-
-
-def match(photo: NDArray[np.floating], reference: NDArray[np.floating]) -> Match:
-    """Find how far the picture of `photo` lies beyond that of `reference`, in pixels.
+def match(photo: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[tuple[float, float], float]:
+    """Find how far (row, col) the picture of `photo` lies beyond that of `reference`, and how clearly.
 
     The cross power spectrum is divided by the reference's own amplitude, not by both: blur that
     differs between the two turns then no noise into signal. The peak is refined by a parabola.
@@ -126,7 +114,7 @@ def match(photo: NDArray[np.floating], reference: NDArray[np.floating]) -> Match
         before, top, after = (float(line[(at + step) % len(line)]) for step in (-1, 0, 1))
         bend = before - 2.0 * top + after
         shift.append(int(at) - len(line) // 2 + (0.5 * (before - after) / bend if bend < 0.0 else 0.0))
-    return Match((shift[0], shift[1]), float(surface.max()) / max(float(surface.std()), 1e-12))
+    return (shift[0], shift[1]), float(surface.max()) / max(float(surface.std()), 1e-12)
 
 
 # `render(warp, corner, shape)`: what a window of the photo shows, without blur
@@ -148,10 +136,11 @@ def matched(
     pixels, shifts = [], []
     for row, col in corners:
         on_step(0, 1)
-        matching = match(plane[row : row + side, col : col + side], render(warp, (row, col), (side, side)))
-        if matching.clarity >= least_clarity:
+        seen, shown = plane[row : row + side, col : col + side], render(warp, (row, col), (side, side))
+        shift, clarity = match(seen, shown)
+        if clarity >= least_clarity:
             pixels.append((row + (side - 1) / 2.0, col + (side - 1) / 2.0))
-            shifts.append(matching.shift)
+            shifts.append(shift)
     if len(pixels) < _FEWEST_MATCHES:
         raise NotEnoughEvidenceError(
             f"only {len(pixels)} of {len(corners)} windows of the photo match the reference; {_REMEDY}"
@@ -180,9 +169,7 @@ _PAPER_OVER_DISC: Final = 2.0
 def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:
     """Find the middles of the discs, in order around the page, clockwise."""
     factor = max(max(plane.shape) // _LOOKED_AT, 1)
-    rows, cols = (n // factor for n in plane.shape)
-    small = np.asarray(plane[: rows * factor, : cols * factor], dtype=np.float64)
-    small = small.reshape(rows, factor, cols, factor).mean(axis=(1, 3))
+    small = block_means(np.asarray(plane, dtype=np.float64), factor)
     scale = max(small.shape) / _LOOKED_AT
     dark = ndimage.gaussian_filter(small, 2.0 * scale) < _DARK * ndimage.gaussian_filter(small, 40.0 * scale)
     labels, _ = ndimage.label(dark)

@@ -380,36 +380,40 @@ NEAR_CLIP: Final = 0.97
 _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 
 
-def photo_noise(photo: LinearPhoto, channel: Channel) -> tuple[float, float]:
-    """Shot and read noise of the pixels that were measured."""
-    noise = (photo.sensor_noise or photo.noise)[CHANNELS.index(channel)]
-    return noise.shot, noise.read
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """A square window of one colour of a photo."""
 
+    corner: tuple[int, int]  # top left pixel, (row, col)
+    light: NDArray[np.float64]  # (side, side)
+    measured: NDArray[np.bool_]  # which pixels the sensor measured in this colour, unclipped
+    shot: float  # of the noise of these pixels
+    read: float
 
-def measured_pixels(
-    photo: LinearPhoto, channel: Channel, row: int, col: int, shape: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Which pixels of a window the sensor measured in a channel, unclipped."""
-    index = CHANNELS.index(channel)
-    window = photo.planes[index, row : row + shape[0], col : col + shape[1]]
-    good = np.asarray(window < NEAR_CLIP * photo.clip[index])
-    if photo.cfa is not None:
-        rows = (row + np.arange(shape[0])) % 2
-        cols = (col + np.arange(shape[1])) % 2
-        good &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
-    return good
+    @classmethod
+    def of(cls, photo: LinearPhoto, channel: Channel, corner: tuple[int, int], side: int) -> Window:
+        """Cut it out of a photo."""
+        (row, col), index = corner, CHANNELS.index(channel)
+        light = photo.planes[index, row : row + side, col : col + side].astype(np.float64)
+        measured = np.asarray(light < np.float32(NEAR_CLIP * photo.clip[index]))
+        if photo.cfa is not None:
+            rows, cols = (row + np.arange(side)) % 2, (col + np.arange(side)) % 2
+            measured &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
+        noise = (photo.sensor_noise or photo.noise)[index]
+        return cls(corner, light, measured, noise.shot, noise.read)
+
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """Variance of the noise, its mean for each pixel.
+
+        By its own level a pixel that is dark by chance would count more than others.
+        """
+        own = self.shot * np.maximum(self.light, 0.0) + self.read
+        return np.full(own.shape, float(own[self.measured].mean()) if self.measured.any() else 1.0)
 
 
 def window_psf(
-    photo: LinearPhoto,
-    channel: Channel,
-    corner: tuple[int, int],
-    shape: tuple[int, int],
-    latent: Latent,
-    size: int,
-    *,
-    measured: NDArray[np.bool_] | None = None,
-    latent_noise: NDArray[np.floating] | None = None,
+    window: Window, latent: Latent, size: int, *, latent_noise: NDArray[np.floating] | None = None
 ) -> tuple[Kernel, Solved, tuple[float, float]]:
     """Measure the PSF of one window.
 
@@ -417,52 +421,27 @@ def window_psf(
     is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
     would soften a peak as narrow as a pixel.
     """
-    row, col = corner
-    height, width = shape
-    index = CHANNELS.index(channel)
-    observed = np.asarray(photo.planes[index, row : row + height, col : col + width], dtype=np.float64)
-    if measured is None:
-        measured = measured_pixels(photo, channel, row, col, shape)
-    variance = even_variance(photo, channel, observed, measured)
-    _, shift = roughly(observed, measured, variance, latent, min(SMALL, size))
-    sharp = latent(shift, size // 2)
+    _, shift = roughly(window, latent, min(SMALL, size))
+    given = window.light, latent(shift, size // 2), window.measured, window.variance, size
     if latent_noise is None:
-        solved = solve(observed, sharp, measured, variance, size, varying=True)
+        solved = solve(*given, varying=True)
         return solved.kernel, solved, shift
     # less its noise a latent picture says too little of how the kernel changes, and of the best grid
-    solved = solve(observed, sharp, measured, variance, size, latent_noise)
+    solved = solve(*given, latent_noise)
     return centred(solved.kernel), solved, shift
 
 
-def roughly(
-    observed: NDArray[np.float64],
-    measured: NDArray[np.bool_],
-    variance: NDArray[np.float64],
-    latent: Latent,
-    size: int = SMALL,
-) -> tuple[Solved, tuple[float, float]]:
+def roughly(window: Window, latent: Latent, size: int = SMALL) -> tuple[Solved, tuple[float, float]]:
     """Find a small kernel of a window."""
     shift = (0.0, 0.0)
     for _ in range(2):
-        first = solve(observed, latent(shift, size // 2), measured, variance, size)
+        first = solve(window.light, latent(shift, size // 2), window.measured, window.variance, size)
         shift = shift[0] + first.shift[0], shift[1] + first.shift[1]
         if max(map(abs, shift)) > _MOST_SHIFT:
             raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
         if max(map(abs, first.shift)) < 0.02:
             break
     return first, shift
-
-
-def even_variance(
-    photo: LinearPhoto, channel: Channel, observed: NDArray[np.float64], measured: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Return the variance of a window's noise, its mean for each pixel, in the photo's units squared.
-
-    By its own level a pixel that is dark by chance would count more than others.
-    """
-    shot, read = photo_noise(photo, channel)
-    variance = shot * np.maximum(observed, 0.0) + read
-    return np.full(observed.shape, float(variance[measured].mean()) if measured.any() else 1.0)
 
 
 def window_corners(

@@ -32,14 +32,13 @@ from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require, sure
+from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
 from lensmodel.measured.page import DETAILS, MEAN, TargetPage
 from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
     SMALL,
     Solved,
-    even_variance,
-    measured_pixels,
+    Window,
     quadratic,
     roughly,
     window_corners,
@@ -129,18 +128,17 @@ class Target:
         self, photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], size: int, channel: Channel
     ) -> MeasuredPsf:
         """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
-        best = solve_window(photo, placed, channel, corner, self.side, size)
+        best = solve_window(Window.of(photo, channel, corner, self.side), placed, size)
         for part in _SMALLER:
             side = round(self.side * part)
             few = _pixels(photo, channel, side) < _LEAST_PIXELS * size * size
             if best.solved.misfit <= EXPLAINED or few:
                 break
             inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
-            best = solve_window(photo, placed, channel, inner, side, size)
-        error = float(np.hypot(best.solved.error, FLOOR))
-        pixel = best.corner[0] + (best.side - 1) / 2.0, best.corner[1] + (best.side - 1) / 2.0
-        position = photo.frame.position(*pixel)
-        return sure(MeasuredPsf(best.kernel, position, channel, error, pixel, best.side), _SURE)
+            best = solve_window(Window.of(photo, channel, inner, side), placed, size)
+        side, error = len(best.window.light), float(np.hypot(best.solved.error, FLOOR))
+        middle = np.add(best.window.corner, (side - 1) / 2.0)
+        return psf_at(photo, channel, best.kernel, middle, side, error, _SURE)
 
 
 def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
@@ -168,12 +166,12 @@ def _identified(
         page = TargetPage(detail)
         for turn in range(4):
             on_step(0, 1)
-            warp = Warp.of_homography(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
+            warp = Warp(homography_of(np.roll(marks, -turn, axis=0), page.marks), photo.frame)
             if not 0.3 < warp.scale(*middle) < 3.0:
                 break  # no turn makes noise visible that pixels do not resolve
             placed = PlacedPage(page, warp)
             shown = placed.window(row, col, (side, side))
-            clarity = match(plane[row : row + side, col : col + side], shown).clarity
+            _, clarity = match(plane[row : row + side, col : col + side], shown)
             if best is None or clarity > best[0]:
                 best = clarity, placed
     if best is None or best[0] < _CLEAR:
@@ -250,23 +248,16 @@ def _taper(length: int) -> NDArray[np.float32]:
 class SolvedWindow:
     """A solved window: kernel, the solution it came from, how far the page was moved, and its light."""
 
+    window: Window
     kernel: NDArray[np.float64]
     solved: Solved
     shift: tuple[float, float]
     light: NDArray[np.float64]  # (6,), terms of `window_terms`
-    corner: tuple[int, int]
-    side: int
 
 
-def solve_window(
-    photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int, size: int
-) -> SolvedWindow:
+def solve_window(window: Window, placed: PlacedPage, size: int) -> SolvedWindow:
     """Find the light and the kernel of size `size` of a window of the page."""
-    (row, col), shape = corner, (side, side)
-    measured = measured_pixels(photo, channel, row, col, shape)
-    plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
-    observed = np.asarray(plane, dtype=np.float64)
-    variance = even_variance(photo, channel, observed, measured)
+    (row, col), side = window.corner, len(window.light)
 
     def page(shift: tuple[float, float], margin: int) -> NDArray[np.float32]:
         outer = side + 2 * margin, side + 2 * margin
@@ -277,10 +268,10 @@ def solve_window(
 
     light = np.eye(6)[0]
     for _ in range(_LIGHT_ROUNDS):  # light and a small kernel, each found with the other
-        rough, shift = roughly(observed, measured, variance, lit)
-        light = _fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
-    kernel, solved, shift = window_psf(photo, channel, corner, shape, lit, size)
-    return SolvedWindow(kernel, solved, shift, light, corner, side)
+        rough, shift = roughly(window, lit)
+        light = _fitted_light(window, page(shift, SMALL // 2), rough.kernel)
+    kernel, solved, shift = window_psf(window, lit, size)
+    return SolvedWindow(window, kernel, solved, shift, light)
 
 
 def tones_of(
@@ -301,7 +292,7 @@ def tones_of(
     for corner in corners:
         on_step(0, 1)
         try:
-            information, bent = _tones_in(photo, placed, corner, side)
+            information, bent = _tones_in(Window.of(photo, "g", corner, side), placed)
         except NotEnoughEvidenceError:
             continue
         precision, weighted, windows = precision + information, weighted + information @ bent, windows + 1
@@ -311,14 +302,12 @@ def tones_of(
     return float(1.0 - 2.0 * q * MEAN + 3.0 * c * MEAN**2), float(q - 3.0 * c * MEAN), float(c)
 
 
-def _tones_in(
-    photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], side: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Precision (2, 2) and value (2,) of (q, c) in one window."""
-    half = SMALL // 2
-    window = solve_window(photo, placed, "g", corner, side, SMALL)
-    light, kernel = window_terms(side, half) @ window.light, window.kernel
-    start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
+    side, half, (row, col), good = len(window.light), SMALL // 2, window.corner, window.measured
+    solved = solve_window(window, placed, SMALL)
+    light, kernel = window_terms(side, half) @ solved.light, solved.kernel
+    start = row - half - solved.shift[0], col - half - solved.shift[1]
     shape = side + 2 * half, side + 2 * half
     columns = [
         scipy.signal.fftconvolve(
@@ -328,10 +317,7 @@ def _tones_in(
     ]
     t = np.linspace(-1.0, 1.0, side)
     columns += list(np.moveaxis(quadratic(t[:, None], t[None, :]), -1, 0))
-    good = measured_pixels(photo, "g", *corner, (side, side))
-    plane = photo.planes[1, corner[0] : corner[0] + side, corner[1] : corner[1] + side]
-    basis = np.stack([column[good] for column in columns], axis=-1)
-    observed = np.asarray(plane[good], dtype=np.float64)
+    basis, observed = np.stack([column[good] for column in columns], axis=-1), window.light[good]
     terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
     if not terms[0] > 0.0:
         raise NotEnoughEvidenceError("a window shows a negative of the page")
@@ -345,17 +331,15 @@ def _tones_in(
 _FEWEST: Final = 64  # pixels: five times as many as there are terms
 
 
-def _fitted_light(
-    observed: NDArray[np.floating], measured: NDArray[np.bool_], page: NDArray[np.floating], kernel: Kernel
-) -> NDArray[np.float64]:
+def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) -> NDArray[np.float64]:
     """Terms (6,) of a quadratic in row and column, whose mean over its square window is 1."""
-    side = observed.shape[0]
+    side, measured = len(window.light), window.measured
     if int(measured.sum()) < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
     outer, inner = window_terms(side, kernel.shape[0] // 2), window_terms(side, 0)
     lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
     basis = np.stack([*lit, *inner[measured].T], axis=-1)
-    terms, *_ = np.linalg.lstsq(basis, np.asarray(observed[measured], dtype=np.float64), rcond=None)
+    terms, *_ = np.linalg.lstsq(basis, window.light[measured], rcond=None)
     light = inner @ terms[:6]
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")

@@ -61,14 +61,8 @@ def psf_grid(
         )
     answers = [model.query(place, settings, size) for place in places]
     kernels = np.stack([answer.kernel for answer in answers]).astype(np.float32)
-    return PsfGrid(
-        kernels,
-        places,
-        rows,
-        cols,
-        settings,
-        predicted_error=tuple(float(answer.predicted_error) for answer in answers),
-    )
+    errors = tuple(float(answer.predicted_error) for answer in answers)
+    return PsfGrid(kernels, places, rows, cols, settings, errors)
 
 
 def to_fits(psfs: PsfGrid) -> bytes:

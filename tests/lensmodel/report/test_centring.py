@@ -12,8 +12,7 @@ import pytest
 from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.report import Asymmetry, centring
-from lensmodel.report.centring import EDGE_R, _verdict
+from lensmodel.report.centring import EDGE_R, Asymmetry, _verdict, centring
 from lensmodel.simulate import SimulatedLens, draw_lens
 
 SIZE = 21

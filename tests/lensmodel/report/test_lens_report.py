@@ -26,7 +26,6 @@ from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import (
     LensReport,
-    SensorGeometry,
     compare,
     filled_aspect,
     lens_report,
@@ -34,7 +33,7 @@ from lensmodel.report import (
 )
 from lensmodel.report.centring import Asymmetry, Centring
 from lensmodel.report.html import to_html
-from lensmodel.report.lens_report import UNKNOWN
+from lensmodel.report.lens_report import UNKNOWN, SensorGeometry
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
 from lensmodel.report.plots import EXPLAINED, charts, comparison_page, overview, pages, to_pdf, to_png
 from lensmodel.report.tables import place_table, to_csv

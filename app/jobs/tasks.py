@@ -36,6 +36,7 @@ from lensmodel import measured as lens_measure
 from lensmodel.blind import estimators
 from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
+from lensmodel.core.names import camera_name
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
 from lensmodel.model.profile import read_profile
@@ -282,7 +283,8 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         read = read_profile(file, "This file")
     samples = read.model.samples
     write_samples(folder, samples)
-    named = {"photos": read.photos, "lens": read.lens}
+    cameras = sorted({camera_name(camera.maker, camera.model) for camera in read.cameras} - {""})
+    named = {"photos": read.photos, "lens": read.lens, "cameras": cameras}
     return {"mode": read.model.settings.mode, "samples": len(samples), **named}
 
 

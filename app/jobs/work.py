@@ -10,7 +10,7 @@ import hashlib
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import contextmanager
 from contextvars import copy_context
@@ -345,16 +345,24 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     if read["mode"] != mode:
         text = f"the profile was learned with the model {read['mode']}, and the service uses {mode}"
         raise JobFailedError("conflict", f"{text}: use it on the command line")
+    own = {s.settings.focal_mm for s in samples if s.settings.focal_mm}
     if not file.given.get("any_lens"):
         focals = store.lenses.coverage_of([lens])[lens.id][1]
-        own = {s.settings.focal_mm for s in samples if s.settings.focal_mm}
         why = difference(Identity(lens.names, focals_mm=focals), Identity(read["lens"], focals_mm=own))
         if why is not None:
             text = f"the profile seems to be of another lens: {why}; {OTHER_LENS_REMEDY}"
             raise JobFailedError("other_lens", text)
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
-    if not store.photos.take_in(file, samples, names):
+    called = _called(read["lens"], read.get("cameras", []), own) if file.given.get("rename") else ""
+    if not store.photos.take_in(file, samples, names, called if called.isprintable() else ""):
         raise NotWantedError
+
+
+def _called(lens: Mapping[str, str], cameras: Sequence[str], focals_mm: Collection[float]) -> str:
+    """Return what a profile calls its lens, else its camera and focal length; empty if it says neither."""
+    name = lens.get("label") or full_name(lens.get("maker"), lens.get("model"))
+    taken_with = [*cameras, *(f"{focal:g} mm" for focal in focals_mm if len(focals_mm) == 1)]
+    return (name or ", ".join(taken_with if len(cameras) == 1 else []))[:200].strip()
 
 
 def inspect(context: JobContext, photo: PhotoRow) -> PhotoRow:

@@ -167,6 +167,7 @@ async def add_lens_profile(
     lens_id: str,
     call: CallDep,
     any_lens: Annotated[bool, Query(description="also where it seems to be of another lens")] = False,
+    rename: Annotated[bool, Query(description="call the lens as the profile does, if it does")] = False,
 ) -> JobOut:
     """Let what a profile knows join a lens; each of its photos counts as one, without its file.
 
@@ -176,7 +177,7 @@ async def add_lens_profile(
     await run_in_threadpool(call.lens, lens_id)
     async with receiving(call) as (public_id, key):
         uploaded = await upload.receive_profile(call.request, call.storage, key, lens_id)
-    said = {"any_lens": True} if any_lens else {}
+    said = {"any_lens": any_lens, "rename": rename}
     job = views.job_out((await run_in_threadpool(recorded, call, public_id, key, uploaded, **said)).photo)
     call.response.headers["Location"] = job.links["self"] or ""
     return job

@@ -462,9 +462,14 @@ class Photos(Works[PhotoRow]):
 
     @writes
     def take_in(
-        self, session: Session, file: PhotoRow, samples: Sequence[PsfSample], names: Mapping[str, str]
+        self,
+        session: Session,
+        file: PhotoRow,
+        samples: Sequence[PsfSample],
+        names: Mapping[str, str],
+        called: str = "",
     ) -> bool:
-        """Let the samples of a profile join its lens."""
+        """Let the samples of a profile join its lens, which is `called` so from now on."""
         # False where the lens is gone, or the reading of `file` was cancelled or begun anew. Each photo of
         # the profile becomes a counted photo without a file, which can be excluded or deleted as any other.
         # What was imported before is not imported again.
@@ -475,6 +480,7 @@ class Photos(Works[PhotoRow]):
         done: dict[str, Any] = {"epoch": file.epoch, "file_gone_at": now()}
         if not lens or not self.move(session, file.public_id, ANY_OWNER, ("inspecting",), "stored", **done):
             return False
+        lens.label = called or lens.label
         discard(session, file.blob_key)
         own = set(session.scalars(select(PhotoRow.public_id).where(PhotoRow.lens_id == lens.id)))
         of_profiles = (PhotoRow.owner_id == lens.owner_id, PhotoRow.kind == PROFILE)

@@ -140,9 +140,9 @@ export function setUpCharts() {
   });
 }
 
-async function putProfile(lens, file, any = false) {
+async function putProfile(lens, file, how) {
   const headers = { "Content-Type": "application/zip" };
-  const response = await ask(`${lens}/profile${any ? "?any_lens=true" : ""}`, { method: "PUT", body: file, headers });
+  const response = await ask(`${lens}/profile?${new URLSearchParams(how)}`, { method: "PUT", body: file, headers });
   for (;;) { // a worker reads it
     const { state, error } = await (await ask(`${response.headers.get("Location")}?wait=20`)).json();
     if (state === "succeeded") return true;
@@ -157,7 +157,7 @@ export function setUpLensActions() {
     if (!label && !file.size) throw new Error("Give a name, or choose a profile.");
     const { id } = await send("POST", "/v1/lenses", { label: label || file.name.replace(/\.lensprofile$/i, "") });
     try {
-      if (file.size) await putProfile(`/v1/lenses/${id}`, file);
+      if (file.size) await putProfile(`/v1/lenses/${id}`, file, { rename: !label });
     } catch (reason) {
       await send("DELETE", `/v1/lenses/${id}`).catch(() => {}); // it may be gone with its profile
       throw reason;
@@ -177,7 +177,7 @@ export function setUpLensActions() {
     },
     upload: (fields) => {
       if (!fields.get("profile").size) throw new Error("Choose a profile first.");
-      return withItsLens((any) => putProfile(lens, fields.get("profile"), any));
+      return withItsLens((any) => putProfile(lens, fields.get("profile"), { any_lens: any }));
     },
     delete: async () => {
       const question = "Delete this lens and everything learned from its photos? The photos themselves are kept.";

@@ -726,7 +726,7 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.get_by_label("A file that ends in").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/lenses/*")
-    expect(page.locator("h1")).to_have_text("one")
+    expect(page.locator("h1")).to_have_text("Test Optics Test 35mm f/1.8")  # as the profile says
     expect(page.locator(".facts").first).to_contain_text("1 photo")
 
 

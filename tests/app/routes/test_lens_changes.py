@@ -19,7 +19,7 @@ from app.store.owners import ANY_OWNER
 from lensmodel.core.codec import to_json
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.answer import PAPER
-from lensmodel.model.profile import read_profile, write_profile
+from lensmodel.model.profile import Camera, read_profile, write_profile
 from lensmodel.report import lens_report
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -143,6 +143,33 @@ def test_a_lens_is_made_of_a_profile_alone(client: TestClient, steps: Steps) -> 
     assert (made.status_code, made.json()["label"], made.json()["photos"]) == (201, "Given away", 0)
     assert put_profile(client, made.json()["id"], sent)[1]["photos"] == 1
     assert "Given away" in client.get("/").text
+
+
+D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8")
+
+
+@pytest.mark.usefixtures("reading")
+@pytest.mark.parametrize(
+    ("lens", "cameras", "name"),
+    [
+        ({"label": "Grandfather's", "maker": "Zeiss", "model": "Biotar"}, (D750,), "Grandfather's"),
+        ({"maker": "Canon", "model": "EF24mm f/1.4L"}, (D750,), "Canon EF24mm f/1.4L"),
+        ({"serial": "77"}, (D750, replace(D750, serial="2")), "Nikon D750, 24 mm"),
+        ({}, (D750, BODY), "file"),
+        ({}, (), "file"),
+        ({"label": "two\nlines"}, (), "file"),
+    ],
+)
+def test_a_lens_made_of_a_profile_is_called_as_that_says_else_as_its_file(
+    client: TestClient, steps: Steps, lens: dict[str, str], cameras: tuple[Camera, ...], name: str
+) -> None:
+    sent, of = io.BytesIO(), steps.lens_id(steps.counted(patches=4))
+    known = read_profile(io.BytesIO(client.get(f"/v1/lenses/{of}/profile").content), "The answer")
+    write_profile(sent, replace(known, lens=lens, cameras=cameras))
+    made, kept = (client.post("/v1/lenses", json={"label": "file"}).json()["id"] for _ in range(2))
+
+    assert put_profile(client, made, sent.getvalue(), rename=True)[1]["label"] == name
+    assert put_profile(client, kept, sent.getvalue())[1]["label"] == "file"
 
 
 def test_a_profile_is_not_read_beside_the_keys_of_the_database(

@@ -47,7 +47,7 @@ from lensmodel.quality.edge_finder import FoundEdge, find_edges
 FLOOR: Final = 0.15
 # Cycles/pixel: steps far below what a kernel resolves (chosen)
 _FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)
-_SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise, demosaiced
+_SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise
 # Edges closer in direction say nearly the same of a kernel; those of a square cross at 90 degrees (chosen)
 _CROSSING: Final = math.radians(45.0)
 # A corner of a square lies at most so much further out than the middles of windows that hold one edge and
@@ -165,10 +165,11 @@ class _Line:
     variance: float  # pixels^2, of the Gaussian whose contrast falls to a half where this does
 
     @classmethod
-    def of(cls, plane: NDArray[np.floating], edge: FoundEdge) -> _Line:
+    def of(cls, photo: LinearPhoto, channel: Channel, edge: FoundEdge) -> _Line:
         """Measure an edge; raises where that fails."""
-        row, col, height, width = edge.box
-        response = slanted_edge(plane[row : row + height, col : col + width])
+        row, col, side, _ = edge.box
+        window = Window.of(photo, channel, (row, col), side)
+        response = slanted_edge(window.light, window.measured)
         transfer, middle = _transfer(response)
         normal = _unit(response.normal)
         half = crossing(_FREQUENCIES, np.abs(transfer), 0.5)
@@ -306,8 +307,7 @@ class _Mixture:
 
 def _square_psf(photo: LinearPhoto, channel: Channel, square: Sequence[FoundEdge], size: int) -> MeasuredPsf:
     """Fit the kernel of one square in one colour."""
-    plane = photo.planes[CHANNELS.index(channel)]
-    lines = [_Line.of(plane, edge) for edge in square]
+    lines = [_Line.of(photo, channel, edge) for edge in square]
     half = math.ceil(_HALF_WIDTHS * math.sqrt(max(line.variance for line in lines)))
     half = min(max(half, _LEAST_HALF), _MOST_HALF)
     pairs = [(a, b) for a, b in combinations(lines, 2) if abs(a.normal @ b.normal) < math.cos(_CROSSING)]

@@ -105,11 +105,12 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
     return np.clip(area / (2.0 * a * b), 0.0, 1.0)
 
 
-def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
+def slanted_edge(plane: NDArray[np.floating], measured: NDArray[np.bool_] | None = None) -> EdgeResponse:
     """Measure one slanted edge, near-vertical or near-horizontal, either side bright.
 
     80 x 60 pixels or more are recommended; the edge should lean 2 to 10 degrees, or more as long as it stays
-    clear of 45.
+    clear of 45. Of a mosaic, `measured` says which pixels the profile is taken from: what demosaicing fills
+    in has the sharpness of the other colours.
     """
     crop = np.asarray(plane, dtype=np.float64)
     if crop.ndim != 2 or min(crop.shape) < _MIN_SIDE or not np.isfinite(crop).all():
@@ -124,7 +125,8 @@ def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     cos = 1.0 / math.hypot(1.0, slope)
     rows, cols = upright.shape
     x = np.arange(cols)[None, :] - (intercept + slope * np.arange(rows)[:, None])
-    distance, esf = _profile(x * cos * sign, upright)
+    used = np.ones(crop.shape, dtype=np.bool_) if measured is None else measured
+    distance, esf = _profile(x * cos * sign, upright, used.T if turned else used)
     middle = (cols - 1) / 2.0 - (intercept + slope * (rows - 1) / 2.0)
     frequencies, mtf = _spectrum(esf)
     # the normal in the upright crop: (1, -slope) in (column, row), towards the bright side
@@ -192,12 +194,12 @@ def _robust_line(y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[float,
 
 
 def _profile(
-    distance: NDArray[np.float64], crop: NDArray[np.float64]
+    distance: NDArray[np.float64], crop: NDArray[np.float64], used: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean level in bins of a quarter pixel of the distance, as far as both sides are well filled."""
     bins = np.floor(distance * OVERSAMPLING + 0.5).astype(np.intp)
     limit = round(_REACH * OVERSAMPLING)
-    inside = np.abs(bins) <= limit
+    inside = used & (np.abs(bins) <= limit)
     index = bins[inside] + limit
     count = np.bincount(index, minlength=2 * limit + 1)
     total = np.bincount(index, weights=crop[inside], minlength=2 * limit + 1)

@@ -463,6 +463,16 @@ def test_squares_give_the_kernel_along_and_between_their_edges(covariance: list[
     assert all(distance(one.kernel, np.rot90(kernel)).rel_l2 > 0.3 for one in found)
 
 
+def test_squares_give_red_its_own_kernel_where_demosaicing_gave_it_the_sharpness_of_green() -> None:
+    soft, sharp = gaussian(21, np.diag([3.0, 1.6])), gaussian(21, np.diag([0.6, 0.6]))
+    scene = board_scene(110.0, SHAPE, targets.Setup(distortion=0.0))[1]
+    photo = photo_of(scene, sharp)
+    photo.planes[0, ::2, ::2] = photo_of(scene, soft, 1).planes[0, ::2, ::2]
+    found = SlantedEdges().measure([photo], size=21, channels=("r",))
+    assert found
+    assert np.median([distance(one.kernel, soft).rel_l2 for one in found]) < 0.15
+
+
 # --- samples and models -------------------------------------------------------------------------
 
 

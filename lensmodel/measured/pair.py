@@ -112,11 +112,13 @@ class AperturePair:
         start = np.eye(3)
         start[:2, 2] = -_COARSE * np.array(shift)
         warp = Warp(start, opened.frame)
+        # once: for every window it takes minutes
+        spline = ndimage.spline_filter(reference, order=3, mode="mirror")
 
         def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
             pixels = (at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True))
             places = bent(*np.meshgrid(*pixels, indexing="ij"))
-            return np.asarray(ndimage.map_coordinates(reference, places, order=3, mode="mirror"))
+            return np.asarray(ndimage.map_coordinates(spline, places, prefilter=False, mode="mirror"))
 
         half = self.side // 2
         corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)

@@ -176,8 +176,8 @@ def _identified(
                 best = clarity, placed
     if best is None or best[0] < _CLEAR:
         raise NotEnoughEvidenceError(
-            "four discs are seen, but between them not the noise of a known target; print the page that "
-            "`lensmodel target` writes, stretched in no direction, and photograph it in focus"
+            "no known target is seen; photograph the page that `lensmodel target` writes, printed without "
+            "stretching it, whole and in focus"
         )
     return best[1]
 

@@ -34,6 +34,8 @@ from lensmodel.photo import LinearPhoto
 # dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals
 FLOOR: Final = 0.1
 _FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
+# Least share of bright spots that stand alone (chosen): 30 ordinary photos have less than .04, stars .4
+_ISOLATED: Final = 0.05
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
 # Of stacking at improved centres: each stack is sharper by those before it, and soon they rest (chosen)
 _ROUNDS: Final = 3
@@ -72,7 +74,7 @@ class Points:
             cell = int(row * self.down / photo.frame.height), int(col * self.across / photo.frame.width)
             cells.setdefault(cell, []).append((row, col))
         good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
-        if not good and len(lights) < len(spots) / 2:
+        if len(lights) < _ISOLATED * len(spots):
             raise NotEnoughEvidenceError(
                 f"of {len(spots)} bright spots only {len(lights)} are isolated: this is no photo of points "
                 "of light, or they are too close together; photograph stars or pinholes before a dark "

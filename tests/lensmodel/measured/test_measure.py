@@ -354,10 +354,11 @@ def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
         Points().measure([bright], size=21)
 
 
-def test_an_ordinary_photo_is_called_no_photo_of_points() -> None:
+@pytest.mark.parametrize("across", [7, 1])
+def test_an_ordinary_photo_is_called_no_photo_of_points(across: int) -> None:
     scene = simulate.demo_scene("city")[1, : SHAPE[0] + 56, : SHAPE[1] + 56]
     with pytest.raises(NotEnoughEvidenceError, match="no photo of points") as refusal:
-        Points().measure([photo_of(scene, lopsided())], size=21)
+        Points(across=across, down=1).measure([photo_of(scene, lopsided())], size=21)
     assert "expose" not in str(refusal.value)
 
 

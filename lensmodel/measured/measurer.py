@@ -33,8 +33,6 @@ class MeasuredPsf:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
-        if not self.error >= 0.0:
-            raise InvalidInputError(f"the expected error must not be negative, got {self.error}")
 
 
 class Measurer(Protocol):

@@ -46,7 +46,7 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.least_squares import fista, nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, centroid
 from lensmodel.core.types import CHANNELS, Channel, Kernel
@@ -125,16 +125,9 @@ def solve(
 
     Raises
     ------
-    InvalidInputError
-        If the shapes do not fit each other.
     NotEnoughEvidenceError
         If fewer pixels count than the kernel has, or no kernel explains them.
     """
-    if size < 3 or size % 2 == 0 or latent.shape != tuple(n + size - 1 for n in observed.shape):
-        raise InvalidInputError(
-            f"a latent picture of {latent.shape} does not fit a window of {observed.shape} and kernels of "
-            f"{size}"
-        )
     if int(measured.sum()) < size * size:
         raise NotEnoughEvidenceError(
             f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"

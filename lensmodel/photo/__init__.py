@@ -2,7 +2,6 @@
 
 from lensmodel.photo.containers import HEAD_BYTES, sniff
 from lensmodel.photo.development import develop, inspect
-from lensmodel.photo.metadata import read_metadata
 from lensmodel.photo.values import (
     ColorSpace,
     Encoding,
@@ -29,7 +28,6 @@ __all__ = [
     "PhotoMetadata",
     "develop",
     "inspect",
-    "read_metadata",
     "shown",
     "sniff",
     "upright",

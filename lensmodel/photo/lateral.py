@@ -76,8 +76,6 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
     part of the shifts is fitted by Huber-weighted least squares; the number of terms, none
     included, is chosen by the Bayesian information criterion.
     """
-    if planes.shape != (3, frame.height, frame.width):
-        raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")
     full = 0.98 * np.broadcast_to(clip, 3)
     radii: dict[int, list[float]] = {0: [], 2: []}
     shifts: dict[int, list[float]] = {0: [], 2: []}
@@ -105,8 +103,6 @@ def resample(planes: Planes, frame: Frame, lateral: LateralColour) -> Planes:
 
     Interpolation softens a little; `correct_planes(..., lateral=...)` needs none.
     """
-    if planes.shape != (3, frame.height, frame.width):
-        raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")
     out = np.array(planes, dtype=np.float32)
     row_c, col_c = frame.center
     cols = np.arange(frame.width) - col_c

@@ -18,13 +18,12 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 from typing import Final
 
 from lensmodel.photo.colour import BT709, ColourSpace, named_profile
-from lensmodel.photo.containers import Header, opened_header
+from lensmodel.photo.containers import Header
 from lensmodel.photo.tiff import EXIF, UNDEFINED, Tag, Tags, TiffReader, Value, rationals, shorts, text
-from lensmodel.photo.values import SOFTWARE, LensIdentity, Limits, PhotoMetadata, SerialSource
+from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
 from lensmodel.photo.xmp import read_xmp
 
 _PLACEHOLDER: Final = re.compile(
@@ -54,15 +53,6 @@ _APERTURES: Final = (0.5, 128.0)
 _FOCALS_MM: Final = (0.1, 20000.0)
 _SPEEDS: Final = (1.0, 1e7)
 _EXPOSURES_S: Final = (1e-7, 1e6)
-
-
-def read_metadata(path: Path | str) -> PhotoMetadata:
-    """Read what a photo file says, without decoding it.
-
-    Unreadable metadata are unknown metadata; only a file that is no photo raises.
-    """
-    with opened_header(Path(path), Limits()) as header:
-        return Said.of(header).metadata()
 
 
 def is_placeholder(serial: str) -> bool:
@@ -100,7 +90,7 @@ class Said:
         return cls(header, tags, read_xmp(header.xmp), note)
 
     def metadata(self) -> PhotoMetadata:
-        """Put it together; see `read_metadata`."""
+        """Put it together; what cannot be read is unknown."""
         tags, xmp, note = self.tags, self.xmp, self.note
         if self.header.camera is not None:
             return PhotoMetadata(self.header.camera[0], self.header.camera[1] or None)

@@ -166,12 +166,12 @@ class Mosaic:
         if not self.is_bayer:
             return None
         step = 1.0 / max(white - min(self.black), 1.0)
-        sites = [estimate_noise(site, step=step) for site in self.sites(white)]
-        return (sites[0], sites[1], sites[2]) if len(sites) == 3 else None
+        r, g, b = (estimate_noise(site, step=step) for site in self.sites(white))
+        return r, g, b
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""
-        if not self.is_bayer or min(self.colours.shape) < 2:
+        if not self.is_bayer:
             return None
         cell = self.colours[:2, :2]
         (a, b), (c, d) = np.where(cell == 3, 1, cell).tolist()

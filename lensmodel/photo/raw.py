@@ -274,11 +274,10 @@ def balance_of_rendition(
     planes = mosaic.sites(mosaic.white)
     rows, cols = (min(sides) for sides in zip(*(plane.shape for plane in planes), strict=True))
     sites = np.stack([plane[:rows, :cols] for plane in planes], axis=-1)  # of odd sides the rest is cut off
-    height, width, colours = sites.shape
+    height, width, _ = sites.shape
     rows, cols = (round(_BLOCKS * side / max(height, width)) for side in (height, width))
-    if colours != 3 or min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
-        return None
-    if abs(np.log(picture.width * height / (picture.height * width))) > _ASPECT:
+    stretched = abs(np.log(picture.width * height / (picture.height * width))) > _ASPECT
+    if stretched or min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
         return None
     pixels = np.asarray(picture.resize((4 * cols, 4 * rows), Image.Resampling.BOX), dtype=np.float64) / 255.0
     numbers, shown, sensor = (

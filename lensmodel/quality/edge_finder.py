@@ -142,16 +142,9 @@ def _measured(crop: NDArray[np.float64]) -> EdgeResponse | None:
 
 
 def _means(plane: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Means of 4 x 4 pixels; what is left over at the end of a side is left out."""
-    rows, cols = plane.shape[0] // _MEAN, plane.shape[1] // _MEAN
-    out = np.empty((rows, cols), dtype=np.float32)
-    for top in range(0, rows, _STRIP // _MEAN):
-        bottom = min(top + _STRIP // _MEAN, rows)
-        part = np.asarray(plane[top * _MEAN : bottom * _MEAN, : cols * _MEAN], dtype=np.float32)
-        lines = part.reshape(bottom - top, _MEAN, cols * _MEAN).sum(axis=1)
-        out[top:bottom] = sum(lines[:, shift::_MEAN] for shift in range(_MEAN))
-    out /= _MEAN * _MEAN
-    return out
+    """Means of 4 x 4 pixels."""
+    strips = (plane[top : top + _STRIP].astype(np.float32) for top in range(0, len(plane), _STRIP))
+    return np.concatenate([block_means(strip, _MEAN) for strip in strips])
 
 
 def _segments(means: NDArray[np.float32]) -> list[_Segment]:
@@ -226,9 +219,8 @@ def _segment(points: NDArray[np.float64]) -> _Segment:
 
 def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     """Sums over windows, a quarter of a window apart."""
-    rows, cols = (length // _STRIDE for length in plane.shape)
-    blocks = plane[: rows * _STRIDE, : cols * _STRIDE].reshape(rows, _STRIDE, cols, _STRIDE).sum(axis=(1, 3))
     parts = _WINDOW // _STRIDE
+    blocks = _STRIDE**2 * block_means(plane, _STRIDE)
     return np.asarray(sliding_window_view(blocks, (parts, parts)).sum(axis=(2, 3)), dtype=np.float32)
 
 

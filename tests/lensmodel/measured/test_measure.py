@@ -163,13 +163,6 @@ def test_noise_of_the_latent_picture_is_taken_off() -> None:
     assert 1.0 < without.light < 1.15  # what k >= 0 cuts off of the noise is too much by a tenth here
 
 
-@pytest.mark.parametrize("size", [14, 1])
-def test_the_solver_refuses_shapes_that_do_not_fit(size: int) -> None:
-    plane = np.ones((40, 40))
-    with pytest.raises(InvalidInputError):
-        solve(plane, np.ones((54, 54)), plane > 0, plane, size)
-
-
 def test_too_few_pixels_determine_no_kernel() -> None:
     plane = np.ones((20, 20))
     with pytest.raises(NotEnoughEvidenceError, match="400 pixels count, 441"):

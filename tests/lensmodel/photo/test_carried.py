@@ -39,7 +39,7 @@ def corrected(source: Path, target: Path, output: photo.OutputFormat, **options:
 @pytest.mark.parametrize("output", FORMATS)
 def test_copyright_and_artist_are_kept(output: photo.OutputFormat, tmp_path: Path) -> None:
     result = corrected(REPORTS / "copyright.jpg", tmp_path / "x", output)
-    said = photo.read_metadata(result)
+    said = photo.inspect(result).metadata
 
     assert (said.copyright, said.artist) == ("(c) 2024 Example", "Example")
     if not output.startswith("png"):
@@ -56,7 +56,7 @@ def test_rights_authors_rating_and_keywords_of_xmp_are_kept(
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "x.jpg", xmp=XMP.format(rating=rating).encode())
 
-    said = photo.read_metadata(corrected(tmp_path / "x.jpg", tmp_path / "out", output))
+    said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out", output)).metadata
 
     assert (said.copyright, said.artist, said.rating) == ("© Ä. Example", "Ä. Example, B. Example", rating)
     assert said.keywords == ("holiday", "café & sea")
@@ -69,7 +69,7 @@ def test_rating_author_and_keywords_as_windows_writes_them_are_kept(tmp_path: Pa
     block[0x9C9E] = "holiday;sea\0".encode("utf-16-le")
     Image.new("RGB", (64, 48), "grey").save(tmp_path / "x.jpg", exif=block)
 
-    said = photo.read_metadata(corrected(tmp_path / "x.jpg", tmp_path / "out.tif", "tiff16"))
+    said = photo.inspect(corrected(tmp_path / "x.jpg", tmp_path / "out.tif", "tiff16")).metadata
 
     assert (said.rating, said.artist, said.keywords) == (5, "Ä. Example", ("holiday", "sea"))
 

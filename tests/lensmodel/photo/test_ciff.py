@@ -18,12 +18,19 @@ from PIL import Image
 
 from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError
-from lensmodel.photo import read_metadata
+from lensmodel.photo.containers import opened_header
+from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.raw import balance_of_rendition, opened_raw
 
 DATA = Path(os.environ.get("LENSMODEL_TEST_DATA", "no data"))
 HEAP = b"II" + struct.pack("<I", 26) + b"HEAPCCDR" + bytes(12)
+
+
+def read_metadata(path: Path) -> photo.PhotoMetadata:
+    """What the header says, also of a file that holds no picture."""
+    with opened_header(path, photo.Limits()) as header:
+        return Said.of(header).metadata()
 
 
 @pytest.mark.parametrize(

@@ -132,8 +132,3 @@ def test_what_a_small_photo_cannot_tell_is_bounded(pixels: Callable, side: int) 
 
     assert np.abs(np.subtract(red, IDENTITY)).max() == pytest.approx(0.1)
     LateralColour(red, IDENTITY, frame.half_diagonal)
-
-
-def test_planes_of_another_size_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="planes must be"):
-        estimate_lateral(np.zeros((3, 8, 8), dtype=np.float32), FRAME)

@@ -226,7 +226,7 @@ def test_a_linear_dng_asks_for_the_baseline_exposure_of_the_dng_it_came_from(
 def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: photo.OutputFormat) -> None:
     path = tmp_path / "x"
     photo.write_image(path, planes(), PLAIN, format=output, description="corrected")
-    seen = photo.read_metadata(path)
+    seen = photo.inspect(path).metadata
 
     assert seen == METADATA.without_serials()
     assert not [word for word in (b"BODY1", b"LENS1", b"GPS") if word in path.read_bytes()]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+import lensmodel
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -26,6 +29,12 @@ def test_a_notebook_was_executed_from_top_to_bottom(path: Path) -> None:
     assert outputs
     assert not [output for output in outputs if output["output_type"] == "error"]
     assert path.stat().st_size < MAX_BYTES
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_shows_public_names_and_simulated_photos(path: Path) -> None:
+    text = "".join(line for cell in cells(path) for line in cell["source"])
+    assert set(re.findall(r"lensmodel\.(?!simulate)(\w+)", text)) <= {*lensmodel.__all__, "lensprofile"}
 
 
 @pytest.mark.slow

@@ -61,12 +61,12 @@ def _take_turns_at_compiling(folder: Path) -> None:
 
 @pytest.fixture(autouse=True)
 def _handlers_end_with_their_test() -> Iterator[None]:
-    """A command that runs in a test logs to what is standard error there, and closed afterwards."""
+    """A command that runs in a test logs to standard error, which is another one afterwards."""
     root = logging.getLogger()
     before, level = list(root.handlers), root.level
     yield
     for handler in root.handlers[:]:
-        if type(handler) is logging.StreamHandler and handler not in before:
+        if type(handler).__name__ in {"StreamHandler", "_Lines"} and handler not in before:
             root.removeHandler(handler)
     root.setLevel(level)
 

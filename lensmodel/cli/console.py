@@ -28,12 +28,13 @@ REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced i
 COMPILING = "lensmodel.correction.engine.first_use"  # Logs when loops are compiled, once on a machine
 
 
-class _Lines(logging.Formatter):
-    """What is told of a photo reads as all that a command tells."""
+class _Lines(logging.Handler):
+    """Tells records as a command tells all else, above its bar; those for people in the same words, too."""
 
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
-        return f"lensmodel: {record.getMessage()}" if record.name == REMARKS else super().format(record)
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print the line of a record."""
+        for_people = record.name in {REMARKS, COMPILING}
+        typer.echo(f"lensmodel: {record.getMessage()}" if for_people else self.format(record), err=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +58,12 @@ class Display:
     def configure(self) -> None:
         """Let the log lines of this process through to standard error."""
         level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(self.verbose, 2)]
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(_Lines("%(levelname)s %(name)s: %(message)s"))
-        logging.basicConfig(level=logging.ERROR if self.quiet else level, handlers=[handler], force=True)
+        logging.basicConfig(
+            level=logging.ERROR if self.quiet else level,
+            format="%(levelname)s %(name)s: %(message)s",
+            handlers=[_Lines()],
+            force=True,
+        )
         if not self.quiet and sys.stderr.isatty():  # so long a silence looks like a fault
             logging.getLogger(COMPILING).setLevel(logging.INFO)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 import subprocess
 import sys
@@ -14,7 +16,7 @@ from in_process import lensmodel
 from running import SMALL, write_photo
 
 from lensmodel.cli import console
-from lensmodel.cli.console import Pace, PacedProgress, aligned, clock, mtf50_words
+from lensmodel.cli.console import Display, Pace, PacedProgress, aligned, clock, mtf50_words
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, StepHook
@@ -149,6 +151,18 @@ def test_a_measurement_and_its_report_count_the_same_places(
     assert "3 places measured on stars.dng" in done.stdout
     assert "blur measured at 3 places" in report.stdout
     assert "outermost places that were measured" in report.stdout
+
+
+def test_that_loops_are_compiled_is_said_in_words_above_the_bar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    Display().configure()
+    with monkeypatch.context() as redirected:
+        redirected.setattr(sys, "stderr", io.StringIO())  # as `PacedProgress` does
+        logging.getLogger(console.COMPILING).info("compiling, about %d s", 30)
+        assert sys.stderr.getvalue() == "lensmodel: compiling, about 30 s\n"  # type: ignore[attr-defined]
+    assert capsys.readouterr().err == ""
 
 
 def test_quick_work_says_nothing() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from app.runtime.settings import Settings
-from lensmodel.workflow.sampling import KERNEL_PATCHES, PRESETS, Preset
+from lensmodel.blind.sampling import KERNEL_PATCHES, PRESETS, Config
 
 
-def configured_preset(settings: Settings) -> Preset:
+def configured_preset(settings: Settings) -> Config:
     """Return estimator, kernel size, patches, model mode and correction method."""
     preset = PRESETS["default"]
     own = settings.estimator != preset.estimator

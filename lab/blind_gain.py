@@ -29,14 +29,15 @@ from numpy.typing import NDArray
 
 from lab.cases import list_photos, photo_half
 from lab.images import gains, to_srgb
+from lab.kernels import distance
 from lab.traced import GridLens
-from lensmodel import photo
+from lensmodel import api, photo
+from lensmodel.blind import sampling
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample, distance
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
 from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, load_scene, photograph, write_photo
-from lensmodel.workflow import correcting, sampling
 
 CAMERA: Final = SimulatedCamera(height=900, width=1350, full_well_electrons=20_000.0)
 MARGIN: Final = 64  # pixels of a scene beyond the frame (chosen)
@@ -115,7 +116,7 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0
     for number, path in enumerate(shots):
         lens.shot(number, path)
     for path in shots:
-        config = sampling.Config(lens.settings)
+        config = sampling.configured("default", lens.settings)
         try:
             samples.append(sampling.samples_of_photo(path, config, workers=1, siblings=shots))
         except NotEnoughEvidenceError:
@@ -130,8 +131,8 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0
             yield [lens.name, str(count), "its photos show too little"]
             continue
         model = LensModel.fit(known)
-        lateral = correcting.lateral_of(developed)
-        made = correcting.correct_photo(developed, model, lens.settings, lateral=lateral)
+        lateral = api.lateral_of(developed)
+        made = api.correct_photo(developed, model, lens.settings, lateral=lateral)
         found = gains(*map(lens.shown, (clean.planes, made.planes, truth)))
         assert found is not None, "a frame of the camera holds many blocks"
         expected = {zone: report.expected_gain_db for zone, report in made.zones.items()}

@@ -19,9 +19,10 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import cKDTree
 
 from lab import page
+from lab.kernels import distance
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfSample, as_kernel, centred, distance
+from lensmodel.core.psf import PsfSample, as_kernel, centred
 from lensmodel.core.types import (
     ZONES,
     FieldPosition,

@@ -16,12 +16,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from lensmodel.core.psf import delta, distance, rms_width
+from lab.kernels import distance
+from lensmodel.blind import sampling
+from lensmodel.core.psf import delta, rms_width
 from lensmodel.core.types import LensSettings
 from lensmodel.measured.points import Points
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
-from lensmodel.workflow import sampling
 
 SIZE: Final = 31
 _WIDEST: Final = 2.5  # times the median width (chosen): wider cells hold no single stars
@@ -42,7 +43,7 @@ class Judged(NamedTuple):
 def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
     """Measure the stars of a photo, learn its lens from it blindly, and compare cell by cell."""
     stars = Points().measure([develop(path)], size=SIZE, channels=("g",))
-    samples = sampling.samples_of_photo(path, sampling.Config(settings), workers=1)
+    samples = sampling.samples_of_photo(path, sampling.configured("default", settings), workers=1)
     model, green = LensModel.fit(samples), settings.with_channel("g")
     widths = [rms_width(star.kernel) for star in stars]
     for star, width in zip(stars, widths, strict=True):

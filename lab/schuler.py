@@ -44,6 +44,7 @@ from lab.blind.steps.gradients import (
 )
 from lab.blind.steps.pyramid import Image, View
 from lab.model_benchmark import pixel_to_local
+from lensmodel.blind import sampling
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import (
@@ -57,7 +58,6 @@ from lensmodel.core.types import (
 )
 from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import draw_lens
-from lensmodel.workflow import sampling
 
 STORED: Final = Path(__file__).parent / "data" / "rival_basis.npz"
 

@@ -11,8 +11,8 @@ The public names are those of `__all__`; each is imported when it is first used,
 package costs nothing. docs/library.md shows them at work.
 
 `patches` chooses patches of photos, `blind` and `measured` make samples of a PSF of them, `model` makes these
-a function of place and settings, both by the network of `neural`, and `correction` applies that; `workflow`
-joins them, and `api` has its verbs. Photos come in and go out through `photo`; `quality` judges, `report`
+a function of place and settings, both by the network of `neural`, and `correction` applies that; `api` and
+`calibration` join them in a `lens`. Photos come in and go out through `photo`; `quality` judges, `report`
 describes, `simulate` makes photos whose truth is known, `core` has what all share, and `cli` is the command.
 CONTRIBUTING.md says where a method is added.
 """
@@ -25,17 +25,17 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from lensmodel.api import calibrate, correct
     from lensmodel.blind import PsfEstimate, PsfEstimator, estimators
+    from lensmodel.blind.sampling import CalibrationEvent
     from lensmodel.core.errors import CancelledError, LensModelError
     from lensmodel.core.geometry import field_grid
     from lensmodel.core.psf import PsfSample
     from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
     from lensmodel.correction import Bounds, Corrected, Deconvolver, Restored, Sensor, deconvolvers
+    from lensmodel.lens import Lens
     from lensmodel.model import ModelSettings, PsfAnswer
     from lensmodel.patches import Selector, selectors
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.development import photo_from_array
-    from lensmodel.workflow.lens import Lens
-    from lensmodel.workflow.sampling import CalibrationEvent
 
 __all__ = [
     "Bounds",
@@ -74,9 +74,9 @@ _HOMES: Final = {
     "lensmodel.patches": ("Selector", "selectors"),
     "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
     "lensmodel.core.errors": ("CancelledError", "LensModelError"),
-    "lensmodel.workflow.lens": ("Lens",),
+    "lensmodel.lens": ("Lens",),
     "lensmodel.photo": ("LinearPhoto", "develop"),
-    "lensmodel.workflow.sampling": ("CalibrationEvent",),
+    "lensmodel.blind.sampling": ("CalibrationEvent",),
     "lensmodel.core.geometry": ("field_grid",),
     "lensmodel.core.psf": ("PsfSample",),
     "lensmodel.model": ("ModelSettings", "PsfAnswer"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -73,9 +72,8 @@ def backup(
     from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
 
     shown = Display.of(context, quiet=quiet)
-    with opened(data, existing=True) as (_, store, storage), shown.progress() as bars:
-        update = partial(bars.update, bars.add_task("blobs", total=None))
+    with opened(data, existing=True) as (_, store, storage), shown.progress("blobs") as bar:
         result = copies.backup(
-            store.database, storage, folder, lambda done, total: update(completed=done, total=total)
+            store.database, storage, folder, lambda done, total: bar.show(completed=done, total=total)
         )
     shown.result(f"{folder}: {result['photos']} photos and {result['blobs']} blobs of {result['made_at']}")

@@ -31,9 +31,9 @@ from app.blobs.tiles import write_tiles
 from app.jobs.answers import CLEANED, LAYER_FILES, REPORT, SHOWN, SIDES, SUFFIX, THUMBNAIL
 from app.jobs.sample_files import read_samples, write_samples
 from app.sandbox.child import ProgressHook, Task
-from lensmodel import correction, photo
+from lensmodel import api, correction, photo
 from lensmodel import measured as lens_measure
-from lensmodel.blind import estimators
+from lensmodel.blind import estimators, sampling
 from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
 from lensmodel.core.names import camera_name
@@ -46,7 +46,6 @@ from lensmodel.patches.windows import Rejection
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.location import find_location
 from lensmodel.report import lens_report
-from lensmodel.workflow import correcting, sampling
 
 log = logging.getLogger(__name__)
 
@@ -144,8 +143,8 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
     # The samples go to the folder
     developed = sampling.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
-    numbers = {(patch.row, patch.col): idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
-    results = sampling.estimate_cell(
+    numbers = {patch.position: idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
+    samples = sampling.estimate_cell(
         developed,
         group,
         settings=_settings(arguments["settings"]),
@@ -154,8 +153,8 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
         size=arguments["size"],
         on_step=progress,
     )
-    write_samples(folder, [result.sample for result in results])
-    return [numbers[result.patch.row, result.patch.col] for result in results]
+    write_samples(folder, samples)
+    return [numbers[sample.position] for sample in samples]
 
 
 def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -171,7 +170,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     settings = _settings(arguments["settings"])
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
-    corrected = correcting.correct_photo(
+    corrected = api.correct_photo(
         developed,
         model,
         settings,
@@ -182,7 +181,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         layers=extremes if params.get("layers") else (),
         lateral=lateral,
         roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
-        least_gain_db=correcting.SEEN_DB if developed.lossy and roi is None else None,
+        least_gain_db=api.SEEN_DB if developed.lossy and roi is None else None,
         workers=arguments["workers"],
         on_step=progress,
     )
@@ -339,7 +338,7 @@ def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
 
 def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
     try:
-        return correcting.lateral_of(developed)
+        return api.lateral_of(developed)
     except LensModelError as error:
         log.info("no lateral colour: %s", error)
         return None

@@ -19,13 +19,13 @@ from scipy import ndimage
 
 from app.sandbox import confine
 from app.sandbox.child import give_way
-from lensmodel import photo
+from lensmodel import api, photo
+from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow import correcting, sampling
 
 SIDE: Final = 384  # of the made-up photo in pixels (chosen): patches fit in, and it takes seconds
 METHODS: Final = ("fast", "standard", "paper")
@@ -49,16 +49,15 @@ def warm(folder: Path) -> None:
 
 def _learn_and_correct(developed: photo.LinearPhoto) -> None:
     selection = sampling.find_patches(developed, count=8)
-    results = sampling.estimate_cell(developed, selection.patches, settings=SETTINGS, photo_id="warm")
-    estimated = [result.sample for result in results]
+    estimated = sampling.estimate_cell(developed, selection.patches, settings=SETTINGS, photo_id="warm")
     measured = [replace(sample, encoded=None) for sample in estimated]  # kernels alone
-    lateral = correcting.lateral_of(developed)
+    lateral = api.lateral_of(developed)
     for samples in (estimated, measured):
         model = LensModel.fit(samples)
         model.expected_errors()
         for method in METHODS:
             part = (0, 0, SIDE, SIDE)
-            correcting.correct_photo(developed, model, SETTINGS, method=method, lateral=lateral, roi=part)
+            api.correct_photo(developed, model, SETTINGS, method=method, lateral=lateral, roi=part)
 
 
 if __name__ == "__main__":

@@ -39,15 +39,15 @@ from app.store.lenses import LensState, report_key
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, CorrectionRow, LensRow, PatchRow, PhotoRow
+from lensmodel.blind import sampling
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, NoUsablePatchesError
 from lensmodel.core.names import full_name, name_key, serial_key
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
 from lensmodel.correction import Bounds
+from lensmodel.model.identity import Identity, difference
 from lensmodel.patches import Patch
-from lensmodel.workflow import sampling
-from lensmodel.workflow.identity import Identity, difference
 
 log = logging.getLogger(__name__)
 
@@ -341,7 +341,7 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
     lens = store.lenses.get(file.given["lens_id"], ANY_OWNER)
     if lens is None:
         raise JobFailedError("unknown_lens", "the lens was deleted meanwhile: send the profile to another")
-    mode = configured_preset(context.settings).mode
+    mode = configured_preset(context.settings).model
     if read["mode"] != mode:
         text = f"the profile was learned with the model {read['mode']}, and the service uses {mode}"
         raise JobFailedError("conflict", f"{text}: use it on the command line")

@@ -29,6 +29,7 @@ from app.routes.corrections import list_corrections
 from app.routes.lenses import get_lens, list_calibrations, stored_report
 from app.schemas import Aperture, PhotoOut, blank_is_none
 from app.store.tables import PHOTO_WORKED_ON, CorrectionRow, LensRow
+from lensmodel.api import SEEN_DB
 from lensmodel.cli.console import gain_words
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
@@ -36,7 +37,6 @@ from lensmodel.correction.audit import HELD
 from lensmodel.photo.values import ENDINGS
 from lensmodel.report import LensReport, Unit, caution, sharpness
 from lensmodel.report.tables import place_table
-from lensmodel.workflow.correcting import SEEN_DB
 
 STATIC: Final = Path(__file__).parent / "static"
 HEADERS: Final = {

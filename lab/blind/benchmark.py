@@ -28,6 +28,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from lab import kernels
 from lab.blind.judge import deconvolved, squared_error
 from lab.blind.methods import BlindMethod, compared
 from lab.cases import HALVES, BlindCase, Half, list_photos, load_psfs, make_cases, observe
@@ -82,7 +83,7 @@ class CaseResult:
     noise: float
     error_ratio: float  # ER with the estimated kernel, and of the blurred patch as it is
     untouched_ratio: float
-    ncc: float  # against the true kernel after sub-pixel alignment; see `psf.distance`
+    ncc: float  # against the true kernel after sub-pixel alignment; see `lab.kernels.distance`
     rel_l2: float
     mtf_rmse: float
     width_px: float  # RMS widths
@@ -270,7 +271,7 @@ def _run_job(job: _Job) -> list[CaseResult]:
                 logger.info("%s declined %s: %s", name, job.case.name, error)
         seconds = time.perf_counter() - started
         kernel = psf.delta(3) if estimate is None else np.asarray(estimate.kernel)
-        distance = psf.distance(kernel, seen.kernel)
+        distance = kernels.distance(kernel, seen.kernel)
         ratio = untouched
         if estimate is not None:
             restored = deconvolved(seen.patch, kernel, sigma, distance.shift)

@@ -236,9 +236,8 @@ def correct(
 @contextmanager
 def _bar(shown: Display, what: str) -> Iterator[StepHook]:
     """Show how many of how many are done; a refused value is wrong usage."""
-    with as_usage(), shown.progress() as bars:
-        task = bars.add_task(what, total=None)
-        yield lambda done, total: bars.update(task, completed=done, total=total)
+    with as_usage(), shown.progress(what) as bar:
+        yield lambda done, total: bar.show(completed=done, total=total)
 
 
 def _names(text: str) -> tuple[str, ...]:

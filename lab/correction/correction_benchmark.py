@@ -17,11 +17,11 @@ from scipy import special
 from skimage import restoration
 
 from lab.images import to_srgb
+from lab.kernels import gaussian
 from lab.page import table
 from lab.peers import Peer
 from lensmodel.core.geometry import Frame
 from lensmodel.core.jit import jit
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import (
     BayerPattern,
     Channel,

@@ -24,11 +24,11 @@ from lab.gallery.measure import measured
 from lab.gallery.pictures import FRAMES, SimulatedFrame, rendered, take
 from lab.page import table
 from lab.reproduce.cases import repository_grids
+from lensmodel.api import lateral_of
 from lensmodel.core.psf import PsfField, as_kernel
 from lensmodel.core.types import Channel, FieldPosition, Kernel
 from lensmodel.correction import StoredColour, correct_planes
 from lensmodel.photo import develop
-from lensmodel.workflow.correcting import lateral_of
 
 KERNEL: Final = 55
 _HEAD: Final = (

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from lab.correction.correction_benchmark import SoftCorners
 from lab.peers import light_numbers, write_raw
+from lensmodel.api import lateral_of
 from lensmodel.correction import correct_planes
 from lensmodel.photo import develop, write_image
-from lensmodel.workflow.correcting import lateral_of
 
 
 def main() -> None:

@@ -28,11 +28,11 @@ from app.client import Client
 from app.schemas import CorrectionOut, JobOut, PhotoOut
 from lab.charts import ZoneSharpness, by_zone, measure_edges
 from lab.images import Picture, as_shown, fidelity, side_by_side
+from lab.kernels import distance
 from lab.scenes import photograph_of
 from lensmodel.cli.console import mtf50_words
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import zone_of
-from lensmodel.core.psf import distance
 from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone
 from lensmodel.photo import develop
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo

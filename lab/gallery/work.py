@@ -14,10 +14,10 @@ import numpy as np
 import lensmodel
 from lab.gallery.pictures import Picture, Rendered, read_rendered, rendered
 from lab.stored import Unit, stored, version_of
+from lensmodel.blind.sampling import CalibrationEvent
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.photo import develop
-from lensmodel.workflow.sampling import CalibrationEvent
 
 BEFORE, AFTER = "before.npy", "after.npy"
 """Pictures as stored, rendered."""

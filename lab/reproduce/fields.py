@@ -12,11 +12,12 @@ import numpy as np
 
 from lab import targets
 from lab.correction.filter_flow import EfficientFilterFlow
+from lab.kernels import distance
 from lab.model_benchmark import PATCHES, asked_places, patch_places, predictor
 from lab.reproduce.cases import Case
 from lensmodel import measured as measure
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfField, PsfSample, as_kernel, distance
+from lensmodel.core.psf import PsfField, PsfSample, as_kernel
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.measured.target import Target
 from lensmodel.model import LensModel

@@ -12,17 +12,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from lab.images import as_shown
+from lab.kernels import distance
 from lab.reproduce import fields
 from lab.reproduce.cases import Case, Reproduction
 from lab.reproduce.shots import take
+from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfField, distance, rms_width
+from lensmodel.core.psf import PsfField, rms_width
 from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import LensModel
 from lensmodel.patches import r_map
 from lensmodel.photo import develop
-from lensmodel.workflow import sampling
 
 # Layout (chosen): places that are shown, pixels of a kernel, PSFs down and across.
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))
@@ -75,10 +76,9 @@ def _fig4(plan: Reproduction, photos: Path, path: Path, workers: int) -> dict[st
     case = plan.cases[0]
     shots = take(case, plan.files(), photos, photos=1)
     developed = develop(shots.learn[0])
-    config = sampling.Config()
-    chosen = sampling.find_patches(developed, count=config.patches, estimator=config.method).patches
+    chosen = sampling.find_patches(developed, count=sampling.PRESETS["default"].patches).patches
     try:
-        samples = sampling.samples_of_photo(shots.learn[0], config, workers=workers)
+        samples = sampling.samples_of_photo(shots.learn[0], workers=workers)
     except LensModelError as error:
         return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]

@@ -48,11 +48,11 @@ from lab.reproduce.learners import Learner, Roi, corrected_with, paper_way
 from lab.reproduce.shots import Container, Shots, in_container, take
 from lab.schuler import Schuler
 from lab.stored import Unit, read, stored
+from lensmodel.blind.sampling import PRESETS
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.photo import develop
-from lensmodel.workflow.sampling import PRESETS
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)
 

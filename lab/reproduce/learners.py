@@ -11,14 +11,15 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from lab.reproduce.cases import METHOD, Case
+from lensmodel import api
+from lensmodel.blind import sampling
+from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import LensModelError, NoSamplesError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.correction import correct_planes
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.workflow import correcting, sampling
-from lensmodel.workflow.sampling import PRESETS, Preset
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
 Roi: TypeAlias = tuple[int, int, int, int]
@@ -28,7 +29,7 @@ _SMALL_FRAME: Final = 2e6
 """Pixels below which the paper's way takes kernels of the default's size (chosen): 55 are of 21 MP."""
 
 
-def paper_way(case: Case) -> Preset:
+def paper_way(case: Case) -> Config:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
         return PRESETS["paper"]
@@ -38,7 +39,7 @@ def paper_way(case: Case) -> Preset:
 class Learner:
     """One lens that learns from photos by a preset, answers for its PSF, and corrects photos."""
 
-    def __init__(self, way: Preset, workers: int) -> None:
+    def __init__(self, way: Config, workers: int) -> None:
         self.seconds = 0.0  # that learning took
         self._way, self._workers = way, workers
         self._seen: dict[str, str] = {}  # why photos did not count, by their identity
@@ -57,12 +58,11 @@ class Learner:
         return refused
 
     def _learned(self, photo: Path) -> str:
-        config = sampling.Config(estimator=self._way.estimator, kernel_size=self._way.kernel_size)
         try:
-            samples = sampling.samples_of_photo(photo, config, workers=self._workers)
+            samples = sampling.samples_of_photo(photo, self._way, workers=self._workers)
         except LensModelError as error:
             return str(error)
-        chosen = ModelSettings(mode=self._way.mode)
+        chosen = ModelSettings(mode=self._way.model)
         self._model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
         return ""
 
@@ -80,12 +80,12 @@ class Learner:
         Also the expected gain in PSNR of linear light by zone, mean over the parts; None if not told.
         """
         developed = develop(photo)
-        model, settings = self._known(), sampling.settings_of(developed)
-        field = correcting.psfs_for(developed, model, settings, method=self._way.method)
-        lateral = correcting.lateral_of(developed)
+        model, settings = self._known(), developed.info.metadata.settings()
+        field = api.psfs_for(developed, model, settings, method=self._way.method)
+        lateral = api.lateral_of(developed)
         planes, said = developed.planes.copy(), dict[str, list[float | None]]()
         for roi in parts:
-            done = correcting.correct_photo(
+            done = api.correct_photo(
                 developed, model, settings, method=self._way.method, lateral=lateral, known=field, roi=roi,
                 workers=self._workers,
             )  # fmt: skip
@@ -108,7 +108,7 @@ def corrected_with(
     developed: LinearPhoto, field: PsfField, parts: Sequence[Roi], *, workers: int = 1
 ) -> Planes:
     """Correct parts of a photo with a PSF field taken as right, as a learner does with its own."""
-    lateral, made = correcting.lateral_of(developed), developed.planes.copy()
+    lateral, made = api.lateral_of(developed), developed.planes.copy()
     for roi in parts:
         made[_inside(roi)] = correct_planes(
             developed.planes, field, developed.frame, method=METHOD, noise=developed.correction_noise,

@@ -11,12 +11,13 @@ import numpy as np
 
 from lab.charts import by_zone, measure_edges
 from lab.images import BLOCK, BORDER, fidelity
+from lab.kernels import distance
 from lab.model_benchmark import asked_places
 from lab.reproduce.cases import Case
 from lab.reproduce.learners import Place, Roi
 from lab.reproduce.shots import Shots, guard_of
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import PsfField, distance
+from lensmodel.core.psf import PsfField
 from lensmodel.core.types import CHANNELS, ZONES, Kernel, Planes, Zone
 from lensmodel.simulate import edge_chart
 

@@ -1,4 +1,4 @@
-"""Train the learned choice of patches (`lensmodel.patches.good_regions`).
+"""Train the learned choice of patches (`lensmodel.patches.select`).
 
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, stats
 
+from lab import kernels
 from lab.blind.methods import BlindMethod, compared
 from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
@@ -30,8 +31,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
 from lensmodel.patches.checks import details_of
-from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
-from lensmodel.patches.select import RMapSelector, first_reasons
+from lensmodel.patches.select import FEATURES, RMapSelector, TreeEnsemble, features_of, first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, measure_blocks, windows_of
 from lensmodel.simulate import draw_lens
 
@@ -86,7 +86,7 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
             half=half,
             features=tuple(round(float(v), 5) for v in own),
             r_map_score=float(score),
-            ncc=psf.distance(found, kernel).ncc,
+            ncc=kernels.distance(found, kernel).ncc,
         )
 
 
@@ -131,7 +131,8 @@ def fit(table: Path, model: Path, seed: int = 0) -> dict[str, float]:
         random_state=seed,
     ).fit(_features(learn), np.log([max(1.0 - row.ncc, 1e-4) for row in learn]))
     ensemble = _arrays(trees)
-    ensemble.save(model)
+    model.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(model, **{name: getattr(ensemble, name) for name in ensemble.__slots__})
     similarity = [row.ncc for row in held]
     scores = {"learned": -ensemble.predict(_features(held)), "r-map": [row.r_map_score for row in held]}
     return {name: float(stats.spearmanr(own, similarity).statistic) for name, own in scores.items()}
@@ -139,10 +140,8 @@ def fit(table: Path, model: Path, seed: int = 0) -> dict[str, float]:
 
 def _features(rows: Sequence[Labelled]) -> NDArray[np.float64]:
     values = np.array([row.features for row in rows])
-    if values.shape[1] != len(FEATURES):
-        raise InvalidInputError(
-            f"the table has {values.shape[1]} features, not {len(FEATURES)}; collect anew"
-        )
+    if values.shape[1] != FEATURES:
+        raise InvalidInputError(f"the table has {values.shape[1]} features, not {FEATURES}; collect anew")
     return values
 
 

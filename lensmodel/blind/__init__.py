@@ -9,11 +9,4 @@ estimators: Registry[PsfEstimator] = Registry(
     "estimator", {"default": LearnedEstimator, "michaeli-irani": PatchRecurrence}, "lensmodel.estimators"
 )
 
-__all__ = [
-    "LearnedEstimator",
-    "PatchRecurrence",
-    "PhotoEstimator",
-    "PsfEstimate",
-    "PsfEstimator",
-    "estimators",
-]
+__all__ = ["PatchRecurrence", "PhotoEstimator", "PsfEstimate", "PsfEstimator", "estimators"]

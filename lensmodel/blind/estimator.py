@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample, centred, resized, rms_width
+from lensmodel.core.psf import PsfSample, centred, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.patches.checks import repeats
 from lensmodel.patches.windows import Patch, Selection
@@ -33,14 +33,11 @@ class PsfEstimate:
         0..1; ranks estimates by their true error.
     predicted_error : float
         Expected relative L2 distance to the true kernel.
-    diagnostics : mapping of str to float
-        What the estimator reports of itself.
     """
 
     kernel: Kernel
     confidence: float
     predicted_error: float
-    diagnostics: Mapping[str, float]
 
 
 class PsfEstimator(Protocol):
@@ -68,7 +65,6 @@ class PsfEstimator(Protocol):
         *,
         size: int = 31,
         green: PsfEstimate | None = None,
-        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share.
 
@@ -82,8 +78,6 @@ class PsfEstimator(Protocol):
             Odd side of the kernel, up to 55.
         green : PsfEstimate, optional
             What this method gave for the same windows in green, to start another color from.
-        on_step : StepHook
-            Progress; raising `CancelledError` there stops the work.
 
         Returns
         -------
@@ -178,8 +172,7 @@ def confidence_of(error: float) -> float:
     return 1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2)
 
 
-def finished(kernel: Kernel, *, size: int, error: float, diagnostics: Mapping[str, float]) -> PsfEstimate:
+def finished(kernel: Kernel, *, size: int, error: float) -> PsfEstimate:
     """Centre a kernel of any odd side and say how sure it is by its expected relative L2 error."""
-    final = resized(centred(kernel), size)
     error = min(max(error, 0.0), 1.0) if math.isfinite(error) else 1.0
-    return PsfEstimate(final, confidence_of(error), error, {"width": rms_width(final), **diagnostics})
+    return PsfEstimate(resized(centred(kernel), size), confidence_of(error), error)

@@ -109,7 +109,6 @@ class LearnedEstimator:
         *,
         size: int = 31,
         green: PsfEstimate | None = None,
-        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that patches of one plane share, as if all colors of a mosaic were that plane.
 
@@ -127,8 +126,7 @@ class LearnedEstimator:
         tokens = network.encode(to_octant(np.stack(rows), xy), xy, conditions)
         memory = network.memory(tokens, xy, [conditions] * len(kept))
         answer = network.query(memory, xy[0], conditions)
-        on_step(1, 1)
-        return finished(answer.kernels[1], size=size, error=float(answer.error[1]), diagnostics={})
+        return finished(answer.kernels[1], size=size, error=float(answer.error[1]))
 
 
 def _kind_of(developed: LinearPhoto) -> PatchKind:

@@ -31,7 +31,7 @@ from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, delta, otf, resized
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _BORDER = 3  # pixels left out along the rim: fewer patches overlap there (chosen)
 _ERROR: Final = 0.61
@@ -226,7 +226,6 @@ class PatchRecurrence:
         *,
         size: int = 31,
         green: PsfEstimate | None = None,
-        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         """Estimate the kernel that patches share: after green, the finest level alone, from its kernel on.
 
@@ -239,7 +238,6 @@ class PatchRecurrence:
             levels -= 1
         kernel = delta(_LEAST_SIDE) if green is None else green.kernel
         latent = [view.y for view in (s.at(levels - 1) for s in scaled)]
-        total, done = levels * self.iterations, 0
         for level in reversed(range(levels)):
             side = max(_LEAST_SIDE, _odd(size / ALPHA**level))
             views = [s.at(level) for s in scaled]
@@ -247,10 +245,7 @@ class PatchRecurrence:
             latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
             for _ in range(self.iterations):
                 kernel = self._step(views, latent, kernel, side)
-                done += 1
-                on_step(done, total)
-        report = {"support": float(size), "levels": float(levels)}
-        return finished(kernel, size=size, error=_ERROR, diagnostics=report)
+        return finished(kernel, size=size, error=_ERROR)
 
     def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> Kernel:
         """Match and sharpen each latent image, in place, and solve for the kernel that they share."""

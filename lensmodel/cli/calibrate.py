@@ -11,30 +11,24 @@ from typing import Annotated, Any
 import typer
 
 from lensmodel.blind import estimators
-from lensmodel.cli import files
+from lensmodel.blind.sampling import PRESETS, CalibrationEvent, configured
+from lensmodel.calibration import AHEAD, Calibration
+from lensmodel.cli import files, options
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import AnyLens, Aperture, Json, Photos, Profile, Quiet, Verbose, Workers, choice
 from lensmodel.core import processes
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.patches import selectors
-from lensmodel.workflow import calibrating, sampling
-from lensmodel.workflow.calibrating import AHEAD
-from lensmodel.workflow.sampling import PRESETS, preset_of
-
-Selector = Annotated[
-    str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
-]
 
 
 def calibrate(
     context: typer.Context,
-    photos: Photos,
-    profile: Profile = None,
-    aperture: Aperture = None,
+    photos: options.Photos,
+    profile: options.Profile = None,
+    aperture: options.Aperture = None,
     model: Annotated[
         str | None,
-        choice(
+        options.choice(
             "--model",
             tuple(PRESETS),
             "paper: the paper's method alone, for comparison: kernels by Michaeli and Irani, their "
@@ -54,19 +48,21 @@ def calibrate(
             help="Side of the kernels, an odd number from 3 to 55; default: 31, with --model paper 55.",
         ),
     ] = None,
-    selector: Selector = "r-map",
-    workers: Workers = None,
+    selector: Annotated[
+        str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
+    ] = "r-map",
+    workers: options.Workers = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Address of a Dask cluster that estimates the photos."),
     ] = None,
-    any_lens: AnyLens = False,
+    any_lens: options.AnyLens = False,
     force: Annotated[
         bool, typer.Option("--force", help="Discard what the profile holds; begin anew.")
     ] = False,
-    json_output: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
+    json_output: options.Json = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
 ) -> None:
     """Learn the blur of one lens from photos and write it to a profile.
 
@@ -91,22 +87,24 @@ def calibrate(
     if others := files.passed_over(photos):
         shown.note(f"passed over: {others}")
     files.refuse_photo(target, paths)
+    store = files.ProfileFile(target, model, force=force)
     with files.as_usage():
-        config = sampling.Config(LensSettings(aperture=aperture), model, estimator, kernel_size, selector)
-        config.check()
+        config = configured(
+            store.model,
+            LensSettings(aperture=aperture),
+            estimator=estimator,
+            kernel_size=kernel_size,
+            selector=selector,
+        )
     results: list[dict[str, Any]] = []
-    with shown.progress() as bars:
-        task = bars.add_task("", total=len(paths))
+    with shown.progress(total=len(paths)) as bar:
 
-        def on_event(event: sampling.CalibrationEvent) -> None:
-            share = event.done / event.total if event.total else 0.0
-            bars.update(
-                task, description=f"{event.photo.name}: {event.stage}", completed=len(results) + share
-            )
+        def on_event(event: CalibrationEvent) -> None:
+            text = f"{event.photo.name}: {event.stage}"
+            bar.part(len(results), event.done, event.total, description=text)
 
         with executor_of(scheduler) as (executor, ahead), processes.pool(None, workers) as pool:
-            store = files.ProfileFile(target, model, force=force)
-            calibration = calibrating.Calibration(store, config, any_lens=any_lens, pool=pool)
+            calibration = Calibration(store, config, any_lens=any_lens, pool=pool)
             for event in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
                 result: dict[str, Any] = {"state": "counted", "samples": event.total}
                 if event.error is not None:
@@ -116,7 +114,7 @@ def calibrate(
                     result = {"state": "known"}
                     shown.note(f"{event.photo}: the profile has it already")
                 results.append({"photo": str(event.photo), **result})
-                bars.update(task, completed=len(results))
+                bar.show(completed=len(results))
     lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
     photo_count = len(lens.profile.photos) if lens else 0
@@ -127,7 +125,7 @@ def calibrate(
             "photos": photo_count,
             "samples": len(lens.samples) if lens else 0,
             "coverage": coverage,
-            "model": preset_of(lens.model).name if lens else None,
+            "model": lens.model.mode if lens else None,
             "results": results,
         }
     )

@@ -11,8 +11,7 @@ import logging
 import sys
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
@@ -20,7 +19,7 @@ from typing import Any, Final
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, Task, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from lensmodel.core.codec import to_json
 
@@ -96,23 +95,18 @@ class Display:
         """Tell what went wrong."""
         typer.echo(f"lensmodel: {text}", err=True)
 
-    def progress(self) -> PacedProgress:
+    def progress(self, text: str = "", total: float | None = None) -> PacedProgress:
         """One bar with share and time left; plain lines now and then where no terminal can show it."""
         terminal = sys.stderr.isatty()
         return PacedProgress(
+            text,
+            total,
             say=None if self.quiet or terminal else partial(typer.echo, err=True),
             console=Console(file=sys.stderr),
             disable=self.quiet or not terminal,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
         )
-
-    @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Show that something goes on whose end cannot be foretold, with the time since its start."""
-        with self.progress() as bar:
-            bar.add_task(text, total=None)
-            yield
 
 
 # At most one line in so many seconds (chosen): a night's log stays readable, and quick commands silent
@@ -159,6 +153,8 @@ class PacedProgress(Progress):
 
     def __init__(
         self,
+        text: str,
+        total: float | None,
         *,
         say: Callable[[str], None] | None = None,
         every_s: float = EVERY_S,
@@ -168,41 +164,35 @@ class PacedProgress(Progress):
         super().__init__(*columns, TextColumn("{task.fields[left]}"), **given)
         self._say, self._every_s = say, every_s
         self._began = self._last = time.monotonic()
-        self._paces: dict[TaskID, Pace] = {}
+        self._pace = Pace()
+        self.add_task(text, total=total, left="")
+        (self._task,) = self.tasks
 
-    def add_task(self, *given: Any, **options: Any) -> TaskID:  # noqa: ANN401 - as `Progress` takes them
-        """Add a task as `Progress.add_task` does."""
-        return super().add_task(*given, left="", **options)
-
-    def update(self, task_id: TaskID, *, more: bool = False, **changes: Any) -> None:  # noqa: ANN401 - as there
-        """Change a task as `Progress.update` does; tell it if it is time.
+    def show(self, *, more: bool = False, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
+        """Change what is shown as `Progress.update` does; tell it if it is time.
 
         What was done of a photo that is then passed over stays done. While there is `more` work of another
         kind ahead, whose pace nobody knows, no time left is told.
         """
-        now, task = time.monotonic(), self._tasks[task_id]
+        now, task = time.monotonic(), self._task
         if "completed" in changes:
             changes["completed"] = max(changes["completed"], task.completed)
-        super().update(task_id, **changes)
-        pace = self._paces[task_id] = Pace() if more else self._paces.get(task_id, Pace())
-        if not more:
-            pace.mark(now, task.completed, task.total)
-        left = pace.left(now)
+        self.update(task.id, **changes)
+        if more:
+            self._pace = Pace()
+        else:
+            self._pace.mark(now, task.completed, task.total)
+        left = self._pace.left(now)
         task.fields["left"] = "" if left is None else f"ETA {clock(left)}"
         if self._say is not None and now - self._last >= self._every_s:
             self._last = now
-            self._say(line(task, now - self._began, left))
+            done = f" {task.percentage:3.0f} %" if task.total else ""
+            ahead = "" if left is None else f", about {clock(left)} left"
+            self._say(f"[{clock(now - self._began)}]{done} {task.description or 'working'}{ahead}")
 
-    def part(self, task: TaskID, number: int, done: int, total: int, *, more: bool = False) -> None:
+    def part(self, number: int, done: int, total: int, **changes: Any) -> None:  # noqa: ANN401 - as `show` takes them
         """Show that photo `number` is done as far as `done` of `total`."""
-        self.update(task, completed=number + done / max(total, 1), more=more)
-
-
-def line(task: Task, seconds: float, left: float | None) -> str:
-    """Say how far a task is: time since the start, share, what is in work, time left if it can be told."""
-    done = f" {task.percentage:3.0f} %" if task.total else ""
-    ahead = "" if left is None else f", about {clock(left)} left"
-    return f"[{clock(seconds)}]{done} {task.description or 'working'}{ahead}"
+        self.show(completed=number + done / max(total, 1), **changes)
 
 
 def clock(seconds: float) -> str:

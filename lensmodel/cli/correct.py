@@ -7,25 +7,13 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from lensmodel.cli import files, folder, outputs
+from lensmodel.cli import files, folder, options, outputs
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    ANY_LENS,
-    JSON,
-    QUIET,
-    WORKERS,
-    Aperture,
-    HelpAll,
-    Photos,
-    Verbose,
-    choice,
-    rare,
-)
 from lensmodel.core.types import LensSettings
 from lensmodel.correction import Bounds, deconvolvers
+from lensmodel.lens import Lens
 from lensmodel.photo import OutputFormat
-from lensmodel.workflow.lens import Lens
 
 # Panels of the options that --help-all adds
 LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting", "Writing", "Running"
@@ -33,7 +21,7 @@ LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting",
 
 def correct(
     context: typer.Context,
-    photos: Photos,
+    photos: options.Photos,
     profile: Annotated[
         Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The profile of their lens.")
     ] = None,
@@ -66,13 +54,13 @@ def correct(
     ] = 1.0,
     file_format: Annotated[
         OutputFormat | None,
-        choice(
+        options.choice(
             "--format",
             get_args(OutputFormat),
             "dng: linear, for a raw converter. Default: by the name after -o, else tiff16.",
         ),
     ] = None,
-    aperture: Aperture = None,
+    aperture: options.Aperture = None,
     force: Annotated[
         bool,
         typer.Option(
@@ -81,19 +69,20 @@ def correct(
     ] = False,
     profiles: Annotated[
         Path | None,
-        rare(
+        options.rare(
             LEARNING,
             metavar="DIR",
             help="Folder of the lens profiles. Default: a folder `lenses` in the output.",
         ),
     ] = None,
     learn_from: Annotated[
-        int, rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group.")
+        int,
+        options.rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group."),
     ] = folder.LEARN_FROM,
-    any_lens: Annotated[bool, rare(LEARNING, ANY_LENS)] = False,
+    any_lens: Annotated[bool, options.rare(LEARNING, options.ANY_LENS)] = False,
     method: Annotated[
         str | None,
-        rare(
+        options.rare(
             CORRECTING,
             metavar="NAME",
             help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
@@ -101,7 +90,7 @@ def correct(
     ] = None,
     halo: Annotated[
         float | None,
-        rare(
+        options.rare(
             CORRECTING,
             metavar="SHARE",
             help="How far results may go beyond the photo's own range beside edges, as a share of that "
@@ -110,27 +99,27 @@ def correct(
     ] = None,
     texture: Annotated[
         float,
-        rare(
+        options.rare(
             CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."
         ),
     ] = 1.0,
     denoise: Annotated[
         float,
-        rare(
+        options.rare(
             CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."
         ),
     ] = 0.0,
     keep_location: Annotated[
         bool,
-        rare(
+        options.rare(
             WRITING, "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
         ),
     ] = False,
-    workers: Annotated[int | None, rare(RUNNING, WORKERS)] = None,
-    json_output: Annotated[bool, rare(RUNNING, JSON)] = False,
-    quiet: Annotated[bool, rare(RUNNING, QUIET)] = False,
-    verbose: Verbose = 0,
-    help_all: HelpAll = False,
+    workers: Annotated[int | None, options.rare(RUNNING, options.WORKERS)] = None,
+    json_output: Annotated[bool, options.rare(RUNNING, options.JSON)] = False,
+    quiet: Annotated[bool, options.rare(RUNNING, options.QUIET)] = False,
+    verbose: options.Verbose = 0,
+    help_all: options.HelpAll = False,
 ) -> None:
     """Remove the blur of the lens from photos.
 
@@ -171,7 +160,7 @@ def correct(
             deconvolvers.create(method)
         LensSettings(aperture=aperture)
     clashed = outputs.clashes(twice, shown)
-    options = {
+    given = {
         "aperture": aperture,
         "method": method,
         "strength": strength,
@@ -180,16 +169,15 @@ def correct(
         "keep_location": keep_location,
         "workers": workers,
     }
-    correction = outputs.Correction(targets, options, profile is None, any_lens, force, shown)
+    correction = outputs.Correction(targets, given, profile is None, any_lens, force, shown)
     document: dict[str, Any] = {"profile": str(profile)}
     if profile is None:
         base = next(iter([*targets.values(), *twice])).parent
         document = folder.correct_folder(correction, profiles or base / folder.PROFILES, learn_from)
     else:
         known = Lens(files.profile_at(profile))
-        with shown.progress() as bar:
-            task = bar.add_task("", total=len(targets))
-            document["results"] = correction.photos(list(targets), known, bar, task)
+        with shown.progress(total=len(targets)) as bar:
+            document["results"] = correction.photos(list(targets), known, bar)
     document["results"][:0] = clashed
     shown.document(document)
     if any(result["state"] == "failed" for result in document["results"]):

@@ -10,13 +10,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from lensmodel.calibration import LensStore
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.lens import Lens
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.values import CORRECTED, ENDINGS, RAW_ENDINGS
-from lensmodel.workflow.calibrating import LensStore
-from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.sampling import preset_of
 
 # Endings of pictures in folders that are told of where they are passed over (docs/formats.md)
 NOT_READ: Final = frozenset(
@@ -146,8 +145,10 @@ class ProfileFile(LensStore):
 
     def __init__(self, target: Path, model: str | None = None, *, force: bool = False) -> None:
         super().__init__()
-        self._target, self._model = target, model
+        self._target, self._wanted = target, model
         self._stamp_read = _stamp(target) if force else None
+        known = self.lens()
+        self.model = self._wanted = model or (known.model.mode if known else "default")
 
     def lens(self) -> Lens | None:
         """Return the lens, read anew if another run changed the file."""
@@ -155,10 +156,10 @@ class ProfileFile(LensStore):
         if stamp in {None, self._stamp_read}:
             return self._lens
         lens = Lens(profile_at(self._target, replaceable=True))
-        learned = preset_of(lens.model).name
-        if self._model not in {None, learned}:  # its kernels are the other model's: both would be mixed
+        learned = lens.model.mode
+        if self._wanted not in {None, learned}:  # its kernels are the other model's: both would be mixed
             raise InvalidInputError(
-                f"the lens in {self._target.name} has the model {learned}, not {self._model}: name a new "
+                f"the lens in {self._target.name} has the model {learned}, not {self._wanted}: name a new "
                 "file after --profile and give its photos again, or replace the file with --force"
             )
         self._lens, self._stamp_read = lens, stamp

@@ -13,20 +13,18 @@ from itertools import accumulate, zip_longest
 from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import TaskID
-
+from lensmodel.blind.sampling import CalibrationEvent, configured
+from lensmodel.calibration import Calibration
 from lensmodel.cli import files
 from lensmodel.cli.console import Display, PacedProgress, aligned, gain_words
 from lensmodel.cli.outputs import Correction
 from lensmodel.core.errors import LensModelError, NotEnoughEvidenceError
 from lensmodel.core.names import camera_name, name_key, serial_key
 from lensmodel.core.types import LensSettings
+from lensmodel.lens import Lens
+from lensmodel.model.identity import SAME_FOCAL, Identity
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow.calibrating import Calibration
-from lensmodel.workflow.identity import SAME_FOCAL, Identity
-from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.sampling import CalibrationEvent, Config
 
 # Photos that a group is learned from: five are the advice (docs/guide.md), three more for other apertures
 # (chosen); each takes about a minute
@@ -54,11 +52,10 @@ def correct_folder(correction: Correction, profiles: Path, most: int) -> dict[st
             display.error(f"{path}: {files.reason(error)}")
     lens_groups, unread = groups(shots), len(results)
     counts = [min(most, group.scenes) for group in lens_groups]
-    with display.progress() as bar:
-        task = bar.add_task("learning", total=sum(counts) + len(shots))
+    with display.progress("learning", sum(counts) + len(shots)) as bar:
         begins = accumulate(counts, initial=0)
         learned = [
-            _learn(group, profiles, count, correction, bar, task, begin)
+            _learn(group, profiles, count, correction, bar, begin)
             for group, count, begin in zip(lens_groups, counts, begins, strict=False)
         ]
         for group, count in zip(lens_groups, learned, strict=True):
@@ -66,7 +63,7 @@ def correct_folder(correction: Correction, profiles: Path, most: int) -> dict[st
             lens = Lens(files.profile_at(target)) if target.exists() else None
             begin = sum(counts) + len(results) - unread
             more = group is not lens_groups[-1]  # photos of another kind, which may be left or take longer
-            done = correction.photos(group.paths, lens, bar, task, begin=begin, more=more)
+            done = correction.photos(group.paths, lens, bar, begin=begin, more=more)
             results += done
             rows.append(_row(group, None if lens is None else target, count, done))
     if rows or not unread:
@@ -81,7 +78,6 @@ def _learn(
     most: int,
     correction: Correction,
     bar: PacedProgress,
-    task: TaskID,
     begin: int,
 ) -> int:
     """Learn the lens of a group; return from how many photos, now or in an earlier run."""
@@ -89,14 +85,11 @@ def _learn(
 
     def on_event(event: CalibrationEvent) -> None:
         text = f"learning from {event.photo.name}: {event.stage}"
-        bar.update(task, description=text, more=True)
-        bar.part(task, begin + counted, event.done, event.total, more=True)
+        bar.part(begin + counted, event.done, event.total, description=text, more=True)
 
-    calibration = Calibration(
-        files.ProfileFile(group.profile_in(profiles)),
-        Config(LensSettings(aperture=correction.options["aperture"])),
-        any_lens=correction.any_lens,
-    )
+    store = files.ProfileFile(group.profile_in(profiles))
+    config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
+    calibration = Calibration(store, config, any_lens=correction.any_lens)
     paths = [shot.path for shot in group.to_learn_from()]
     for event in calibration.learn(paths, siblings=group.paths, on_event=on_event):
         if event.error is None:
@@ -106,7 +99,7 @@ def _learn(
             display.detail(f"{event.photo}: {event.error}")
         if counted == most:
             break
-    bar.update(task, completed=begin + most, more=True)
+    bar.show(completed=begin + most, more=True)
     refused = [correction.refused.get(path) for path in paths]
     if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
         reasons = set(map(str, refused))

@@ -44,7 +44,7 @@ COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
             "Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.",
         ),
         "psf": (
-            "lensmodel.cli.psf",
+            "lensmodel.cli.report",
             "Show what the lens makes of a point of light at one place in the picture.",
         ),
         "export": (

@@ -8,32 +8,19 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.progress import TaskID
 
-from lensmodel.cli import files
+from lensmodel.blind.sampling import configured
+from lensmodel.calibration import Admit, Calibration
+from lensmodel.cli import files, options
 from lensmodel.cli.console import Display, PacedProgress
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    AnyLens,
-    Aperture,
-    Force,
-    Json,
-    Photos,
-    Profile,
-    Quiet,
-    Verbose,
-    choice,
-    odd,
-    one_of,
-)
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.files import write_atomically
 from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
+from lensmodel.measured import photos as measuring
 from lensmodel.measured.edges import chart_edges
 from lensmodel.photo import LinearPhoto, PhotoInfo, develop
-from lensmodel.workflow import measuring, sampling
-from lensmodel.workflow.calibrating import Admit, Calibration
 
 KINDS: Final = ("target", "pair", "points", "edges")
 # What comes before the first place, by the way of measuring
@@ -54,16 +41,18 @@ def measure(
     kind: Annotated[
         str,
         typer.Argument(
-            metavar=f"<{'|'.join(KINDS)}>", parser=one_of("measure", KINDS), help="What the photos show."
+            metavar=f"<{'|'.join(KINDS)}>",
+            parser=options.one_of("measure", KINDS),
+            help="What the photos show.",
         ),
     ],
-    photos: Photos,
-    profile: Profile = None,
-    aperture: Aperture = None,
+    photos: options.Photos,
+    profile: options.Profile = None,
+    aperture: options.Aperture = None,
     size: Annotated[
         int,
         typer.Option(
-            min=9, max=101, metavar="N", callback=odd, help="Side of a PSF in pixels, an odd number."
+            min=9, max=101, metavar="N", callback=options.odd, help="Side of a PSF in pixels, an odd number."
         ),
     ] = 31,
     replace_blind: Annotated[
@@ -80,11 +69,11 @@ def measure(
             help="With edges: write to this folder which edges were measured: edges.pdf, .png and .csv.",
         ),
     ] = None,
-    any_lens: AnyLens = False,
-    force: Force = False,
-    json_output: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
+    any_lens: options.AnyLens = False,
+    force: options.Force = False,
+    json_output: options.Json = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
 ) -> None:
     """Measure the blur of a lens from photos made for the purpose.
 
@@ -119,13 +108,13 @@ def measure(
     files.refuse_photo(target, paths)
     with files.as_usage():
         groups = measuring.measurements_of(kind, paths)
-        config = sampling.Config(LensSettings(aperture=aperture))
-        calibration = Calibration(files.ProfileFile(target), config, any_lens=any_lens, replace=replace_blind)
+        store = files.ProfileFile(target)
+        config = configured(store.model, LensSettings(aperture=aperture))
+        calibration = Calibration(store, config, any_lens=any_lens, replace=replace_blind)
     results: list[dict[str, Any]] = []
-    with shown.progress() as bars:
-        task = bars.add_task("", total=len(groups))
+    with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):
-            on_step = partial(_show_step, bars, task, group[0].name, kind, number, len(groups))
+            on_step = partial(_show_step, bar, group[0].name, kind, number, len(groups))
             on_step(0, 1)
             method = partial(
                 measuring.samples_of_developed,
@@ -140,7 +129,7 @@ def measure(
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
-            bars.update(task, completed=number + 1)
+            bar.show(completed=number + 1)
     shown.document({"profile": str(target) if target.exists() else None, "results": results})
     for result in results:
         if result["state"] == "measured":
@@ -155,13 +144,14 @@ def measure(
 
 
 def _show_step(
-    bars: PacedProgress, task: TaskID, name: str, kind: str, number: int, photos: int, done: int, total: int
+    bar: PacedProgress, name: str, kind: str, number: int, photos: int, done: int, total: int
 ) -> None:
     """Show how far photo `number` is; `done` 0 is before its first place."""
-    bars.update(
-        task,
+    bar.part(
+        number,
+        done,
+        total,
         description=f"{name}: {'measuring' if done else PREPARING[kind]}",
-        completed=number + done / max(total, 1),
         # the pace of a single photo is that of its places: reading it and finding the page has another
         more=done == 0 and photos == 1,
     )
@@ -219,7 +209,9 @@ def target(
     edges: Annotated[
         bool, typer.Option("--edges", help="35 dark squares, for `lensmodel measure edges`.")
     ] = False,
-    paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")] = "a3",
+    paper: Annotated[
+        str, options.choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")
+    ] = "a3",
     detail: Annotated[
         int,
         typer.Option(
@@ -228,9 +220,9 @@ def target(
             "to the number of pixels that the page will span in the photo.",
         ),
     ] = USUAL_DETAIL,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
+    force: options.Force = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
 ) -> None:
     """Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.
 

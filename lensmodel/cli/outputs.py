@@ -10,10 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import TaskID
-
 import lensmodel
-from lensmodel.api import FORMATS
+from lensmodel.api import FORMATS, SEEN_DB
 from lensmodel.cli import files
 from lensmodel.cli.console import Display, PacedProgress, gain_words
 from lensmodel.cli.ending import UsageError
@@ -25,11 +23,10 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.types import ZONE_WORDS, StepHook
 from lensmodel.correction.audit import HELD
+from lensmodel.lens import Lens
+from lensmodel.model.identity import Identity, difference
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.values import CORRECTED, PhotoMetadata
-from lensmodel.workflow.correcting import SEEN_DB
-from lensmodel.workflow.identity import Identity, difference
-from lensmodel.workflow.lens import Lens
 
 EXTENSION: Final[dict[OutputFormat | None, str]] = {None: ".tif", "tiff32": ".tif", "png8": ".png"} | {
     written: ending for ending, written in reversed(FORMATS.items())
@@ -104,7 +101,6 @@ class Correction:
         paths: Sequence[Path],
         lens: Lens | None,
         bar: PacedProgress,
-        task: TaskID,
         *,
         begin: int = 0,
         more: bool = False,
@@ -114,9 +110,9 @@ class Correction:
         tell = self.display.detail if self.sorted else self.display.note
         left: Counter[str] = Counter()
         for number, path in enumerate(paths, start=begin):
-            bar.update(task, description=f"correcting {path.name}", more=more)
+            bar.show(description=f"correcting {path.name}", more=more)
             target = self.targets[path]
-            result = self._photo(path, target, lens, paths, partial(bar.part, task, number, more=more))
+            result = self._photo(path, target, lens, paths, partial(bar.part, number, more=more))
             match result["state"]:
                 case "failed":
                     self.display.error(f"{path}: {result['reason']}")
@@ -134,7 +130,7 @@ class Correction:
                     for remark in _remarks(result):
                         tell(f"{path.name}, {remark}")
             results.append({"photo": str(path), "output": str(target), **result})
-            bar.update(task, completed=number + 1, more=more)
+            bar.show(completed=number + 1, more=more)
         return results
 
     def _photo(

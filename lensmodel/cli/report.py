@@ -1,4 +1,4 @@
-"""`lensmodel report` and `lensmodel export`: what a profile says, and its PSFs for other programs."""
+"""`lensmodel report`, `psf` and `export`: what a profile says, and its PSFs for other programs."""
 
 from __future__ import annotations
 
@@ -9,26 +9,18 @@ from typing import Annotated, Final
 
 import typer
 
-from lensmodel.cli import files
-from lensmodel.cli.console import Display
+from lensmodel import quality
+from lensmodel.api import lateral_of
+from lensmodel.cli import files, options
+from lensmodel.cli.console import Display, mtf50_words
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import (
-    ANGLE,
-    RADIUS,
-    Channel,
-    Force,
-    Json,
-    ProfileFile,
-    Quiet,
-    Size,
-    Verbose,
-    aperture_option,
-)
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
+from lensmodel.core.geometry import zone_of
 from lensmodel.core.names import camera_name, full_name
-from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel
+from lensmodel.core.psf import rms_width
+from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings
+from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
@@ -42,9 +34,8 @@ from lensmodel.report import (
 )
 from lensmodel.report import export as write_psfs
 from lensmodel.report.tables import to_csv
-from lensmodel.workflow.correcting import lateral_of
 
-Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
+Aperture = Annotated[float | None, options.aperture_option("f-number; default: the widest that a photo had.")]
 
 FORMS: Final = (".html", ".pdf", ".png", ".csv", ".json")
 COMPARED: Final = "comparison.pdf"
@@ -52,7 +43,7 @@ COMPARED: Final = "comparison.pdf"
 
 def report(
     context: typer.Context,
-    profile: ProfileFile,
+    profile: options.ProfileFile,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -77,10 +68,10 @@ def report(
             help="A photo of this lens on which lateral colour is measured; may be repeated; needs --output.",
         ),
     ] = None,
-    json_output: Json = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
+    json_output: options.Json = False,
+    force: options.Force = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
 ) -> None:
     """Say how sharp a lens is, whether it is centred, and which photo would help most.
 
@@ -109,10 +100,10 @@ def report(
     if photo and output is None:
         raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
-    with shown.busy("computing its PSFs at 200 places"):
+    with shown.progress("computing its PSFs at 200 places"):
         found = measured(profile, aperture, photo or [], whole=output is not None)
     if output is not None:
-        with shown.busy("drawing"):
+        with shown.progress("drawing"):
             for target in targets:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
@@ -184,7 +175,7 @@ def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
 
 def export(
     context: typer.Context,
-    profile: ProfileFile,
+    profile: options.ProfileFile,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Where to write: a file.")],
     file_format: Annotated[
         str | None,
@@ -193,18 +184,18 @@ def export(
         ),
     ] = None,
     aperture: Aperture = None,
-    channel: Channel = "g",
+    channel: options.Channel = "g",
     rows: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Rows of the grid of places.")] = 5,
     cols: Annotated[
         int, typer.Option(min=1, max=100, metavar="N", help="Columns of the grid of places.")
     ] = 7,
-    r: Annotated[float | None, RADIUS] = None,
-    phi: Annotated[float | None, ANGLE] = None,
-    size: Size = 31,
-    json_output: Json = False,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = 0,
+    r: Annotated[float | None, options.RADIUS] = None,
+    phi: Annotated[float | None, options.ANGLE] = None,
+    size: options.Size = 31,
+    json_output: options.Json = False,
+    force: options.Force = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
 ) -> None:
     """Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.
 
@@ -225,7 +216,7 @@ def export(
         raise UsageError("--phi needs --r: together they name a single place")
     with files.as_usage():
         place = None if r is None else FieldPosition(r, phi or 0.0)
-    with shown.busy("computing its PSFs"):
+    with shown.progress("computing its PSFs"):
         model = files.profile_at(profile).model
         psfs = psf_grid(
             model,
@@ -257,7 +248,62 @@ def _format(output: Path, named: str | None) -> str:
     return chosen
 
 
-def _settings(model: LensModel, aperture: float | None, channel: Channel) -> LensSettings:
+def _settings(model: LensModel, aperture: float | None, channel: options.Channel) -> LensSettings:
     with files.as_usage():
         chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
     return chosen.with_channel(channel)
+
+
+def psf(
+    context: typer.Context,
+    profile: options.ProfileFile,
+    r: Annotated[float, options.RADIUS] = 0.0,
+    phi: Annotated[float, options.ANGLE] = 0.0,
+    aperture: Annotated[float | None, options.aperture_option("f-number; default: all together.")] = None,
+    channel: options.Channel = "g",
+    size: options.Size = 55,
+    json_output: options.Json = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
+) -> None:
+    """Show what the lens makes of a point of light at one place in the picture.
+
+    Examples:
+
+        lensmodel psf my-24mm.lensprofile --r 0.9 --phi 0.6 --aperture 1.4
+
+        lensmodel psf my-24mm.lensprofile --json
+
+    `lensmodel export` writes it to a file.
+
+    Exit status: 0 answered, 1 the profile cannot be used, 2 wrong usage.
+    """
+    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
+    with files.as_usage():
+        place = FieldPosition(r, phi)
+        settings = LensSettings(aperture=aperture, channel=channel)
+    with shown.progress("computing the PSF"):
+        answer = files.profile_at(profile).model.query(place, settings, size)
+    tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
+    shown.result(_psf_words(place, answer, tangential, sagittal))
+    support = ("effective_samples", "photos", "extrapolated", "predicted_error", "nearest", "answered_by")
+    shown.document(
+        {
+            "query": {"r": place.r, "phi": place.phi, "aperture": aperture, "channel": channel, "size": size},
+            "support": {name: getattr(answer, name) for name in (*support, "weights")},
+            "rms_width_px": rms_width(answer.kernel),
+            "mtf50": {"tangential": tangential, "sagittal": sagittal},
+            "psf": {"shape": list(answer.kernel.shape), "dtype": "float32", "data": answer.kernel.tolist()},
+        }
+    )
+
+
+def _psf_words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
+    beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
+    photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
+    return (
+        f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
+        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; "
+        f"{photos}, {answer.effective_samples:.1f} effective samples, expected error "
+        f"{answer.predicted_error:.2f}{beyond}; answered by {answer.answered_by}"
+    )

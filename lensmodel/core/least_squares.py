@@ -69,12 +69,10 @@ def fista(
 
 
 def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, float]:
-    """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that.
-
-    All eigenvalues of a kernel of 55 x 55 pixels take ten times as long as to find out by a Cholesky
-    factor that none is too small, as is usual.
-    """
-    if len(a) > _FEW:
+    """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that."""
+    if (
+        len(a) > _FEW
+    ):  # all eigenvalues take ten times as long as a Cholesky factor, which tells of small ones
         start = np.ones(len(a))
         largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
         least = _LEAST * largest

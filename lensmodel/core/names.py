@@ -35,10 +35,7 @@ def camera_name(maker: str | None, model: str | None) -> str:
 
 
 def name_key(text: str | None) -> str:
-    """Return what is compared of a maker or a model.
-
-    Case, punctuation and blanks differ between programs that write the same name.
-    """
+    """Return what is compared of a maker or a model: programs differ in case, punctuation and blanks."""
     return re.sub(r"[\W_]+", "", (text or "").casefold())
 
 

@@ -48,10 +48,7 @@ def pool(executor: Executor | None, workers: int | None, part: object = None) ->
 
 
 def _begin() -> None:
-    """Prepare a worker, before it imports NumPy: one thread, and Ctrl-C is left to who started it.
-
-    A worker ends with its parent, however that ends: left alone it would wait for work for ever.
-    """
+    """Prepare a worker, before it imports NumPy: one thread, no Ctrl-C, and an end with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     for name in _ONE_THREAD:

@@ -43,20 +43,6 @@ def delta(size: int) -> Kernel:
     return as_kernel(kernel)
 
 
-def gaussian(size: int, covariance: npt.ArrayLike) -> Kernel:
-    """Gaussian kernel of a covariance in px², axes (row, col), integrated over the pixel: 5 x 5 samples."""
-    over = 5
-    cov = np.asarray(covariance, dtype=np.float64) + np.eye(2) * 1e-4
-    half = (size * over) // 2
-    t = np.arange(-half, half + 1) / over
-    inverse = np.linalg.inv(cov)
-    rows, cols = t[:, None], t[None, :]
-    fine = np.exp(
-        -0.5 * (inverse[0, 0] * rows**2 + 2 * inverse[0, 1] * rows * cols + inverse[1, 1] * cols**2)
-    )
-    return as_kernel(fine.reshape(size, over, size, over).sum(axis=(1, 3)))
-
-
 def resized(kernel: Kernel, size: int) -> Kernel:
     """Crop or zero-pad to another odd side, centre kept, renormalised."""
     if size < 1 or size % 2 == 0:
@@ -98,10 +84,7 @@ def centred(kernel: npt.ArrayLike) -> Kernel:
 
 
 def second_moments(kernel: npt.NDArray[np.float64], level: float = WING_LEVEL) -> npt.NDArray[np.float64]:
-    """Central second moments in px² as the matrix [[rr, rc], [rc, cc]].
-
-    Only values above `level` times the peak count: faint wings would dominate the sum.
-    """
+    """Central second moments in px², [[rr, rc], [rc, cc]], of the values above `level` times the peak."""
     core = np.where(kernel > level * kernel.max(), kernel, 0.0)
     core = core / core.sum()
     row, col = centroid(core)
@@ -111,9 +94,9 @@ def second_moments(kernel: npt.NDArray[np.float64], level: float = WING_LEVEL) -
     return np.array([[float((core * dr * dr).sum()), rc], [rc, float((core * dc * dc).sum())]])
 
 
-def rms_width(kernel: npt.NDArray[np.float64], level: float = WING_LEVEL) -> float:
+def rms_width(kernel: npt.NDArray[np.float64]) -> float:
     """Root of the mean second moment per axis, in pixels (the sigma of a round Gaussian)."""
-    return math.sqrt(max(float(np.trace(second_moments(kernel, level))) / 2.0, 0.0))
+    return math.sqrt(max(float(np.trace(second_moments(kernel))) / 2.0, 0.0))
 
 
 def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[np.complex128]:
@@ -124,40 +107,6 @@ def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[
     grid = np.zeros(shape)
     grid[:size, :size] = kernel
     return scipy.fft.rfft2(np.roll(grid, (-(size // 2), -(size // 2)), axis=(0, 1)))
-
-
-@dataclass(frozen=True, slots=True)
-class KernelDistance:
-    """How far one kernel is from another after the best sub-pixel shift."""
-
-    ncc: float  # normalised cross-correlation; 1 for equal shapes
-    rel_l2: float  # |a - b| / |b|
-    mtf_rmse: float  # root mean square difference of the moduli for |f| <= 0.5 cycles/pixel
-    shift: tuple[float, float]  # the shift `(row, col)` in pixels that was applied to `a`
-
-
-def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDistance:
-    """Compare kernel `a` with the reference `b`, both normalised, sub-pixel aligned.
-
-    By Parseval the peak c of their correlation yields both figures at once::
-
-        ncc = c / (|a| |b|)        rel_l2² = (|a|² + |b|² - 2 c) / |b|²
-    """
-    a, b = a / a.sum(), b / b.sum()
-    n = int(scipy.fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
-    fa, fb = _centred_fft(a, n), _centred_fft(b, n)
-    cross = fa * np.conj(fb)
-    peak, c = correlation_peak(cross, whole_peak(cross))
-    aa, bb = float((a * a).sum()), float((b * b).sum())
-    freq = scipy.fft.fftfreq(n)
-    inside = np.hypot(freq[:, None], freq[None, :]) <= 0.5
-    difference = (np.abs(fa) - np.abs(fb))[inside]
-    return KernelDistance(
-        ncc=c / math.sqrt(aa * bb),
-        rel_l2=math.sqrt(max(aa + bb - 2 * c, 0.0) / bb),
-        mtf_rmse=float(np.sqrt(np.mean(difference**2))),
-        shift=(-peak[0], -peak[1]),
-    )
 
 
 def whole_peak(cross: npt.NDArray[np.complex128]) -> tuple[int, int]:
@@ -198,13 +147,6 @@ def correlation_peak(
         if np.abs(step).max() < 1e-6:
             break
     return (float(d[0]), float(d[1])), float(phased().real.sum()) / n**2
-
-
-def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.complex128]:
-    half = kernel.shape[0] // 2
-    grid = np.zeros((n, n))
-    grid[: kernel.shape[0], : kernel.shape[1]] = kernel
-    return scipy.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
 TOKEN_LENGTH: Final = 192  # numbers of the token of a patch

@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 class Registry(Generic[T]):
     """Named factories of one kind.
 
-    `extended` leaves this one as it is; `register` adds to it for the whole process. An installed package
-    makes its methods known to every process, those of the command and of the service too, by entry points::
+    `register` adds to it for the whole process. An installed package makes its methods known to every
+    process, those of the command and of the service too, by entry points::
 
         [project.entry-points."lensmodel.estimators"]
         mine = "my_package:MyEstimator"
@@ -75,11 +75,6 @@ class Registry(Generic[T]):
             raise InvalidInputError(f"the {self.kind} {name!r} exists already, or is no name; choose another")
         assert isinstance(self.entries, dict)
         self.entries[name] = factory
-
-    def extended(self, **entries: Callable[..., T]) -> Registry[T]:
-        """Return a registry with more entries; this one stays as it is."""
-        added = {name.replace("_", "-"): factory for name, factory in entries.items()}
-        return Registry(self.kind, {**self.entries, **added}, self.group)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self.entries, *_entry_points(self.group)}))

@@ -256,12 +256,8 @@ def cross_validate(
 
 
 def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Group samples by photo; those of a photo that is alone at its focal length are held out one by one.
-
-    Without that photo nothing would be known of the focal length: that says how a lens changes when one
-    zooms, not how well its samples agree.
-    """
-    groups = photo.copy()
+    """Group samples by photo; those of a photo that is alone at its focal length are held out one by one."""
+    groups = photo.copy()  # without that photo the error would be that of zooming, not of its samples
     for number in np.unique(photo):
         own = photo == number
         known = octaves[own & ~np.isnan(octaves)]

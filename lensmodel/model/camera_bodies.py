@@ -68,21 +68,21 @@ def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
 
 def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> list[PsfSample]:
     """Samples as a body of another pitch would have seen them; those of that pitch stay themselves."""
-    return [_seen_with(s, pitch_um) for s in samples]
 
+    def seen(sample: PsfSample) -> PsfSample:
+        own, half, side = sample.pixel_pitch_um, sample.half_diagonal_px, sample.kernel.shape[0]
+        if own is None or pitch_um is None or alike(own, pitch_um):
+            return sample
+        wanted = min(2 * math.ceil(side / 2 * own / pitch_um) + 1, 2 * side + 1)
+        return replace(
+            sample,
+            kernel=rescaled(sample.kernel, own, pitch_um, wanted),
+            encoded=None,  # its statistics are of the other pixels
+            pixel_pitch_um=pitch_um,
+            half_diagonal_px=None if half is None else half * own / pitch_um,
+        )
 
-def _seen_with(sample: PsfSample, pitch_um: float | None) -> PsfSample:
-    own, half, side = sample.pixel_pitch_um, sample.half_diagonal_px, sample.kernel.shape[0]
-    if own is None or pitch_um is None or alike(own, pitch_um):
-        return sample
-    wanted = min(2 * math.ceil(side / 2 * own / pitch_um) + 1, 2 * side + 1)
-    return replace(
-        sample,
-        kernel=rescaled(sample.kernel, own, pitch_um, wanted),
-        encoded=None,  # its statistics are of the other pixels
-        pixel_pitch_um=pitch_um,
-        half_diagonal_px=None if half is None else half * own / pitch_um,
-    )
+    return [seen(sample) for sample in samples]
 
 
 def alike(a: float, b: float) -> bool:

@@ -118,10 +118,7 @@ class LearnedField:
     def _memory_of(
         self, pitch_um: float | None, cell: tuple[float | None, ...]
     ) -> tuple[NDArray[np.intp], Memory, PatchKind]:
-        """Samples near a cell of place and settings, of all without a cell, with their keys and values.
-
-        And the kind of file of most of them: a question has none of its own.
-        """
+        """Samples near a cell of places, or all; their keys and values; the usual kind of files."""
         group = self._group(pitch_um)
         rows = group.rows
         if cell:

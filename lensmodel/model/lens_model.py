@@ -60,23 +60,9 @@ class LensModel:
         if kernels and self._regression is None:
             self._regression = Regression.of(kernels, settings)
 
-    # --- building -------------------------------------------------------------------------------
-
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:
-        """Build a model from samples.
-
-        Parameters
-        ----------
-        samples : sequence of PsfSample
-            One that is there already, of the same photo and place, is not counted again.
-        settings : ModelSettings, optional
-
-        Raises
-        ------
-        NoSamplesError
-            If there are none, or all photos are excluded.
-        """
+        """Build a model from samples; one of a photo and place that is there already is not counted again."""
         return cls(_distinct(camera_bodies.on_one_circle(samples)), settings or ModelSettings())
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
@@ -87,8 +73,6 @@ class LensModel:
             return self
         return LensModel(every, self.settings, self._regression)
 
-    # --- asking ---------------------------------------------------------------------------------
-
     def query(
         self,
         position: FieldPosition,
@@ -97,22 +81,9 @@ class LensModel:
         *,
         pitch_um: float | None = None,
     ) -> PsfAnswer:
-        """Return the PSF at a place, with what stands behind it.
+        """Return the PSF at a place, of odd side `size`, with what stands behind it.
 
-        Parameters
-        ----------
-        position : FieldPosition
-        settings : LensSettings
-            Unknown settings take no part.
-        size : int
-            Odd side in pixels.
-        pitch_um : float, optional
-            Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
-
-        Raises
-        ------
-        InvalidInputError
-            If the size is even or not positive, or the pitch is not positive.
+        Unknown settings take no part; `pitch_um` is that of the body that asks, by default of the samples.
         """
         pitch_um = self._asked(size, pitch_um)
         parts = [part.ask(position, settings, size, pitch_um) for part in self._answering]
@@ -149,10 +120,7 @@ class LensModel:
         *,
         pitch_um: float | None = None,
     ) -> NDArray[np.float64]:
-        """Return the PSFs of many places at one setting, float64 of shape (n, size, size).
-
-        The same numbers as of `query`, whose parameters it takes; a regression alone is several times faster.
-        """
+        """Return the kernels of `query` of many places, (n, size, size); a regression alone is faster."""
         pitch_um = self._asked(size, pitch_um)
         if not positions:
             return np.empty((0, size, size))
@@ -171,8 +139,6 @@ class LensModel:
         if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
             raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
         return self.pitch_um if pitch_um is None else pitch_um
-
-    # --- what it is made of ---------------------------------------------------------------------
 
     @property
     def mode(self) -> str:
@@ -260,10 +226,7 @@ def _place_of(sample: PsfSample) -> Hashable:
 
 
 def _distinct(samples: Sequence[PsfSample], known: int = 0) -> tuple[PsfSample, ...]:
-    """The first `known` samples and those that are new beside them.
-
-    No encoded ones of a known photo, none of one place and estimator twice.
-    """
+    """The first `known` samples, and those of other places and estimators, or encoded ones of new photos."""
     photos = {s.photo for s in samples[:known] if s.encoded is not None}
     kept, keys = list(samples[:known]), {_key_of(s) for s in samples[:known]}
     for sample in samples[known:]:

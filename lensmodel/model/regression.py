@@ -30,8 +30,7 @@ from lensmodel.model import camera_bodies
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings, Part
 from lensmodel.model.bandwidths import CrossValidation, bandwidths, cross_validate
-from lensmodel.model.local_frame import Answers, LocalKernels
-from lensmodel.model.widths import WidthField
+from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5

@@ -12,15 +12,5 @@ References
 
 from lensmodel.neural.features import Conditions
 from lensmodel.neural.network import FieldAnswer, FieldNetwork, Memory
-from lensmodel.neural.statistics import LENGTH, WINDOW, patch_statistics, to_octant
 
-__all__ = [
-    "LENGTH",
-    "WINDOW",
-    "Conditions",
-    "FieldAnswer",
-    "FieldNetwork",
-    "Memory",
-    "patch_statistics",
-    "to_octant",
-]
+__all__ = ["Conditions", "FieldAnswer", "FieldNetwork", "Memory"]

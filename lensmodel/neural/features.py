@@ -1,22 +1,82 @@
 """Places, settings and their relations as numbers, the same in training and in use.
 
-A place is turned into the octant 0 <= y <= x first; how a sample lies to a query is told in the frame of the
-query's octant. So nothing changes when all places are turned by one symmetry of the square.
+A lens has no preferred side, and a pixel grid looks the same after a quarter turn or in a mirror. So every
+place is turned into the octant 0 <= y <= x first, how a sample lies to a query is told in the frame of the
+query's octant, and what the network says is turned back. An octant is a triple of flags: mirror x, then
+mirror y, then exchange x and y. Places have x to the right and y upwards; arrays have rows downwards.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import KINDS, PatchKind
 from lensmodel.core.types import LensSettings
-from lensmodel.neural.symmetry import OCTANTS, octant_of, relative_octant, to_octant_place
+
+OCTANTS: Final = 8
+DIRECTIONS: Final = 16
+"""Directions of statistics over the full circle, pi/8 apart, counter-clockwise from the right."""
+
+
+def octant_of(xy: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Octant of places, shape (..., 2): 1 if x is mirrored, plus 2 if y is, plus 4 if they are exchanged."""
+    x, y = xy[..., 0], xy[..., 1]
+    return (x < 0) + 2 * (y < 0) + 4 * (np.abs(y) > np.abs(x))
+
+
+def to_octant_place(octant: NDArray[np.int64], xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Turn places of shape (..., 2) by octants that broadcast against (...)."""
+    x = np.where(octant & 1, -xy[..., 0], xy[..., 0])
+    y = np.where(octant & 2, -xy[..., 1], xy[..., 1])
+    swap = (octant & 4) > 0
+    return np.stack([np.where(swap, y, x), np.where(swap, x, y)], -1)
+
+
+def direction_order(octant: int) -> NDArray[np.int64]:
+    """Where each of the 16 directions of an array in the octant's frame is found in the image's frame."""
+    k = np.arange(DIRECTIONS)
+    if octant & 1:
+        k = (8 - k) % DIRECTIONS
+    if octant & 2:
+        k = -k % DIRECTIONS
+    if octant & 4:
+        k = (4 - k) % DIRECTIONS
+    return np.argsort(k)
+
+
+def to_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn images of shape (..., n, n) into the frame of an octant."""
+    if octant & 1:
+        image = image[..., ::-1]
+    if octant & 2:
+        image = image[..., ::-1, :]
+    return np.swapaxes(image[..., ::-1, ::-1], -1, -2) if octant & 4 else image
+
+
+def from_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn images of shape (..., n, n) back from the frame of an octant."""
+    if octant & 4:
+        image = np.swapaxes(image[..., ::-1, ::-1], -1, -2)
+    if octant & 2:
+        image = image[..., ::-1, :]
+    return image[..., ::-1] if octant & 1 else image
+
+
+def relative_octant(query: NDArray[np.int64], sample: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Symmetry that leads from the frame of a sample's octant to that of the query's, 0..7."""
+    return _RELATIVE[query, sample]
+
+
+# to_octant_place as matrices; the inverse of one is its transpose
+_MATRICES: Final = to_octant_place(np.arange(OCTANTS)[:, None], np.eye(2)).mT
+_PRODUCTS: Final = _MATRICES[:, None] @ _MATRICES.mT[None]
+_RELATIVE: Final = (_PRODUCTS[:, :, None] == _MATRICES).all(axis=(-1, -2)).argmax(axis=-1)
+
 
 FAR_M: Final = 50.0
 """Metres: focus farther away is as good as infinite: a lens of 300 mm moves less than 2 mm for it."""
@@ -28,45 +88,19 @@ SETTINGS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What is known of how a patch was taken, or of what is asked for; None is unknown.
-
-    Parameters
-    ----------
-    f_number : float or None
-    pitch_um : float or None
-        Pixel pitch in micrometres.
-    focal_mm, focus_m : float or None
-        Focal length and focus distance.
-    kind : {"raw", "tiff", "jpeg"}
-        What the file holds: samples of the mosaic, developed planes, or those of a camera.
-
-    Raises
-    ------
-    InvalidInputError
-        If a value is not positive, or the kind is not known.
-    """
+    """What is known of how a patch was taken, or of what is asked for: positive, or None for unknown."""
 
     f_number: float | None = None
-    pitch_um: float | None = None
+    pitch_um: float | None = None  # of a pixel
     focal_mm: float | None = None
     focus_m: float | None = None
-    kind: PatchKind = "raw"
+    kind: PatchKind = "raw"  # samples of the mosaic, developed planes, or those of a camera
 
     @classmethod
     def of(cls, settings: LensSettings, pitch_um: float | None, kind: PatchKind) -> Conditions:
         """Take them from settings of a lens; infinite focus is that of `FAR_M`."""
         focus_m = None if settings.focus_m is None else min(settings.focus_m, FAR_M)
         return cls(settings.aperture, pitch_um, settings.focal_mm, focus_m, kind)
-
-    def __post_init__(self) -> None:
-        for name in ("f_number", "pitch_um", "focal_mm", "focus_m"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(f"{name} must be positive, or None where it is unknown, got {value}")
-        if self.kind not in KINDS:
-            raise InvalidInputError(
-                f"the kind of a file must be one of {', '.join(KINDS)}, got {self.kind!r}"
-            )
 
     def row(self) -> NDArray[np.float64]:
         """As numbers, float64 of shape (SETTINGS,); unknown ones are NaN."""

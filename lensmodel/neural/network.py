@@ -29,18 +29,19 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
+from scipy.special import erf, softmax
 
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.neural.features import (
     DISTANCES,
     Conditions,
     condition_features,
+    from_octant_image,
+    octant_of,
     place_features,
     relation_features,
 )
 from lensmodel.neural.statistics import LENGTH
-from lensmodel.neural.symmetry import from_octant_image, octant_of
 
 Array = NDArray[np.float32]
 
@@ -90,11 +91,6 @@ class FieldAnswer:
 
 def _gelu(x: Array) -> Array:
     return (0.5 * x * (1.0 + erf(x / np.float32(np.sqrt(2.0))))).astype(np.float32)
-
-
-def _softmax(x: Array, axis: int = -1) -> Array:
-    e = np.exp(x - x.max(axis, keepdims=True))
-    return e / e.sum(axis, keepdims=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +146,7 @@ class FieldNetwork:
         near = relation[..., :DISTANCES] @ np.abs(w[f"{block}.distance"])  # (q, n, heads)
         score += (directed @ relation.transpose(0, 2, 1) - near.transpose(0, 2, 1)).transpose(1, 0, 2)
         nothing = np.broadcast_to(w[f"{block}.nothing"][:, None, None], (*score.shape[:2], 1))
-        attention = _softmax(np.concatenate([score, nothing], -1))[..., :-1]
+        attention = softmax(np.concatenate([score, nothing], -1), axis=-1)[..., :-1]
         seen = (attention.transpose(1, 0, 2) @ relation).transpose(1, 0, 2)  # (heads, q, RELATION)
         taken = (attention @ value + seen @ w[f"{block}.relation_value"]).astype(np.float32)
         x = x + self._linear(f"{block}.out", taken.transpose(1, 0, 2).reshape(len(x), -1))
@@ -212,7 +208,7 @@ class FieldNetwork:
         hidden = _gelu(self._linear("kernel.0", self._normal("kernel.normal", x)))
         logits = self._linear("kernel.2", self._linear("kernel.1", hidden)).reshape(3, -1)
         told = self._linear("error.1", _gelu(self._linear("error.0", self._normal("error.normal", x))))[0]
-        kernels = from_octant_image(int(octant_of(place)[0]), assembled(_softmax(logits)))
+        kernels = from_octant_image(int(octant_of(place)[0]), assembled(softmax(logits, axis=-1)))
         return FieldAnswer(
             centred_kernels(kernels),
             np.exp(told[:3]).astype(np.float64),
@@ -242,10 +238,7 @@ def assembled(parts: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Kernels (..., n, n) with their centre of mass in the middle, shifted by linear interpolation.
-
-    The network is trained on centred kernels: what is left to do is a small part of a pixel.
-    """
+    """Kernels (..., n, n) moved by the part of a pixel that their centre of mass is off the middle."""
     moving: NDArray[np.float64] = np.asarray(kernels, np.float64)
     at = np.arange(moving.shape[-1]) - moving.shape[-1] // 2
     for axis, other in ((-1, -2), (-2, -1)):

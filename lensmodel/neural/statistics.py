@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Plane
-from lensmodel.neural.symmetry import DIRECTIONS, direction_order, octant_of
+from lensmodel.neural.features import DIRECTIONS, direction_order, octant_of
 
 WINDOW: Final = 128
 """Pixels: side of a patch; holds several times the widest kernel, and little of the field (chosen)."""
@@ -151,22 +151,10 @@ _DY: Final = np.round(np.outer(np.sin(_ANGLES), _SHIFTS)).astype(np.int64)
 def patch_statistics(
     mosaic: Plane, colours: NDArray[np.int8], read: float, shot: float
 ) -> NDArray[np.float32]:
-    """Statistics of a patch, in the frame of the image.
+    """Statistics of a patch in the frame of the image, (LENGTH,), finite for every finite input.
 
-    Parameters
-    ----------
-    mosaic : Plane, float32, shape (WINDOW, WINDOW)
-        Samples of a mosaic in linear light, black 0, white 1. Planes of a developed photo are sampled by a
-        mosaic first, so that one kind of input serves all files.
-    colours : ndarray of int8, shape (WINDOW, WINDOW)
-        Colour of each sample: 0 red, 1 green, 2 blue.
-    read, shot : float
-        The variance of the noise is read^2 + shot * value.
-
-    Returns
-    -------
-    ndarray of float32, shape (LENGTH,)
-        Finite for every finite input.
+    `mosaic` and `colours` are (WINDOW, WINDOW): samples in linear light, white 1, and the colour of each,
+    0 red, 1 green, 2 blue. The variance of the noise is read^2 + shot * value.
     """
     powers, level = [], []
     for colour, rings in ((0, _COLOUR_RINGS), (1, _GREEN_RINGS), (2, _COLOUR_RINGS)):
@@ -188,10 +176,7 @@ def patch_statistics(
 
 
 def to_octant(statistics: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Turn statistics (n, LENGTH) of `patch_statistics` into the frames of the octants of their places.
-
-    `xy` (n, 2) are in half diagonals, x to the right, y upwards.
-    """
+    """Turn statistics (n, LENGTH) into the frames of the octants of their places (n, 2)."""
     octants = octant_of(np.asarray(xy))
     out = np.empty_like(statistics)
     for octant in np.unique(octants):

@@ -1,17 +1,14 @@
 """Find the regions of a photo that are informative about the PSF."""
 
 from lensmodel.patches.checks import LEAST_PARTS, LEAST_PATCHES, require_enough
-from lensmodel.patches.rmap import r_map
-from lensmodel.patches.select import RMapSelector, Selector, select, selectors
-from lensmodel.patches.windows import Patch, Reason, Rejection, Selection
+from lensmodel.patches.select import Selector, select, selectors
+from lensmodel.patches.windows import Patch, Reason, Selection, r_map
 
 __all__ = [
     "LEAST_PARTS",
     "LEAST_PATCHES",
     "Patch",
-    "RMapSelector",
     "Reason",
-    "Rejection",
     "Selection",
     "Selector",
     "r_map",

@@ -63,10 +63,7 @@ class Details:
 
 
 def repeats(patch: Plane) -> bool:
-    """Whether a patch repeats itself like a fence or an arcade, so that no blur can be told from it.
-
-    Its autocorrelation then falls far below zero and comes back nearly to one.
-    """
+    """Whether the autocorrelation of a patch falls far below zero and comes back nearly to one: a fence."""
     power = np.abs(fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
     correlation = fft.irfft2(power, s=patch.shape)
     if not correlation[0, 0] > 0:
@@ -171,9 +168,7 @@ def _means(
 def _evidence(power: NDArray[np.float64], noise: float) -> float:
     """Bits a frequency: mean of log2(1 + max(P / N - 1, 0)) over the bands and sectors that blur empties.
 
-    It is the capacity of a channel with the scene as the signal: C. E. Shannon, "Communication in the
-    presence of noise", Proc. IRE 37, 1949. A frequency with signal below the noise says next to nothing
-    about what the lens did to it, one far above says it well.
+    Source: C. E. Shannon, "Communication in the presence of noise", Proc. IRE 37, 1949.
     """
     mean, count = _means(power, _grids(power.shape[0]).evidence)
     signal = np.maximum(mean / max(noise, 1e-30) - 1.0, 0.0)
@@ -181,22 +176,13 @@ def _evidence(power: NDArray[np.float64], noise: float) -> float:
 
 
 def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-    """Mean log of power over noise: at which frequencies and directions the window carries signal.
-
-    If the scene were known, the covariance of a least-squares kernel would be the noise over
-    this power, frequency by frequency.
-    """
+    """Mean log of power over noise: at which frequencies and directions the window carries signal."""
     mean, _ = _means(power, _grids(power.shape[0]).bands)
     return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
 
 
 def _period(power: NDArray[np.float64], sigma: float) -> float:
-    """Highest separate peak of the autocorrelation of the gradients.
-
-    A fence or a facade repeats itself, and a blind estimate then cannot tell one repetition
-    from the next. A long straight edge has a ridge through the origin, not a separate peak: on
-    the way from the origin the correlation must fall to half the peak's height.
-    """
+    """Highest peak of the autocorrelation of the gradients that a valley of half its height parts from 0."""
     size = power.shape[0]
     grids, middle, reach = _grids(size), size // 2, size // 3
     signal = np.maximum(power - sigma * sigma, 0.0) * grids.gradient
@@ -217,10 +203,7 @@ def _period(power: NDArray[np.float64], sigma: float) -> float:
 
 
 def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
-    """Mean step across the lines of an 8 px grid over the mean step elsewhere.
-
-    The step at a line is the difference minus what its neighbours on either side predict.
-    """
+    """Mean step across the lines of an 8 px grid over that elsewhere, less what neighbours predict."""
     ratios = []
     for axis in (0, 1):
         d = np.abs(np.diff(values, axis=axis))

@@ -51,11 +51,8 @@ def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) 
 def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
     """Choose up to `count` windows in field cells: their numbers, and those of their cells.
 
-    First the seeds, one a cell: always from the ring and octant that has the fewest so far, so
-    that the corners get their share, far from the other seeds, and there the best. Then
-    every cell in turn takes its best remaining neighbour, up to four. Two windows of one cell
-    differ by at most 0.12 in r; and by at most 24 degrees, or they lie less than a window apart
-    (where a window is large beside the frame, and near the centre, where the angle says little).
+    First the seeds, one a cell, from the rings and octants that have the fewest so far. Then every cell in
+    turn takes its best remaining neighbour, up to four.
     """
     order = _by_score(windows, score)
     # Half a window's distance between any two chosen; a whole one between the seeds, if there is room.

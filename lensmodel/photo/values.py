@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
 
+from lensmodel.core.errors import MetadataMissingError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import BayerPattern, NoiseModel, Planes
+from lensmodel.core.types import BayerPattern, LensSettings, NoiseModel, Planes
 
 _RAW: Final = (
     "3fr ari arw bay cap cr2 cr3 crw cs1 dc2 dcr dcs dng drf eip erf fff gpr ia iiq k25 kc2 kdc mdc mef mfw "
@@ -110,6 +111,26 @@ class PhotoMetadata:
     copyright: str | None = None
     rating: int | None = None
     keywords: tuple[str, ...] = ()
+
+    def settings(self, given: LensSettings | None = None) -> LensSettings:
+        """Settings of the lens as the file says; a caller's values fill what it leaves open.
+
+        The one rule of precedence: a value that is given for a folder of photos is meant for those among them
+        that do not say their own.
+        """
+        given = given or LensSettings()
+        return LensSettings(
+            aperture=given.aperture if self.aperture is None else self.aperture,
+            focal_mm=given.focal_mm if self.focal_mm is None else self.focal_mm,
+            focus_m=given.focus_m if self.focus_m is None else self.focus_m,
+        )
+
+    def require_aperture(self, given: LensSettings | None = None) -> None:
+        """Refuse a photo whose aperture neither the file nor the caller says."""
+        if self.settings(given).aperture is None:
+            raise MetadataMissingError(
+                "it does not say its aperture; give its f-number by --aperture, 2.8 for f/2.8"
+            )
 
     def without_serials(self) -> PhotoMetadata:
         """Return the same without the serials of body and lens, which are personal data."""

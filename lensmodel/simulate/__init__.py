@@ -8,12 +8,16 @@ from lensmodel.simulate.camera import (
     photograph,
     write_photo,
 )
-from lensmodel.simulate.draw import LENS_KINDS, draw_lens
-from lensmodel.simulate.lens import Aberrations, CameraLens, SimulatedField, SimulatedLens
+from lensmodel.simulate.lens import (
+    LENS_KINDS,
+    Aberrations,
+    CameraLens,
+    SimulatedField,
+    SimulatedLens,
+    draw_lens,
+)
 from lensmodel.simulate.scenes import (
     DEMO_SCENES,
-    Chart,
-    ChartEdge,
     demo_data_path,
     demo_scene,
     edge_chart,
@@ -28,8 +32,6 @@ __all__ = [
     "Aberrations",
     "BlurOptions",
     "CameraLens",
-    "Chart",
-    "ChartEdge",
     "SimulatedCamera",
     "SimulatedField",
     "SimulatedLens",

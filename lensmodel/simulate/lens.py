@@ -34,16 +34,16 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
 
@@ -59,10 +59,7 @@ def spectrum(channel: Channel) -> tuple[tuple[float, float], ...]:
 
 
 class CameraLens(Protocol):
-    """What a simulated camera needs to know of the lens in front of it; hashable.
-
-    Methods are as those of `SimulatedLens`.
-    """
+    """What a simulated camera needs to know of the lens in front of it; hashable."""
 
     @property
     def focal_mm(self) -> tuple[float, ...]:
@@ -106,12 +103,7 @@ class CameraLens(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SimulatedLens:
-    """One copy of a lens. Frozen and hashable; equal parameters give equal kernels.
-
-    Notes
-    -----
-    The focus distance takes no part: every photo is taken at the distance of best focus.
-    """
+    """One copy of a lens; every photo is taken at the distance of best focus."""
 
     # one for every entry of `focal_mm`; between them a zoom interpolates in log focal length
     optics: tuple[Aberrations, ...]
@@ -119,14 +111,6 @@ class SimulatedLens:
     maker: str = "Simulated Optics"  # as written into the metadata of its photos
     model: str = "Simulated 50mm f/2"
     serial: str = "SIM0000001"
-
-    def __post_init__(self) -> None:
-        if not self.optics or len(self.optics) != len(self.focal_mm):
-            raise InvalidInputError(
-                f"one Aberrations per focal length, got {len(self.optics)} for {len(self.focal_mm)}"
-            )
-        if sorted(set(self.focal_mm)) != list(self.focal_mm) or self.focal_mm[0] <= 0:
-            raise InvalidInputError(f"focal lengths must be positive and ascending, got {self.focal_mm}")
 
     def at_focal(self, focal_mm: float | None = None) -> Aberrations:
         """Optics at a focal length; None means the shortest."""
@@ -178,14 +162,7 @@ class SimulatedLens:
         pitch_um: float = DEFAULT_PITCH_UM,
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
-        """Kernel at field vector `h` (right, up), also outside the frame; see `kernel`.
-
-        `offset` is where its centre of mass shall lie, `(row, col)` in pixels.
-        """
-        if size < 3 or size % 2 == 0:
-            raise InvalidInputError(f"size must be odd and at least 3, got {size}")
-        if not 0.5 <= pitch_um <= 50.0:
-            raise InvalidInputError(f"pixel pitch must lie in 0.5..50 um, got {pitch_um}")
+        """Kernel at field vector `h` (right, up), also outside the frame; see `CameraLens`."""
         n = self.f_number(settings)
         pupil = Pupil.of(self.at_focal(settings.focal_mm), h, n)
         (col, row), spread = pupil.ray_spot(WAVELENGTH_NM[settings.channel] / 1000.0, n)
@@ -243,11 +220,7 @@ def disc(
     radius: float = 1.0,
     center: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[np.float32]:
-    """Disc with an edge one sample wide.
-
-    Its area does not jump with the sampling, and the diffraction wings of a hard edge, which would
-    wrap around, fade beyond one period of the discrete transform.
-    """
+    """Disc with an edge one sample wide: a hard one's diffraction wings would wrap around the transform."""
     dx, dy = px - np.float32(center[0]), py - np.float32(center[1])
     rho = np.sqrt(dx * dx + dy * dy)
     return np.clip((np.float32(radius) - rho) / np.float32(step) + np.float32(0.5), 0.0, 1.0)
@@ -281,11 +254,7 @@ class PixelOtf:
         return light / self.period**2
 
     def centred(self, size: int, guess: tuple[float, float], offset: tuple[float, float]) -> Kernel:
-        """Kernel whose centre of mass lies at `offset` (row, col) pixels from the middle one.
-
-        `guess` is where it would lie without a shift. The centre of mass is that of the finite
-        array, as everywhere in this library; light beyond the array does not count.
-        """
+        """Kernel whose centre of mass, unshifted near `guess`, is at `offset` (row, col) from the middle."""
         shift = (offset[0] - guess[0], offset[1] - guess[1])
         light = np.empty(0)
         for _ in range(8):
@@ -307,18 +276,13 @@ def pixel_otf(
     f_number: float,
     spread_um: float = 0.0,
 ) -> PixelOtf:
-    """Transfer function of a pupil seen through square pixels, summed over wavelengths.
-
-    Notes
-    -----
-    At fast apertures, where the band reaches beyond `_DETAILED_CUTOFF` cycles/pixel, its outermost
-    quarter is left to alias into frequencies that the pixel passes at less than 12 percent.
-    """
+    """Transfer function of a pupil seen through square pixels, summed over wavelengths."""
     shortest = min(wave for wave, _ in spectrum)
     extent = max(size * pitch_um, size * pitch_um / 2.0 + spread_um) * _WRAP_MARGIN
     unit = shortest * f_number  # micrometres of period a pupil sample
     period_um = min(max(extent, _MIN_SAMPLES * unit), max(_MAX_SAMPLES * unit, size * pitch_um))
     cutoff = pitch_um / unit
+    # at fast apertures the outermost quarter of the band aliases into what the pixel hardly passes
     factor = 2.0 if cutoff < _DETAILED_CUTOFF else 1.5
     grid = int(fft.next_fast_len(math.ceil(factor * (period_um / unit + 2.0)), real=True))
     image = np.zeros((grid, grid), dtype=np.float32)
@@ -374,13 +338,6 @@ class Aberrations:
     lateral_red: tuple[float, float] = (0.0, 0.0)
     lateral_blue: tuple[float, float] = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        if not 0.7 <= self.f_number <= SMALLEST_F:
-            raise InvalidInputError(f"open aperture must lie in f/0.7..f/{SMALLEST_F:g}, got {self.f_number}")
-        for each in fields(self):
-            if not np.isfinite(getattr(self, each.name)).all():
-                raise InvalidInputError(f"{each.name} must be finite, got {getattr(self, each.name)}")
-
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
         """Optics between two focal lengths: every term linear in `share` of `other`."""
         values: dict[str, Any] = {}
@@ -393,10 +350,7 @@ class Aberrations:
 
 @dataclass(frozen=True, slots=True)
 class Pupil:
-    """The pupil of one place and aperture: W(p) as coefficients of a polynomial, and what it lets through.
-
-    The stop is cut by a second circle far from the centre (cat's eye).
-    """
+    """The pupil of one place and aperture: W(p) as a polynomial, and what it lets through (cat's eye)."""
 
     quartic: float  # |p|^4
     cubic: tuple[float, float]  # (c.p) |p|^2
@@ -481,3 +435,131 @@ class Pupil:
         x, y = float((light * gx).sum() / total), float((light * gy).sum() / total)
         radius = float((np.hypot(gx - x, gy - y) * (light > 0)).max())
         return (scale * x, scale * y), scale * radius
+
+
+_Range: TypeAlias = tuple[float, float]
+
+_USUAL: Final = {
+    "spherical": 1.0,
+    "coma": 1.0,
+    "astigmatism": 1.0,
+    "field_curvature": 1.0,
+    "decentring": 0.05,
+    "uniform_coma": 0.03,
+    "uniform_astigmatism": 0.03,
+    "tilt": 0.03,
+}
+"""Proportions of the aberrations of a lens; uniform faults and tilt as shares of the corner's blur."""
+
+# Of each kind: its f-numbers, and the r.m.s. widths of the ray spot at the centre and at r = 1 (mean
+# over phi) in pixels of 4.5 um, from and to.
+_BLUR: Final[Mapping[str, tuple[Sequence[float], _Range, _Range]]] = {
+    "soft-fast": ((1.4, 1.6, 1.8), (0.9, 1.4), (2.2, 4.2)),
+    "coma": ((1.8, 2.0, 2.4), (0.3, 0.7), (1.3, 3.0)),
+    "astigmatism": ((2.0, 2.4, 2.8), (0.3, 0.7), (1.2, 3.0)),
+    "field-curvature": ((1.8, 2.0, 2.8), (0.3, 0.7), (1.2, 3.0)),
+    "decentred": ((1.8, 2.0, 2.8), (0.4, 0.8), (1.2, 2.6)),
+    "tilted": ((1.8, 2.0, 2.8), (0.3, 0.7), (1.0, 2.2)),
+    "nearly-perfect": ((2.8, 3.5, 4.0), (0.1, 0.25), (0.5, 0.8)),
+    "zoom": ((2.8, 3.5, 4.0), (0.4, 0.9), (1.2, 3.0)),
+}
+# And what is not as usual: a number, or from and to.
+_UNUSUAL: Final[Mapping[str, Mapping[str, float | _Range]]] = {
+    "soft-fast": {"coma": 1.5},
+    "coma": {"coma": 3.0, "astigmatism": 0.4, "field_curvature": 0.3},
+    "astigmatism": {"coma": 0.4, "astigmatism": 3.0, "field_curvature": 0.2},
+    "field-curvature": {"coma": 0.4, "astigmatism": 0.3, "field_curvature": 3.0},
+    "decentred": {"decentring": (0.2, 0.4), "uniform_coma": (0.15, 0.3)},
+    "tilted": {"tilt": (0.4, 0.7), "uniform_astigmatism": (0.05, 0.15)},
+    "nearly-perfect": {"tilt": 0.1},
+    "zoom": {"decentring": 0.12},
+}
+_PRIME_MM: Final = (24.0, 35.0, 50.0, 85.0)
+_ZOOM_MM: Final = ((18.0, 24.0, 28.0), (70.0, 85.0, 105.0))
+
+LENS_KINDS: Final = tuple(_BLUR)  # kinds of lenses that `draw_lens` knows
+
+
+def draw_lens(seed: int, kind: str | None = None) -> SimulatedLens:
+    """Draw a copy of a lens, whose ray spot has a drawn r.m.s. width at the centre and one in the corner."""
+    kind = LENS_KINDS[seed % len(LENS_KINDS)] if kind is None else kind
+    if kind not in _BLUR:
+        raise UnknownMethodError(f"no kind of lens {kind!r}; known: {', '.join(LENS_KINDS)}")
+    rng = np.random.default_rng([seed, LENS_KINDS.index(kind)])
+    f_numbers, *widths = _BLUR[kind]
+    choices = _ZOOM_MM if kind == "zoom" else (_PRIME_MM,)
+    focals = tuple(float(rng.choice(several)) for several in choices)
+    f_number = float(rng.choice(f_numbers))
+    center, corner = (float(rng.uniform(*ends)) for ends in widths)
+    drawn = {
+        name: float(rng.uniform(*value)) if isinstance(value, tuple) else value
+        for name, value in _UNUSUAL[kind].items()
+    }
+    proportions = {**_USUAL, **drawn}
+    optics = [_optics(proportions, f_number, center, corner, rng)]
+    if kind == "zoom":
+        corner *= float(rng.uniform(0.6, 1.1))
+        tele = _optics(proportions, f_number, center, corner, rng)
+        # a shifted element stays where it is when one zooms
+        optics.append(replace(tele, decentring=optics[0].decentring, tilt=optics[0].tilt))
+    name = f"Simulated {kind.title()} {'-'.join(f'{mm:.0f}' for mm in focals)}mm f/{f_number:g}"
+    return SimulatedLens(tuple(optics), focals, model=name, serial=f"SIM{seed:07d}")
+
+
+def _optics(
+    proportions: Mapping[str, float],
+    f_number: float,
+    center_px: float,
+    corner_px: float,
+    rng: np.random.Generator,
+) -> Aberrations:
+    """Draw the optics at one focal length, of some blur at the centre and at the corner."""
+    sign = rng.choice([-1.0, 1.0], size=4)
+    spherical, coma, astigmatism, curvature = (
+        proportions[name] * part
+        for name, part in zip(_USUAL, rng.uniform(0.5, 1.0, size=4) * sign, strict=False)
+    )
+    angle = rng.uniform(0.0, 2.0 * math.pi, size=4)
+
+    def vector(k: int, length: float) -> tuple[float, float]:
+        return length * math.cos(angle[k]), length * math.sin(angle[k])
+
+    center = Aberrations(f_number=f_number, spherical=spherical, defocus=-1.1 * spherical)
+    outer = Aberrations(
+        f_number=f_number,
+        coma=coma,
+        astigmatism=astigmatism,
+        field_curvature=curvature - astigmatism / 2.0,  # the flat compromise between the two foci
+    )
+    center_factor, outer_factor = center_px / _spot_px(center, 0.0), corner_px / _spot_px(outer, 1.0)
+    # defocus in waves whose ray spot is as wide: a disc of radius 2 widths
+    blur = 2.0 * corner_px * DEFAULT_PITCH_UM / (4.0 * REFERENCE_UM * f_number)
+    side = rng.choice([-1.0, 1.0])
+    colour = float(rng.uniform(0.1, 0.4)) * blur
+    return Aberrations(
+        f_number=f_number,
+        spherical=center.spherical * center_factor,
+        defocus=center.defocus * center_factor,
+        coma=outer.coma * outer_factor,
+        astigmatism=outer.astigmatism * outer_factor,
+        field_curvature=outer.field_curvature * outer_factor,
+        decentring=vector(0, proportions["decentring"] * float(rng.uniform(0.7, 1.3))),
+        uniform_coma=vector(1, proportions["uniform_coma"] * blur),
+        uniform_astigmatism=vector(2, proportions["uniform_astigmatism"] * blur),
+        tilt=vector(3, proportions["tilt"] * blur),
+        colour_focus=(side * colour * 0.3, colour * 0.6),
+        vignetting=(1.15, float(rng.uniform(0.15, 0.4))),
+        lateral_red=(float(rng.normal(0.0, 4e-4)), float(rng.normal(0.0, 3e-4))),
+        lateral_blue=(float(rng.normal(0.0, 4e-4)), float(rng.normal(0.0, 3e-4))),
+    )
+
+
+def _spot_px(optics: Aberrations, r: float) -> float:
+    """Root mean square width per axis of the ray spot on the axis phi = 0, pixels of 4.5 um."""
+    p = (np.arange(64) + 0.5) / 32.0 - 1.0
+    px, py = np.meshgrid(p, p)
+    inside = px**2 + py**2 <= 1.0
+    pupil = Pupil.of(optics, (r, 0.0), optics.f_number)
+    gx, gy = pupil.gradient(px[inside], py[inside], REFERENCE_UM)
+    scale = 2.0 * REFERENCE_UM * optics.f_number / DEFAULT_PITCH_UM
+    return scale * math.sqrt((float(np.var(gx)) + float(np.var(gy))) / 2.0)

@@ -110,15 +110,8 @@ def slanted_edge_scene(
     return (dark + (bright - dark) * edge_area(rows, cols, normal)).astype(np.float32)
 
 
-def edge_chart(
-    frame: Frame, *, margin: int = 40, guard: int = 27, dark: float = 0.15, bright: float = 0.75
-) -> Chart:
-    """Chart with edges in the centre, half way out and in all four corners, of both directions.
-
-    Notes
-    -----
-    A tile of the chart MTF of exactly one pixel box: sinc(f cos) sinc(f sin) along the normal.
-    """
+def edge_chart(frame: Frame, *, margin: int = 40, guard: int = 27) -> Chart:
+    """Chart with edges in the centre, half way out and in all four corners, of both directions."""
     tile = min(frame.height // 6, frame.width // 8)
     box = tile - 2 * guard
     if tile < _MIN_TILE or box < _MIN_TILE // 3:
@@ -126,9 +119,9 @@ def edge_chart(
             f"the chart needs a frame of at least {6 * _MIN_TILE} x {8 * _MIN_TILE} pixels and tiles larger "
             f"than twice the guard, got {frame.height} x {frame.width} and a guard of {guard}"
         )
-    plane = np.full(
-        (frame.height + 2 * margin, frame.width + 2 * margin), (dark + bright) / 2.0, dtype=np.float32
-    )
+    dark, bright = 0.15, 0.75
+    shape = (frame.height + 2 * margin, frame.width + 2 * margin)
+    plane = np.full(shape, (dark + bright) / 2.0, dtype=np.float32)
     edges = []
     for up, right, direction in _places(frame, tile):
         row = round(frame.center[0] - up - (tile - 1) / 2.0)
@@ -162,11 +155,7 @@ def _places(frame: Frame, tile: int) -> list[tuple[float, float, Direction]]:
 
 
 def _slanted(angle: float) -> float:
-    """Turn an angle a little, so that the edge crosses the pixel grid at many phases.
-
-    An edge whose slope is p / q with a small q meets only q phases, and the edge profile would
-    have holes.
-    """
+    """Turn an angle so that the edge meets many phases of the pixels: of slope p / q it meets only q."""
     for slant in _SLANTS_DEG:
         turned = angle + math.radians(slant)
         slope = abs(math.tan(turned))

@@ -27,8 +27,9 @@ from app.store import LensName, Store, database
 from app.store.database import Database, new_id, upgrade
 from app.store.owners import ANY_OWNER
 from app.store.tables import PROFILE_FILE, CorrectionRow, PhotoRow
+from lab.kernels import gaussian
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
+from lab.kernels import distance, gaussian
 from lab.scenes import dead_leaves
 from lab.schuler import BasisField, PhotoWindow, RadialBasis, Schuler, load_basis, principal, save_basis
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import distance, gaussian
 from lensmodel.core.types import FieldPosition, NoiseModel
 from lensmodel.simulate import draw_lens
 

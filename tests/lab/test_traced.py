@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.kernels import distance, gaussian
 from lab.scenes import dead_leaves
 from lab.traced import GridField, GridLens, read_grid
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import centroid, distance, gaussian
+from lensmodel.core.psf import centroid
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo

@@ -26,7 +26,7 @@ import sys
 sys.modules |= dict.fromkeys({ABSENT!r})  # None: as if it were not installed
 import numpy as np
 import lensmodel
-from lensmodel.core.psf import gaussian
+from lab.kernels import gaussian
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
 

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 import lensmodel
+from lab.kernels import gaussian
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.geometry import field_grid
-from lensmodel.core.psf import PsfSample, centroid, gaussian
+from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.workflow.lens import Lens
 
 HEAVY = {"numpy", "scipy", "rawpy", "fastapi", "sqlalchemy", "pydantic", "app", "lab"}
 SERVICE = {"fastapi", "sqlalchemy", "pydantic", "dbos", "structlog", "app", "lab"}

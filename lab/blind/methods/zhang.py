@@ -49,8 +49,9 @@ from lab.blind.steps.kernel_step import (
     unsure,
 )
 from lab.blind.steps.pyramid import RATIO, Latents, Level, View, coarse_to_fine, kernel_sides
+from lab.kernels import gaussian
 from lensmodel.blind.estimator import PsfEstimate, usable
-from lensmodel.core.psf import centred, gaussian
+from lensmodel.core.psf import centred
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _FIRST_SIGMA_PX = 0.7  # of the first kernel, in pixels of the coarsest level (chosen)

@@ -199,4 +199,4 @@ def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0
 
 def unsure(kernel: Kernel, size: int) -> PsfEstimate:
     """An estimate of odd side `size` whose method does not say how far it is off."""
-    return finished(kernel, size=size, error=math.nan, diagnostics={})
+    return finished(kernel, size=size, error=math.nan)

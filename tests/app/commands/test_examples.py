@@ -38,10 +38,11 @@ from app.store.accounts import Accounts
 from app.store.database import Database, upgrade
 from app.store.tables import KeyRow
 from lab import targets
+from lab.kernels import gaussian
 from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app, main
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.measured.page import TargetPage
 from lensmodel.model import LensModel, LensProfile, save_profile

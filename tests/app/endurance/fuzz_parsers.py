@@ -29,9 +29,10 @@ from PIL import Image
 from starlette.requests import Request
 
 from app.http import upload
+from lab.kernels import gaussian
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.psf import EncodedPatch, PsfSample, gaussian
+from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.photo.dng import write_bayer_dng

@@ -16,10 +16,10 @@ from deadline import Deadline
 from PIL import Image
 from running import LIGHT, PATIENCE_S, Service, running, write_photo
 
+from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.simulate import demo_data_path
-from lensmodel.workflow import sampling
 
 KNOWN_CODES = {
     "malformed_upload",
@@ -135,7 +135,7 @@ def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) ->
     path.write_bytes(OWN[name])
 
     with pytest.raises(LensModelError) as refusal:
-        sampling.samples_of_photo(path, sampling.Config(LensSettings(4.0), count=2))
+        sampling.samples_of_photo(path, sampling.configured("default", LensSettings(4.0), patch_count=2))
 
     assert refusal.value.code in KNOWN_CODES
     assert len(str(refusal.value)) > 15

@@ -14,7 +14,8 @@ from starlette.testclient import TestClient
 from app.store import LensName, Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import SampleRow
-from lensmodel.core.psf import PsfSample, gaussian, rms_width
+from lab.kernels import gaussian
+from lensmodel.core.psf import PsfSample, rms_width
 from lensmodel.core.types import FieldPosition
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other

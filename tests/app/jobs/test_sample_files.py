@@ -15,8 +15,9 @@ import pytest
 from app.jobs import sample_files, tasks
 from app.jobs.answers import ENCODED, KERNELS, SAMPLES
 from app.jobs.sample_files import DAMAGED, MAX_SIDE, read_samples, returned_samples, write_samples
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, gaussian
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import FieldPosition, LensSettings
 
 PATCH = EncodedPatch(np.ones(9, dtype=np.float16), np.ones(TOKEN_LENGTH, dtype=np.float16))

@@ -18,9 +18,9 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.owners import ANY_OWNER
 from lensmodel import photo
+from lensmodel.blind import sampling
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow import sampling
 
 HOT = 60
 

@@ -37,7 +37,8 @@ from app.sandbox.runner import Budget
 from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
-from lensmodel.core.psf import PsfSample, gaussian
+from lab.kernels import gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
 Answer = Callable[[dict[str, Any], Path], Outcome]

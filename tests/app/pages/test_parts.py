@@ -30,8 +30,9 @@ from app.runtime.settings import Settings
 from app.store import LensName, Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
+from lab.kernels import gaussian
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 from lensmodel.correction.tiles.lattice import cells
 from lensmodel.photo import upright

@@ -18,14 +18,15 @@ from app.jobs.sample_files import write_samples
 from app.jobs.work import _measured
 from app.store import Store
 from app.store.owners import ANY_OWNER
+from lab.kernels import gaussian
+from lensmodel.blind import sampling
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, NoiseModel, ignore_step
 from lensmodel.measured import MeasuredPsf
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo
-from lensmodel.workflow import sampling
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096

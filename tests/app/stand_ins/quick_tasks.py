@@ -11,8 +11,9 @@ import numpy as np
 
 from app.jobs.sample_files import write_samples
 from app.sandbox.child import ProgressHook
+from lab.kernels import gaussian
 from lensmodel.core.files import save_array
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 CELLS = 8

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lensmodel.core.psf import PsfSample, gaussian
+from lab.kernels import gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import Camera, LensModel, LensProfile, load_profile, save_profile
-from lensmodel.workflow.identity import Identity, difference
+from lensmodel.model.identity import Identity, difference
 
 CANON = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
 BODY = Camera("Canon", "Canon EOS 5D", "0123")

@@ -26,8 +26,8 @@ from app.store import LensName, Store
 from app.store.database import Database, current, head, upgrade
 from app.store.owners import ANY_OWNER, ensure_owner
 from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import gaussian
 
 OWNER = "local"
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other

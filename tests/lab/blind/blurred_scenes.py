@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from lab.kernels import gaussian
 from lab.scenes import dead_leaves
-from lensmodel.core.psf import centred, gaussian
+from lensmodel.core.psf import centred
 from lensmodel.core.types import Kernel, Plane
 
 SIGMA = 0.01

@@ -12,6 +12,7 @@ from PIL import Image
 from scipy import ndimage, signal
 
 from lab import cases as making
+from lab import kernels
 from lab.blind import judge
 from lab.blind.benchmark import (
     UNTOUCHED,
@@ -39,7 +40,7 @@ from lensmodel.blind import PsfEstimate
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import FieldPosition, Kernel, NoiseModel, Plane
 from lensmodel.patches import Patch
 
 SMALL = {"patch": 128, "cases": 3, "half": "all"}
@@ -62,7 +63,6 @@ def answer(kernel: Kernel) -> PsfEstimate:
         kernel=kernel,
         confidence=0.5,
         predicted_error=0.3,
-        diagnostics={},
     )
 
 
@@ -81,10 +81,9 @@ class Fake:
         noise: Sequence[NoiseModel],
         *,
         size: int = 31,
-        on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
         self.asked.append(len(patches))
-        return answer(psf.gaussian(size, np.eye(2) * self.sigma**2))
+        return answer(kernels.gaussian(size, np.eye(2) * self.sigma**2))
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def scene() -> Plane:
 
 
 def test_judge_brings_a_blurred_scene_nearer_to_the_truth(scene: Plane) -> None:
-    kernel = psf.gaussian(15, [[2.0, 0.5], [0.5, 1.0]])
+    kernel = kernels.gaussian(15, [[2.0, 0.5], [0.5, 1.0]])
     blurred = signal.fftconvolve(np.pad(scene, 7, mode="reflect"), kernel, mode="valid")
     noisy = (blurred + np.random.default_rng(0).normal(0, 0.003, scene.shape)).astype(np.float32)
     restored = judge.deconvolved(noisy, kernel, 0.003, (0.0, 0.0))
@@ -123,7 +122,7 @@ def test_judge_brings_a_blurred_scene_nearer_to_the_truth(scene: Plane) -> None:
 
 def test_judge_returns_a_flat_patch_unchanged() -> None:
     flat = np.full((128, 128), 0.4, dtype=np.float32)
-    restored = judge.deconvolved(flat, psf.gaussian(11, np.eye(2)), 0.01, (0.0, 0.0))
+    restored = judge.deconvolved(flat, kernels.gaussian(11, np.eye(2)), 0.01, (0.0, 0.0))
 
     np.testing.assert_allclose(restored, 0.4, atol=1e-3)
 
@@ -141,11 +140,11 @@ def test_kernel_shifted_by_the_judge_is_the_kernel_shifted_on_the_grid() -> None
 
 
 def test_judge_undoes_the_shift_of_a_kernel(scene: Plane) -> None:
-    kernel = psf.gaussian(15, np.eye(2) * 2.0)
+    kernel = kernels.gaussian(15, np.eye(2) * 2.0)
     off = psf.as_kernel(ndimage.shift(np.pad(kernel, 3), (1.0, -2.0), order=1))
     blurred = ndimage.convolve(scene.astype(np.float64), kernel).astype(np.float32)
     straight = judge.deconvolved(blurred, kernel, 0.003, (0.0, 0.0))
-    aligned = judge.deconvolved(blurred, off, 0.003, psf.distance(off, kernel).shift)
+    aligned = judge.deconvolved(blurred, off, 0.003, kernels.distance(off, kernel).shift)
 
     np.testing.assert_allclose(aligned, straight, atol=1e-3)
 

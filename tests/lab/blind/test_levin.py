@@ -11,7 +11,8 @@ from scipy import signal
 
 from lab.blind.methods import compared
 from lab.cases import scene_of
-from lensmodel.core.psf import as_kernel, centred, delta, distance
+from lab.kernels import distance
+from lensmodel.core.psf import as_kernel, centred, delta
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 SIGMA = 0.003

@@ -7,8 +7,9 @@ import pytest
 from blurred_scenes import SIGMA, shot, stroke
 
 from lab.blind.methods import BlindMethod, compared
+from lab.kernels import distance
 from lensmodel.blind import estimators
-from lensmodel.core.psf import as_kernel, delta, distance
+from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,8 @@ from lab.blind.steps.pyramid import (
     resample,
     rescaled,
 )
-from lensmodel.core.psf import centroid, gaussian, second_moments
+from lab.kernels import gaussian
+from lensmodel.core.psf import centroid, second_moments
 from lensmodel.core.types import Kernel, NoiseModel
 
 

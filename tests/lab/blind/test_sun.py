@@ -10,8 +10,9 @@ from scipy import signal
 
 from lab.blind.methods.sun import SIDE, Sun, default_prior, edge_mask, edge_terms, image_step, target
 from lab.blind.steps.pyramid import View
+from lab.kernels import distance, gaussian
 from lab.training import blind_data
-from lensmodel.core.psf import as_kernel, delta, distance, gaussian
+from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.quality.edge import edge_area
 

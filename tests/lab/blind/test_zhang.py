@@ -8,7 +8,8 @@ from scipy import signal
 
 from lab.blind.methods.zhang import PatchPosterior, pooled_kernel
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
-from lensmodel.core.psf import as_kernel, delta, distance, gaussian
+from lab.kernels import distance, gaussian
+from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import Kernel
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory

@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lab.correction.filter_flow import EfficientFilterFlow, partition
-from lensmodel.core.psf import gaussian
+from lab.kernels import gaussian
 from lensmodel.correction.blur import UniformBlur
 
 

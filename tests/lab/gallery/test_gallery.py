@@ -27,12 +27,13 @@ from lab.gallery.measure import TILE, bars, measured
 from lab.gallery.page import ZOOM, entries_of, places, sheet, text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
 from lab.images import gains
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo import develop
-from lensmodel.workflow.lens import Lens
 
 Shown = NDArray[np.float64]
 GREY = 0.45

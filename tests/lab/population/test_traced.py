@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.kernels import distance
 from lab.population import traced
 from lab.population.kernels import TERMS, Renderer, spots
 from lab.population.prescriptions import (
@@ -24,7 +25,7 @@ from lab.population.traced import Faults, TracedLens, draw
 from lab.population.tracing import AIM_UM, Nominal
 from lab.traced import _centred, _moved, read_grid
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel, distance
+from lensmodel.core.psf import as_kernel
 from lensmodel.neural.network import SIDE
 
 DATA = Path(__file__).parents[2] / "lensmodel" / "data"

@@ -17,6 +17,7 @@ from PIL import Image
 from scipy import ndimage
 
 from lab.images import EVERY, as_shown, blocks, fidelity, strip, to_srgb
+from lab.kernels import distance
 from lab.reproduce import job, measure
 from lab.reproduce.cases import (
     BEFORE,
@@ -47,13 +48,13 @@ from lab.reproduce.tables import bars, groups, held, kept, paths, share, summary
 from lab.scenes import HARD_SCENES
 from lab.stored import ROOT, code_of, version_of
 from lab.traced import read_grid
+from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import as_kernel, distance
+from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
-from lensmodel.workflow.sampling import PRESETS, Preset
 
 DRAW = job.figures.draw
 
@@ -589,7 +590,7 @@ class Nothing:
     learned: ClassVar[list[str]]
     seconds = 0.0
 
-    def __init__(self, way: Preset, workers: int) -> None:
+    def __init__(self, way: Config, workers: int) -> None:
         del workers
         self.opened.append((way.estimator, way.kernel_size))
 

@@ -9,7 +9,7 @@ import pytest
 
 from lab.training.train_regions import Labelled, _arrays, fit
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.patches.good_regions import FEATURES
+from lensmodel.patches.select import FEATURES
 
 pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
 

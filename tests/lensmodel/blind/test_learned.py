@@ -30,7 +30,6 @@ def shot(height: int = 640, width: int = 896, **changed: object) -> LinearPhoto:
         (1.0, 1.0, 1.0),
         PhotoInfo("dng", width, height),
         Encoding(),
-        "test",
         sensor_noise=noise,
         cfa=RGGB,
     )

@@ -31,15 +31,15 @@ from running import SMALL, scene, write_photo
 from scipy import ndimage
 from typer.testing import CliRunner
 
+from lab.kernels import gaussian
 from lensmodel import photo
+from lensmodel.blind import sampling
 from lensmodel.cli import files, outputs
 from lensmodel.cli.console import EVERY_S, Pace, PacedProgress
 from lensmodel.cli.main import app
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
-from lensmodel.workflow import sampling
-from lensmodel.workflow.sampling import preset_of
 
 HERE = Path(__file__).parents[1]
 PROFILE = "my-24mm.lensprofile"
@@ -127,7 +127,8 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learn from two patches of a photo, too few for a wavefront: its fit takes longer than the rest."""
-    monkeypatch.setattr("lensmodel.workflow.sampling.Config", partial(sampling.Config, count=2))
+    few = {name: replace(preset, patches=2) for name, preset in sampling.PRESETS.items()}
+    monkeypatch.setattr("lensmodel.blind.sampling.PRESETS", few)
 
 
 # --- results -----------------------------------------------------------------------------------
@@ -361,7 +362,7 @@ def test_two_runs_on_one_profile_drop_nothing_of_each_other(
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
 
-    monkeypatch.setattr("lensmodel.workflow.calibrating.samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", estimated)
     done = here("calibrate", "one.dng", "-p", PROFILE)
 
     assert done.returncode == 0, done.stderr
@@ -657,7 +658,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
         refused = here("calibrate", "one.dng", "-p", profile, "--any-lens", *quick, "--model", asked)
         assert refused.returncode != 0
         assert f"has the model {has}, not {asked}" in refused.stderr
-        assert preset_of(load_profile(folder / profile).model).name == has
+        assert load_profile(folder / profile).model.mode == has
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from running import SMALL, write_photo
 from typer.testing import CliRunner
 
 import lensmodel
+from lensmodel.blind import sampling
 from lensmodel.cli.main import app
 from lensmodel.core import processes
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import load_profile
-from lensmodel.workflow import sampling
 
 
 class Counting(ThreadPoolExecutor):
@@ -70,11 +71,11 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
-    config = sampling.Config(estimator="default", count=4)
+    config = replace(sampling.PRESETS["default"], patches=4)
     here = sampling.samples_of_photo(photo, config, workers=1)
     with ThreadPoolExecutor(2) as threads:
         beside = sampling.samples_of_photo(photo, config, executor=threads)
-    sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), config)
+    sent = sampling.samples_of_bytes(photo.name, photo.read_bytes(), config, "")
 
     np.testing.assert_array_equal(stacked(beside), stacked(here))
     np.testing.assert_array_equal(stacked(sent), stacked(here))

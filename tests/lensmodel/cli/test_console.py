@@ -15,10 +15,11 @@ import pytest
 from in_process import lensmodel
 from running import SMALL, write_photo
 
+from lab.kernels import gaussian
 from lensmodel.cli import console
 from lensmodel.cli.console import Display, Pace, PacedProgress, aligned, clock, mtf50_words
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, StepHook
 
 
@@ -56,9 +57,8 @@ def test_a_cell_may_have_several_lines() -> None:
 
 def test_without_a_terminal_progress_is_told_in_lines() -> None:
     said: list[str] = []
-    with PacedProgress(say=said.append, every_s=0.0, disable=True) as lines:
-        task = lines.add_task("learning from a.dng", total=4)
-        lines.update(task, completed=1)
+    with PacedProgress("learning from a.dng", 4, say=said.append, every_s=0.0, disable=True) as bar:
+        bar.show(completed=1)
 
     assert said == ["[0:00]  25 % learning from a.dng"]
 
@@ -69,10 +69,9 @@ def test_time_left_is_told_by_the_pace_of_the_last_kind_of_work_and_no_share_fal
     said: list[str] = []
     clock_s = iter((0.0, 60.0, 120.0, 121.0, 124.0, 127.0))
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock_s))
-    lines = PacedProgress(say=said.append, every_s=0.0, disable=True)
-    task = lines.add_task("photos", total=10)
+    bar = PacedProgress("photos", 10, say=said.append, every_s=0.0, disable=True)
     for done, more in ((1.8, True), (1, True), (2, False), (3, False), (4, False)):  # one passed over
-        lines.update(task, completed=done, more=more)
+        bar.show(completed=done, more=more)
 
     assert said == [
         "[1:00]  18 % photos",
@@ -120,7 +119,7 @@ def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
 
     write_photo(tmp_path / "page.dng", 1, shape=SMALL)
     monkeypatch.setattr(console.time, "monotonic", lambda: now_s[0])
-    monkeypatch.setattr("lensmodel.workflow.measuring.samples_of_developed", measure)
+    monkeypatch.setattr("lensmodel.measured.photos.samples_of_developed", measure)
     done = lensmodel("measure", "target", "page.dng", "--profile", "a.lensprofile", cwd=tmp_path)
 
     assert "[0:20]   0 % page.dng: finding the page" in done.stderr.splitlines()
@@ -144,7 +143,7 @@ def test_a_measurement_and_its_report_count_the_same_places(
         ]
 
     write_photo(tmp_path / "stars.dng", 1, shape=SMALL)
-    monkeypatch.setattr("lensmodel.workflow.measuring.samples_of_developed", measure)
+    monkeypatch.setattr("lensmodel.measured.photos.samples_of_developed", measure)
     done = lensmodel("measure", "points", "stars.dng", "--profile", "a.lensprofile", cwd=tmp_path)
     report = lensmodel("report", "a.lensprofile", cwd=tmp_path)
 
@@ -167,8 +166,8 @@ def test_that_loops_are_compiled_is_said_in_words_above_the_bar(
 
 def test_quick_work_says_nothing() -> None:
     said: list[str] = []
-    with PacedProgress(say=said.append, disable=True) as lines:
-        lines.update(lines.add_task("a", total=1), completed=1)
+    with PacedProgress("a", 1, say=said.append, disable=True) as bar:
+        bar.show(completed=1)
 
     assert said == []
 

@@ -18,14 +18,15 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from running import SMALL, write_photo
 
+from lab.kernels import gaussian
+from lensmodel.blind.sampling import photo_id
 from lensmodel.cli.console import PacedProgress
 from lensmodel.cli.folder import Shot, _table, groups
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.model.profile import Camera
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
-from lensmodel.workflow.sampling import photo_id
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 AUTO = ("correct", "holiday", "--lens", "auto", "--profiles", "lenses", "--method", "fast")

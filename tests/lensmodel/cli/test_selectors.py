@@ -10,8 +10,8 @@ from in_process import lensmodel as command
 from running import write_photo
 
 import lensmodel
+from lensmodel.blind import sampling
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
-from lensmodel.workflow import sampling
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.kernels import gaussian
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.correction.audit import (
     CHECKS,

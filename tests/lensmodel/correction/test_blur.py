@@ -5,8 +5,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import signal
 
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel, delta, gaussian
+from lensmodel.core.psf import as_kernel, delta
 from lensmodel.correction.blur import (
     Drift,
     UniformBlur,

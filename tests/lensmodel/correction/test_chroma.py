@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from lab.kernels import gaussian
 from lensmodel import correction, photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
 from lensmodel.correction import StoredColour
 from lensmodel.photo.colour import curves_of

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import NoiseModel
 from lensmodel.correction import Sensor, SparseGradient
 from lensmodel.correction.blur import Drift, UniformBlur

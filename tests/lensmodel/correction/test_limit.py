@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from lensmodel.core.psf import gaussian
+from lab.kernels import gaussian
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor

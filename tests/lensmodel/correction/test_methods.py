@@ -8,9 +8,10 @@ import pytest
 from scipy import ndimage
 from skimage import restoration
 
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import delta, gaussian
+from lensmodel.core.psf import delta
 from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel
 from lensmodel.correction import (
     RichardsonLucy,

@@ -12,9 +12,10 @@ import pytest
 from scipy import ndimage
 
 from lab.images import psnr_of, to_srgb
+from lab.kernels import gaussian
 from lab.scenes import dead_leaves
 from lensmodel import photo
-from lensmodel.core.psf import as_kernel, delta, gaussian
+from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
 from lensmodel.correction import correct_planes
 from lensmodel.photo.dng import write_bayer_dng

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from lab.kernels import gaussian
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import BayerPattern, Channel, FieldPosition, NoiseModel
 from lensmodel.correction import PsfPosterior, correct_planes
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import gaussian, otf
+from lensmodel.core.psf import otf
 from lensmodel.correction.posterior import GRID, PsfPosterior
 
 SIDE = 31

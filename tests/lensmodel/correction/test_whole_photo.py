@@ -9,9 +9,9 @@ import pytest
 from scipy import ndimage
 
 from lab.correction.filter_flow import EfficientFilterFlow
+from lab.kernels import gaussian
 from lensmodel.core.errors import CancelledError, InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
 from lensmodel.correction import Bounds, Corrected, Roi, correct_planes
 from lensmodel.correction.deconvolver import Sensor, Solution

@@ -15,15 +15,18 @@ from PIL import Image, ImageDraw
 from scipy import ndimage, signal
 
 from lab import targets
+from lab.kernels import distance, gaussian
 from lensmodel import measured as measure
 from lensmodel import simulate
+from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
+from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, StepHook
 from lensmodel.measured.edges import SlantedEdges, squares_of
 from lensmodel.measured.page import PAPERS, TargetPage
 from lensmodel.measured.pair import AperturePair, diffraction_otf
+from lensmodel.measured.photos import samples_of_developed
 from lensmodel.measured.points import Points, find_lights, isolated_lights
 from lensmodel.measured.registration import homography_of, match
 from lensmodel.measured.solve import solve
@@ -32,8 +35,6 @@ from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
 from lensmodel.quality import find_edges
-from lensmodel.workflow.calibrating import joined
-from lensmodel.workflow.measuring import samples_of_developed
 
 SHAPE = (360, 540)
 PAIR_SHAPE = (288, 432)  # of less a pair is as good: it needs no lights and no page

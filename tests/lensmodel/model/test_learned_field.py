@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lab.kernels import distance, gaussian
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, distance, gaussian, rms_width
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.learned_field import NEAREST

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lab.kernels import distance, gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfSample, distance, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.model.camera_bodies import rescaled

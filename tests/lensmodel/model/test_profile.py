@@ -15,11 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, gaussian
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.model.samples import PackedSamples, pack_samples, unpack_samples
+from lensmodel.model.profile import PackedSamples, pack_samples, unpack_samples
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)

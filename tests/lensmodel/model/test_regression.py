@@ -11,16 +11,16 @@ from itertools import chain
 import numpy as np
 import pytest
 
+from lab.kernels import distance, gaussian
 from lab.model_benchmark import PaperModel, pixel_to_local
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
-from lensmodel.core.psf import PsfSample, centroid, delta, distance, gaussian, second_moments
+from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings, local_frame, loops, regression
 from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES
-from lensmodel.model.local_frame import Answers, LocalKernels
+from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
 from lensmodel.model.regression import Neighbourhood
-from lensmodel.model.widths import WidthField
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lensmodel.neural.statistics import LENGTH, WINDOW, group, patch_statistics, to_octant
-from lensmodel.neural.symmetry import (
+from lensmodel.neural.features import (
     OCTANTS,
     from_octant_image,
     octant_of,
@@ -13,6 +12,7 @@ from lensmodel.neural.symmetry import (
     to_octant_image,
     to_octant_place,
 )
+from lensmodel.neural.statistics import LENGTH, WINDOW, group, patch_statistics, to_octant
 
 COLOURS = np.tile(np.array([[0, 1], [1, 2]], np.int8), (WINDOW // 2, WINDOW // 2))
 PLACES = np.array(

@@ -97,7 +97,7 @@ def test_r_of_a_step_is_what_the_formula_says() -> None:
     step[:, 60:] = 1.0
 
     # Within the window every row adds the whole step of 1, all in one direction.
-    assert r_map(step, 25)[60, 60] == pytest.approx(25.0 / (25.0 + 0.5), rel=1e-3)
+    assert r_map(step)[60, 60] == pytest.approx(25.0 / (25.0 + 0.5), rel=1e-3)
 
 
 def test_r_of_a_flat_plane_is_zero() -> None:
@@ -109,14 +109,6 @@ def test_r_map_turns_with_the_plane(turns: int) -> None:
     plane = dead_leaves(90, 90, seed=7)
 
     np.testing.assert_allclose(r_map(np.rot90(plane, turns).copy()), np.rot90(r_map(plane), turns), atol=2e-4)
-
-
-def test_r_map_refuses_an_even_window() -> None:
-    with pytest.raises(InvalidInputError, match="odd"):
-        r_map(np.zeros((50, 50), dtype=np.float32), 24)
-
-
-# ---- what is chosen
 
 
 def test_a_photo_of_1500_by_1000_gives_two_to_four_patches_a_cell_that_lie_together(

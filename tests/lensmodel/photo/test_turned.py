@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from lab.kernels import gaussian
 from lensmodel import photo
+from lensmodel.api import _Posteriors
+from lensmodel.blind.sampling import find_patches
 from lensmodel.core.errors import TurnedPixelsError
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.workflow.correcting import _Posteriors
-from lensmodel.workflow.sampling import find_patches
 
 Picture = NDArray[np.uint8]
 

@@ -13,9 +13,10 @@ from PIL import Image
 from scipy import ndimage, optimize, special
 
 from lab.charts import by_zone, measure_edges
+from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import delta, gaussian
+from lensmodel.core.psf import delta
 from lensmodel.core.types import LensSettings
 from lensmodel.quality import (
     crossing,

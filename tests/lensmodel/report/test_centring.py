@@ -9,7 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lensmodel.core.psf import PsfSample, gaussian, rms_width
+from lab.kernels import gaussian
+from lensmodel.core.psf import PsfSample, rms_width
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.report.centring import EDGE_R, Asymmetry, _verdict, centring

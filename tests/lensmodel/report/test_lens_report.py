@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lab.kernels import gaussian
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings, PsfAnswer
 from lensmodel.photo.lateral import LateralColour

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from lensmodel import measured as measure
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
+from lensmodel.measured import methods, samples_of
 from lensmodel.photo import LinearPhoto, inspect
 from lensmodel.photo.raster import require_known_turn
-from lensmodel.workflow.sampling import require_aperture, settings_of
 
 DEFAULT_SIZE: Final = 31  # pixels: that of an estimate
 
@@ -27,19 +26,19 @@ def samples_of_developed(
     on_step: StepHook = ignore_step,
 ) -> list[PsfSample]:
     """Measure the PSF on one photo, or on the two of an aperture pair, the open one first."""
-    method = measure.methods.create(kind)
+    method = methods.create(kind)
     if not photos:
         raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
+    metadata = photos[0].info.metadata
     require_known_turn(photos[0].info)
-    require_aperture(photos[0].info.metadata, settings)
-    chosen = settings_of(photos[0], settings)
+    metadata.require_aperture(settings)
     measured = method.measure(photos, size=size, on_step=on_step)
-    return measure.samples_of(measured, method, photos[0], photo_id=photo_id, settings=chosen)
+    return samples_of(measured, method, photos[0], photo_id=photo_id, settings=metadata.settings(settings))
 
 
 def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:
     """Group photos into measurements: each for itself, or in twos, the wider aperture first."""
-    method = measure.methods.create(kind)
+    method = methods.create(kind)
     count = method.photos
     if not paths or len(paths) % count:
         remedy = "; give the open photo and the closed one, two different files" if kind == "pair" else ""

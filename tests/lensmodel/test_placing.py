@@ -15,17 +15,17 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from scipy import ndimage
 
-from lensmodel import correction, photo, simulate
+from lab.kernels import gaussian
+from lensmodel import api, correction, photo, simulate
+from lensmodel.api import placed
 from lensmodel.core.errors import InvalidInputError, OutsideSupportError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfField, PsfSample, gaussian, resized, rms_width
+from lensmodel.core.psf import PsfField, PsfSample, resized, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
 from lensmodel.model import LensModel
 from lensmodel.model.camera_bodies import circle_mm, on_one_circle
 from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.lateral import LateralColour
-from lensmodel.workflow import correcting
-from lensmodel.workflow.correcting import placed
 
 WHOLE, CROPPED, PITCH = Frame(480, 720), Frame(320, 480), 6.0
 
@@ -113,15 +113,13 @@ def test_a_frame_in_crop_mode_is_corrected_by_the_kernels_of_the_middle(
         asked.update(field=field, frame=frame, lateral=options["lateral"])
         return run(planes, field, frame, **options)
 
-    monkeypatch.setattr(correcting.correction, "correct_planes", recorded)
+    monkeypatch.setattr(api.correction, "correct_planes", recorded)
     own = LateralColour((0.0, 0.0, 1e-3, 1.0), (0.0, 0.0, 0.0, 1.0), CROPPED.half_diagonal)
-    done = correcting.correct_photo(
-        developed_of(CROPPED), model, LensSettings(2.8), method="fast", lateral=own
-    )
+    done = api.correct_photo(developed_of(CROPPED), model, LensSettings(2.8), method="fast", lateral=own)
 
     place = asked["frame"].position(0.0, 0.0)
     assert place.r == pytest.approx(2.0 / 3.0, abs=0.01)
-    of_whole = correcting.psfs_for(developed_of(WHOLE, kind="jpeg"), model, LensSettings(2.8))
+    of_whole = api.psfs_for(developed_of(WHOLE, kind="jpeg"), model, LensSettings(2.8))
     same = of_whole.kernel_at(WHOLE.position(80.0, 120.0), "g", 15)
     used = resized(asked["field"].posterior_at(place, "g").kernel, 15)
     assert used == pytest.approx(same, abs=1e-3)
@@ -134,7 +132,7 @@ def test_a_frame_larger_than_all_that_is_known_is_refused_by_both_sizes() -> Non
     model = LensModel.fit(samples_on(CROPPED))
 
     with pytest.raises(OutsideSupportError, match=r"5\.2 mm diagonal.*3\.5 mm"):
-        correcting.correct_photo(developed_of(WHOLE), model, LensSettings(2.8), method="fast")
+        api.correct_photo(developed_of(WHOLE), model, LensSettings(2.8), method="fast")
 
 
 def test_what_a_program_cut_is_refused_by_both_sizes() -> None:

@@ -13,25 +13,24 @@ from pathlib import Path
 from typing import Any, Final
 
 from lensmodel import photo
-from lensmodel.core import processes
-from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
-from lensmodel.core.psf import PsfSample
-from lensmodel.measured import is_measured
-from lensmodel.model import LensModel, LensProfile, ModelSettings
-from lensmodel.photo import PhotoMetadata
-from lensmodel.photo.values import CORRECTED
-from lensmodel.workflow.identity import Identity, difference
-from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.sampling import (
+from lensmodel.blind.sampling import (
     CalibrationEvent,
     Config,
     EventHook,
     ignore_event,
     photo_id,
-    require_aperture,
     samples_of_bytes,
     samples_of_photo,
 )
+from lensmodel.core import processes
+from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
+from lensmodel.core.psf import PsfSample
+from lensmodel.lens import Lens
+from lensmodel.measured import is_measured
+from lensmodel.model import LensModel, LensProfile, ModelSettings
+from lensmodel.model.identity import Identity, difference
+from lensmodel.photo import PhotoMetadata
+from lensmodel.photo.values import CORRECTED
 
 AHEAD: Final = 32
 """Photos that are sent to an executor at once (chosen): a gigabyte of them, work for some dozen processes."""
@@ -81,9 +80,8 @@ class Calibration:
         pool: Executor | None = None,
     ) -> None:
         self._store, self._config = store, config
-        self._begin = begin or ModelSettings(mode=config.preset.mode)
+        self._begin = begin or ModelSettings(mode=config.model)
         self._any_lens, self._replace, self._pool = any_lens, replace, pool
-        config.of_lens(self.known).check()
 
     @property
     def known(self) -> Lens | None:
@@ -111,28 +109,20 @@ class Calibration:
         `siblings` are the photos that tell of the defects of the sensor; by default all of them.
         """
         paths = list(paths)
+        siblings = paths if siblings is None else siblings
         jobs: Iterable[tuple[Path, Future[list[PsfSample]] | None]] = ((path, None) for path in paths)
         if executor is not None:
             jobs = processes.in_order(executor, samples_of_bytes, paths, self._sent, ahead=ahead)
         for path, job in jobs:
-            sampler = partial(
-                self._sampled,
-                path,
-                job=job,
-                siblings=paths if siblings is None else siblings,
-                on_event=on_event,
-            )
             try:
-                count = self.add(path, sampler)
+                count = self.add(path, partial(self._sampled, path, job, siblings, on_event))
             except CancelledError:  # is of the whole work, not of one photo
                 raise
             except (LensModelError, OSError) as error:
                 yield CalibrationEvent(path, "skipped", detail=str(error), error=error)
             else:
-                if count is None:
-                    yield CalibrationEvent(path, "skipped", detail="its samples are in the model already")
-                else:
-                    yield CalibrationEvent(path, "counted", count, count)
+                known = CalibrationEvent(path, "skipped", detail="its samples are in the model already")
+                yield known if count is None else CalibrationEvent(path, "counted", count, count)
 
     def add(self, path: Path, sampler: Sampler) -> int | None:
         """Learn from one photo; return how many samples it gave, None where the lens has it already."""
@@ -168,12 +158,11 @@ class Calibration:
     def _sampled(
         self,
         path: Path,
-        key: str,
-        admit: Admit,
-        *,
         job: Future[list[PsfSample]] | None,
         siblings: Iterable[Path],
         on_event: EventHook,
+        key: str,
+        admit: Admit,
     ) -> list[PsfSample]:
         """Estimate the samples of a photo, or wait for those that are estimated elsewhere."""
         if job is not None:
@@ -181,7 +170,7 @@ class Calibration:
             return job.result()
         return samples_of_photo(
             path,
-            self._config.of_lens(self.known),
+            self._config,
             key=key,
             admit=admit,
             executor=self._pool,
@@ -196,7 +185,7 @@ class Calibration:
             if self.knows(key) or path.stem.endswith(CORRECTED):
                 return None
             self._admitted(photo.inspect(path).metadata)
-            return path.name, path.read_bytes(), self._config.of_lens(self.known), key
+            return path.name, path.read_bytes(), self._config, key
         except (LensModelError, OSError):
             return None
 
@@ -204,7 +193,7 @@ class Calibration:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
         identity = Identity.of(metadata)
         self._require_same(self.known, identity)
-        require_aperture(metadata, self._config.settings)
+        metadata.require_aperture(self._config.settings)
         return identity
 
     def _require_same(self, lens: Lens | None, identity: Identity) -> None:

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from lab.images import Gains, gains, to_srgb
 from lab.traced import GridLens, read_grid
-from lensmodel import correction, photo, simulate
+from lensmodel import api, correction, photo, simulate
+from lensmodel.blind import sampling
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.model import LensModel
-from lensmodel.workflow import correcting, sampling
 
 pytestmark = pytest.mark.slow
 
 CAMERA = simulate.SimulatedCamera(height=640, width=960, full_well_electrons=20_000.0)
-GRID = Path(__file__).parents[1] / "data" / "traced-heliar-f3.5.npz"
+GRID = Path(__file__).parent / "data" / "traced-heliar-f3.5.npz"
 NEARLY_PERFECT = 6
 CROP_LENS = simulate.draw_lens(1001)
 MARGIN = 64
@@ -72,9 +72,9 @@ def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(
     simulate.write_photo(tmp_path / "asked.dng", asked)
     model = LensModel.fit(sampling.samples_of_photo(tmp_path / "known.dng", workers=1))
     developed = photo.develop(tmp_path / "asked.dng")
-    lateral = correcting.lateral_of(developed)
+    lateral = api.lateral_of(developed)
 
-    made = correcting.correct_photo(developed, model, settings, lateral=lateral).planes
+    made = api.correct_photo(developed, model, settings, lateral=lateral).planes
 
     with_the_truth = correction.correct_planes(
         developed.planes,
@@ -119,8 +119,8 @@ def test_a_frame_in_crop_mode_gains_in_every_zone_by_the_kernels_of_its_place(
     model, path, truth = cropped
     developed = photo.develop(path)
 
-    settings, lateral = LensSettings(aperture=CROP_LENS.widest()), correcting.lateral_of(developed)
-    made = correcting.correct_photo(developed, model, settings, method=method, lateral=lateral).planes
+    settings, lateral = LensSettings(aperture=CROP_LENS.widest()), api.lateral_of(developed)
+    made = api.correct_photo(developed, model, settings, method=method, lateral=lateral).planes
 
     found = gains(*map(shown, (developed.planes, made, truth)))
     assert found is not None

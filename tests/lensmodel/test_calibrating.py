@@ -15,15 +15,17 @@ import pytest
 import rawpy
 
 import lensmodel
+from lab.kernels import gaussian
 from lensmodel import photo
+from lensmodel.blind import sampling
+from lensmodel.calibration import Calibration, LensStore
 from lensmodel.core import processes
 from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
-from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
+from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.workflow import calibrating, sampling
-from lensmodel.workflow.lens import Lens
 
 Admit = Callable[[photo.PhotoMetadata], None]
 
@@ -44,14 +46,14 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         admit(photo.PhotoMetadata(aperture=None if path.stem == "unknown" else 2.8))
         return samples_of(key)
 
-    monkeypatch.setattr(calibrating, "samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", estimated)
     paths = [tmp_path / "a.dng", tmp_path / "b.dng"]
     for path in paths:
         path.write_bytes(path.name.encode())
     return paths
 
 
-class Noting(calibrating.LensStore):
+class Noting(LensStore):
     """Notes how many samples a lens has whenever it is kept."""
 
     def __init__(self, lens: Lens | None = None) -> None:
@@ -67,7 +69,7 @@ def test_a_lens_is_kept_after_each_photo_and_what_another_run_added_meanwhile_st
     photos: list[Path],
 ) -> None:
     store = Noting()
-    events = calibrating.Calibration(store, sampling.Config()).learn([*photos, photos[0]])
+    events = Calibration(store, sampling.PRESETS["default"]).learn([*photos, photos[0]])
 
     first = next(events)
     kept = store.lens()
@@ -89,7 +91,7 @@ def test_a_lens_is_kept_after_each_photo_and_what_another_run_added_meanwhile_st
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     key = sampling.photo_id(photos[0])
     store = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
-    calibration = calibrating.Calibration(store, sampling.Config())
+    calibration = Calibration(store, sampling.PRESETS["default"])
 
     (event,) = calibration.learn(photos[:1])
 
@@ -104,7 +106,7 @@ def test_photos_that_cannot_teach_a_lens_are_passed_over_with_the_reason(
     paths = [tmp_path / "a-corrected.dng", tmp_path / "unknown.dng"]
     for path in paths:
         path.write_bytes(path.name.encode())
-    calibration = calibrating.Calibration(Noting(), sampling.Config())
+    calibration = Calibration(Noting(), sampling.PRESETS["default"])
 
     corrected, unknown = (event.error for event in calibration.learn(paths))
 
@@ -124,7 +126,7 @@ class Round:
     def estimate(
         self, patches: Sequence[Plane], noise: object, *, size: int, green: lensmodel.PsfEstimate | None
     ) -> lensmodel.PsfEstimate:
-        return green or lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3, {})
+        return green or lensmodel.PsfEstimate(gaussian(size, np.eye(2)), 0.5, 0.3)
 
 
 def test_a_raw_file_is_opened_and_hashed_once_and_all_share_one_pool(
@@ -167,7 +169,7 @@ def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
     def cancelled(path: Path, config: sampling.Config, **options: object) -> list[PsfSample]:
         raise CancelledError("enough")
 
-    monkeypatch.setattr(calibrating, "samples_of_photo", cancelled)
+    monkeypatch.setattr("lensmodel.calibration.samples_of_photo", cancelled)
 
     with pytest.raises(CancelledError, match="enough"):
         lensmodel.calibrate(photos)

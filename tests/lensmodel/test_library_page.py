@@ -19,7 +19,7 @@ from lensmodel.photo.values import PhotoMetadata
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.simulate import BlurOptions, SimulatedCamera, demo_scene, draw_lens, photograph, write_photo
 
-PAGE = Path(__file__).parents[3] / "docs" / "library.md"
+PAGE = Path(__file__).parents[2] / "docs" / "library.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
 WIDTH_PX = 1.2

@@ -46,13 +46,13 @@ def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     if not options.any_lens and lens.id != photo.lens_id:
         common.check_same_lens(call, lens, photo, f"{photo.filename} seems to be of another lens")
     version = _version_for(call, lens, options.lens_version)
-    check_usage(call, "corrections")
     asked = options.model_dump(mode="json", exclude={"photo_id", "lens_id", "lens_version", "any_lens"})
     # with other settings of the photo the same request is a new correction
     params = asked | {"settings": stored_settings(photo)}
+    if not call.store.jobs.is_known(photo, lens, version, params):
+        check_usage(call, "corrections")
     row, created = call.store.jobs.correct(photo, lens, version, params)
-    finished = not created and row.state == "succeeded"
-    call.response.status_code = 200 if finished else 202
+    call.response.status_code = 200 if not created and row.state == "succeeded" else 202
     call.response.headers["Location"] = f"{V1}/corrections/{row.public_id}"
     return views.correction_out(row)
 

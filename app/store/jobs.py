@@ -68,12 +68,19 @@ class Jobs(Works[CorrectionRow]):
 
     # --- corrections ------------------------------------------------------------------------------
 
+    @reads
+    def is_known(
+        self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
+    ) -> bool:
+        """Say whether there is the correction of such a request."""
+        return session.scalar(_same(_request(photo, lens, version, params))) is not None
+
     @writes
     def correct(
         self, session: Session, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:
         """Create a correction, or return the one of the same request; True if it is new."""
-        request = dict(zip(_REQUEST, (photo.id, lens.public_id, version, params_hash(params)), strict=True))
+        request = _request(photo, lens, version, params)
         fresh = CorrectionRow(
             **request,
             public_id=new_id(),
@@ -241,6 +248,10 @@ class Jobs(Works[CorrectionRow]):
     def forget_garbage(self, session: Session, prefix: str) -> None:
         """Record that the blobs of a prefix are deleted."""
         session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
+
+
+def _request(photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(zip(_REQUEST, (photo.id, lens.public_id, version, params_hash(params)), strict=True))
 
 
 def _same(request: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a selection of corrections

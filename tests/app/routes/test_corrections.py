@@ -306,8 +306,10 @@ def test_results_count_for_the_quota_and_expire(
     assert stored == 1000 + len(FILE) + 77  # the photo, its result, and the pictures of that
     with store.database.writing() as session:
         session.execute(update(OwnerRow).values(quota_bytes=stored))
-    refused = post(client, photo_id=steps.counted().public_id)
+    of = client.get(f"/v1/corrections/{finished}").json()["photo_id"]
+    refused = post(client, photo_id=of, nonce="again")
     assert (refused.status_code, refused.json()["code"]) == (429, "quota_exceeded")
+    assert post(client, photo_id=of).status_code == 200  # what is finished is there
 
     assert store.jobs.ended_before(now() - timedelta(days=1)) == []
     assert store.jobs.ended_before(now() + timedelta(days=1)) == [finished]

@@ -32,14 +32,15 @@ from app.jobs.answers import (
 )
 from app.jobs.context import MAX_UNPACKED, JobContext, Wanted
 from app.jobs.sample_files import DAMAGED, returned_samples
-from app.presets import configured_preset
 from app.runtime.outage import is_outage, missable
+from app.runtime.settings import Settings
 from app.store import LensName
 from app.store.lenses import LensState, report_key
 from app.store.owners import ANY_OWNER
 from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, CorrectionRow, LensRow, PatchRow, PhotoRow
 from lensmodel.blind import sampling
+from lensmodel.blind.sampling import KERNEL_PATCHES, PRESETS, Config
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, NoUsablePatchesError
 from lensmodel.core.names import full_name, name_key, serial_key
@@ -70,6 +71,14 @@ _COLUMNS: Final = (
 )
 
 MEDIA_TYPE: Final = {".tif": "tiff", ".png": "png", ".jpg": "jpeg", ".dng": "x-adobe-dng"}
+
+
+def configured_preset(settings: Settings) -> Config:
+    """Return the default preset, as far as the settings do not change it."""
+    preset = PRESETS["default"]
+    own = settings.estimator != preset.estimator
+    patches = settings.patches or (KERNEL_PATCHES if own else preset.patches)
+    return replace(preset, estimator=settings.estimator, patches=patches)
 
 
 def work_on(context: JobContext, photo_id: str, epoch: int) -> None:

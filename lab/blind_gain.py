@@ -4,14 +4,9 @@ r"""What a photo gains that is corrected by a lens known only from other photos,
         [--grids FILE.npz] [--electrons 2500] [--hot 60] [--crop 0.66]
 
 Each lens takes Bayer DNG files of 1.2 megapixels of different photographs of the test half (the development
-half for seeds below 1000), is learned from the first n by default settings, and a photo that was not learned
-from is corrected by default settings. Lenses are of third-order theory (`--seeds`) or ray-traced (`--grids`).
-With `--hot`, so many pixels of the sensor shine in every photo, by a tenth to all of the range, and gains
-count from the photo without them. With `--crop`, the corrected photo is the middle of the frame.
-
-Printed are the gains in PSNR of the picture as shown by zone, each block at its best shift
-(`lab.images.gains`), what the correction expected of itself (of linear light), the median error of green PSFs
-all over the field, true and expected, the share of blocks that lose more than 0.5 dB, and the worst of them.
+half for seeds below 1000), is learned from the first n, and another photo is corrected. With `--hot`, so many
+pixels of the sensor shine in every photo, and gains count from the photo without them. With `--crop`, the
+corrected photo is the middle of the frame. docs/lab/accuracy.md says what is printed.
 """
 
 from __future__ import annotations
@@ -28,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.cases import list_photos, photo_half
-from lab.images import gains, to_srgb
+from lab.images import gains, middle, to_srgb
 from lab.kernels import distance
 from lab.traced import GridLens
 from lensmodel import api, photo
@@ -68,15 +63,15 @@ class KnownLens:
         if scene.shape[1] > scene.shape[2]:
             scene = np.rot90(scene, axes=(1, 2))
         wanted = self.camera.height, self.camera.width
-        size = [min(n, w + MARGIN) // 2 * 2 for n, w in zip(scene.shape[1:], wanted, strict=True)]
-        cut = [slice((n - s) // 2, (n - s) // 2 + s) for n, s in zip(scene.shape[1:], size, strict=True)]
-        part = np.ascontiguousarray(scene[:, cut[0], cut[1]])
+        size = (min(n, w + MARGIN) // 2 * 2 for n, w in zip(scene.shape[1:], wanted, strict=True))
+        part = middle(scene, *size)
         rng = np.random.default_rng([self.number, number])
         taken = photograph(part, self.lens, self.settings, self.camera, rng)
         taken = replace(taken, mosaic=self._with_hot_pixels(taken.mosaic))
-        middle = middle_of(taken.mosaic.shape, crop)
-        write_photo(path, replace(taken, mosaic=np.ascontiguousarray(taken.mosaic[middle])))
-        return np.ascontiguousarray(taken.sharp[:, *middle])
+        # cut where the mosaic repeats
+        kept = [n - 4 * round((1.0 - crop) * n / 4.0) for n in taken.mosaic.shape]
+        write_photo(path, replace(taken, mosaic=middle(taken.mosaic, *kept)))
+        return middle(taken.sharp, *kept)
 
     def _with_hot_pixels(self, mosaic: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Let the same pixels shine in every photo."""
@@ -95,18 +90,9 @@ class KnownLens:
         """Median relative L2 error of green, true and expected."""
         truth, asked = self.lens.field(self.settings), self.settings.with_channel("g")
         answers = [model.query(place, asked, 55) for place in PLACES]
-        true = [
-            distance(answer.kernel, truth.kernel_at(place, "g", 55)).rel_l2
-            for place, answer in zip(PLACES, answers, strict=True)
-        ]
+        pairs = zip(PLACES, answers, strict=True)
+        true = [distance(answer.kernel, truth.kernel_at(place, "g", 55)).rel_l2 for place, answer in pairs]
         return float(np.median(true)), float(np.median([answer.predicted_error for answer in answers]))
-
-
-def middle_of(shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
-    """Return the middle of a frame, cut where its mosaic repeats."""
-    margins = [round((1.0 - share) * side / 4.0) * 2 for side in shape]
-    rows, cols = (slice(m, side - m) for m, side in zip(margins, shape, strict=True))
-    return rows, cols
 
 
 def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0) -> Iterator[list[str]]:

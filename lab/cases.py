@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +23,9 @@ from lensmodel.patches import Patch, select
 from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 
 Half: TypeAlias = Literal["dev", "test", "all"]
-HALVES: Final = ("dev", "test", "all")
 
 DATA: Final = Path(__file__).parent / "data"
-WHITE: Final = 0.9
-"""Level of a scene's 99.5 percentile."""
+WHITE: Final = 0.9  # level of a scene's 99.5 percentile
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 
@@ -50,27 +49,18 @@ class BlindCase:
         return f"{self.photo.stem}{which}/psf{self.psf_number:02d}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class Observation(NamedTuple):
     """What an estimator is shown, and what the judge knows: a blurred, noisy window and its truth."""
 
     patch: Plane
     noise: NoiseModel
     sharp: Plane
-    kernel: Kernel
 
 
-def load_psfs(path: Path | None = None) -> NDArray[np.float64]:
-    """Read PSFs, key `psf`, `(n, k, k)`; our own twelve when no path is given."""
-    source = path or DATA / "lens_psfs.npz"
-    try:
-        with np.load(source, allow_pickle=False) as stored:
-            kernels = np.asarray(stored["psf"], dtype=np.float64)
-    except (OSError, ValueError, KeyError) as error:
-        raise InvalidInputError(f"{source} holds no array 'psf' of shape (n, k, k)") from error
-    if kernels.ndim != 3:
-        raise InvalidInputError(f"'psf' of {source} must have three axes (n, k, k), got {kernels.shape}")
-    return np.stack([psf.centred(kernel) for kernel in kernels])
+def load_psfs() -> NDArray[np.float64]:
+    """Read the twelve PSFs `(n, k, k)` of the benchmark."""
+    with np.load(DATA / "lens_psfs.npz", allow_pickle=False) as stored:
+        return np.stack([psf.centred(kernel) for kernel in stored["psf"]])
 
 
 def list_photos(folder: Path | None = None) -> tuple[Path, ...]:
@@ -92,8 +82,7 @@ _SPLIT: Final[dict[str, dict[str, list[str | int]]]] = json.loads(
 
 def photo_half(stem: str) -> Half:
     """Half of the split that a photo belongs to; photos not listed go by the hash of their name."""
-    chance = hashlib.sha256(stem.encode()).digest()[0]
-    return _half("photos", stem, chance)
+    return _half("photos", stem, hashlib.sha256(stem.encode()).digest()[0])
 
 
 def psf_half(number: int) -> Half:
@@ -138,16 +127,15 @@ def make_cases(
 
 def _spread(pairs: list[tuple[int, int]], order: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
     """Take pairs so that photos and PSFs appear about equally often."""
-    photos: dict[int, int] = {}
-    psfs: dict[int, int] = {}
-    left = [int(at) for at in order]
-    taken: list[int] = []
+    photos: Counter[int] = Counter()
+    psfs: Counter[int] = Counter()
+    left, taken = [int(at) for at in order], list[int]()
     while left and len(taken) < limit:
-        at = min(left, key=lambda a: photos.get(pairs[a][0], 0) + psfs.get(pairs[a][1], 0))
+        at = min(left, key=lambda a: photos[pairs[a][0]] + psfs[pairs[a][1]])
         left.remove(at)
         taken.append(at)
-        photos[pairs[at][0]] = photos.get(pairs[at][0], 0) + 1
-        psfs[pairs[at][1]] = psfs.get(pairs[at][1], 0) + 1
+        photos[pairs[at][0]] += 1
+        psfs[pairs[at][1]] += 1
     return np.array(taken, dtype=np.int64)
 
 
@@ -161,12 +149,7 @@ def scene_of(photo: Path) -> Planes:
 
 
 def observe(case: BlindCase, kernel: Kernel) -> Observation:
-    """Blur the photograph by valid convolution, add noise, and take the best window that a selector finds.
-
-    The next ones are the best that overlap none before them; where all others do, the best of those.
-    Selectors take smaller windows where the frame has not four of them on its shorter side. Where nothing is
-    usable the middle of the frame is taken, lest a method profits from the refusal.
-    """
+    """Blur the photograph by valid convolution, add noise, and take a window that the selector finds."""
     size, margin = case.patch, kernel.shape[0] // 2
     again = [case.window] if case.window else []
     rng = np.random.default_rng([case.seed, case.psf_number, 0, _number(case.photo.stem), *again])
@@ -176,14 +159,14 @@ def observe(case: BlindCase, kernel: Kernel) -> Observation:
     noise, (height, width) = NoiseModel.white(case.noise), plane.shape
     try:
         found = select(plane, noise, Frame(height, width), size=size)
-    except NoUsablePatchesError:
+    except NoUsablePatchesError:  # the middle of the frame, lest a method profits from the refusal
         row, col = (height - size) // 2, (width - size) // 2
     else:
         best = _apart(sorted(found.patches, key=lambda patch: -patch.score), case.window)
         row, col, size = best.row, best.col, best.size
     sharp = green[margin + row : margin + row + size, margin + col : margin + col + size]
     patch = np.ascontiguousarray(plane[row : row + size, col : col + size])
-    return Observation(patch, noise, np.ascontiguousarray(sharp), kernel)
+    return Observation(patch, noise, np.ascontiguousarray(sharp))
 
 
 def _apart(patches: Sequence[Patch], number: int) -> Patch:

@@ -1,21 +1,25 @@
-"""Pictures as an eye sees them, and how close one is to another: as a whole, by zone, block by block."""
+"""Pictures as an eye sees them, how close one is to another by zone and block, and how sharp charts are."""
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
-from lensmodel.core.types import ZONES, Planes, Zone
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame, zone_of
+from lensmodel.core.types import ZONES, Direction, Planes, Zone
+from lensmodel.quality.edge import Box, EdgeResponse, direction_of, slanted_edge
+
+logger = logging.getLogger(__name__)
 
 Encoded: TypeAlias = NDArray[np.floating] | NDArray[np.uint16]
 
@@ -29,8 +33,7 @@ BLOCK: Final = 128  # pixels of a side (chosen)
 BORDER: Final = 8  # pixels of a block that do not count: more than it is shifted
 CORE: Final = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 
-Picture = NDArray[np.uint8]
-"""`(row, col, 3)` sRGB, as shown."""
+Picture = NDArray[np.uint8]  # `(row, col, 3)` sRGB, as shown
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -43,6 +46,12 @@ def as_shown(planes: NDArray[np.floating], gain: tuple[float, float, float] = (1
     """Encode linear planes `(3, row, col)` to 8-bit sRGB `(row, col, 3)`, each channel times its gain."""
     shown = to_srgb(planes * np.asarray(gain, dtype=np.float32)[:, None, None])
     return np.ascontiguousarray(np.moveaxis(np.rint(shown * 255), 0, -1).astype(np.uint8))
+
+
+def middle(picture: NDArray[Any], height: int, width: int) -> NDArray[Any]:
+    """Cut the middle of planes, at most so large."""
+    top, left = (max(n - want, 0) // 2 for n, want in zip(picture.shape[-2:], (height, width), strict=True))
+    return np.ascontiguousarray(picture[..., top : top + height, left : left + width])
 
 
 def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]:
@@ -97,11 +106,8 @@ def zone_masks(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
 def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[float, float]:
     """Shift (row, col) in pixels, up to 3, that brings `image` closest to `reference`, by Gauss-Newton."""
     _same_shape(image, reference)
-    rows, cols = (
-        slice(max((n - _SHIFT_WINDOW) // 2, 0), max((n - _SHIFT_WINDOW) // 2, 0) + _SHIFT_WINDOW)
-        for n in image.shape[-2:]
-    )
-    a, b = (np.asarray(picture, dtype=np.float64)[..., rows, cols] for picture in (image, reference))
+    window = (_SHIFT_WINDOW, _SHIFT_WINDOW)
+    a, b = (middle(np.asarray(picture, dtype=np.float64), *window) for picture in (image, reference))
     a, b = (picture.reshape(-1, *picture.shape[-2:]) for picture in (a, b))
     shift = np.zeros(2)
     core = (slice(None), slice(4, -4), slice(4, -4))
@@ -139,14 +145,8 @@ def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.f
     return moved[..., _SHIFT_PAD : _SHIFT_PAD + height, _SHIFT_PAD : _SHIFT_PAD + width]
 
 
-# --- by zone and by block -----------------------------------------------------------------------
-
-EVERY: Final = 120
-"""Up to so many blocks all are compared, of more every second one, as on a chessboard."""
-
-LOSS_DB: Final = 0.5
-"""A block that loses more than this counts."""
-
+EVERY: Final = 120  # up to so many blocks all are compared, of more every second one, as on a chessboard
+LOSS_DB: Final = 0.5  # a block that loses more than this counts
 _LEAST_ERROR: Final = 1e-8  # mean square, full scale is 1 (chosen): 80 dB, so that ratios stay finite
 
 
@@ -160,8 +160,7 @@ def _errors(
 ) -> NDArray[np.float64]:
     """Squared errors of planes, mean over channels, and pixels: `(block, picture, zone, 2)` sums.
 
-    A PSF is centred on its centre of mass, which may lie a pixel beside its core: distortion, not
-    blur. So the truth of each block, which has no noise, is moved to where it lies best.
+    A PSF's centre of mass may lie beside its core: so the truth of each block is moved to where it lies best.
     """
     radius = frame.polar(np.arange(1.0 * frame.height)[:, None], np.arange(1.0 * frame.width)[None, :])[0]
 
@@ -238,3 +237,64 @@ def gains(before: Encoded, after: Encoded, truth: Encoded) -> Gains | None:
 
 def _gain(old: float, new: float) -> float:
     return 10.0 * math.log10(max(old, _LEAST_ERROR) / max(new, _LEAST_ERROR))
+
+
+# --- sharpness of a photographed chart, edge by edge and zone by zone ---------------------------
+
+
+class EdgeMeasurement(NamedTuple):
+    """One measured edge of a chart."""
+
+    zone: Zone
+    direction: Direction  # see `direction_of`
+    response: EdgeResponse
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneSharpness:
+    """Medians over the edges of one zone."""
+
+    edges: int  # how many were measured
+    mtf50: float  # cycles/pixel; NaN where the zone has no edge of that direction
+    tangential_mtf50: float
+    sagittal_mtf50: float
+    mtf_max: float  # largest of the zone: above 1 means oversharpened
+    overshoot: float  # largest of the zone, percent of the step
+
+
+def measure_edges(plane: NDArray[np.floating], boxes: Sequence[Box]) -> tuple[EdgeMeasurement, ...]:
+    """Measure the slanted edges of a photo."""
+    frame = Frame(*plane.shape)
+    measured = []
+    for box in boxes:
+        row, col, height, width = box
+        if row < 0 or col < 0 or row + height > frame.height or col + width > frame.width:
+            raise InvalidInputError(f"box {box} leaves the frame of {frame.height} x {frame.width} pixels")
+        try:
+            response = slanted_edge(plane[row : row + height, col : col + width])
+        except NotEnoughEvidenceError as error:
+            logger.warning("no edge measured in box %s: %s", box, error)
+            continue
+        position = frame.position(row + (height - 1) / 2.0, col + (width - 1) / 2.0)
+        direction = direction_of(response.normal, position)
+        measured.append(EdgeMeasurement(zone_of(position.r), direction, response))
+    if not measured:
+        raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
+    return tuple(measured)
+
+
+def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:
+    """Gather measured edges by zone; zones without an edge are missing."""
+    table: dict[Zone, ZoneSharpness] = {}
+    for zone in ZONES:
+        here = [m for m in measurements if m.zone == zone]
+        if not here:
+            continue
+        every, along, across = (
+            [m.response.mtf50 for m in here if direction in ("", m.direction)]
+            for direction in ("", "tangential", "sagittal")
+        )
+        mtf50, t, s = (float(np.median(found)) if found else math.nan for found in (every, along, across))
+        highest = max(float(m.response.mtf[m.response.frequencies <= 0.5].max()) for m in here)
+        table[zone] = ZoneSharpness(len(here), mtf50, t, s, highest, max(m.response.overshoot for m in here))
+    return table

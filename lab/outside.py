@@ -2,9 +2,8 @@
 
     python -m lab.outside $LENSMODEL_TEST_DATA/psf/starfield_a.tiff --aperture 2.8
 
-A photo of the sky shows its lens as it is: stars are points. They are measured, and the lens is learned from
-the same photo as if it were any other, by a network that has seen no stars. Cells where stars seem far wider
-than elsewhere hold pairs or trails, and are left out.
+Stars are points: they are measured, and the lens is learned from the same photo as from any other. Cells
+where stars seem far wider than elsewhere hold pairs or trails, and are left out.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ _WIDEST: Final = 2.5  # times the median width (chosen): wider cells hold no sin
 
 
 class Judged(NamedTuple):
-    """A green PSF at one place of a photo: the stars of a cell against the blind model."""
+    """A green PSF at one place of a photo: the stars of a cell against the blind model; relative L2."""
 
     r: float
-    distance: float  # relative L2
+    distance: float
     told: float  # what the model expects it to be
     error: float  # of the measurement, as it expects
-    point: float  # relative L2 of a point, which is a lens without blur
+    point: float  # of a lens without blur
     measured_px: float  # r.m.s. widths along one axis
     blind_px: float
 
@@ -51,8 +50,8 @@ def judged(path: Path, settings: LensSettings) -> Iterator[Judged]:
             continue
         answer = model.query(star.position, green, SIZE)
         found, point = (distance(kernel, star.kernel).rel_l2 for kernel in (answer.kernel, delta(SIZE)))
-        told = answer.predicted_error
-        yield Judged(star.position.r, found, told, star.error, point, width, rms_width(answer.kernel))
+        errors = (found, answer.predicted_error, star.error, point)
+        yield Judged(star.position.r, *errors, width, rms_width(answer.kernel))
 
 
 def main() -> None:

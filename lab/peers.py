@@ -1,7 +1,4 @@
-"""Programs that people use instead, run from outside: what they cost.
-
-Nothing here links a program; each is called by its own command line where it is installed.
-"""
+"""Programs that people use instead, called by their own command lines where installed: what they cost."""
 
 from __future__ import annotations
 
@@ -28,8 +25,7 @@ from lensmodel.photo.dng import write_bayer_dng
 _LIMIT_S: Final = 1800  # seconds that a program may take (chosen): one that hangs must end
 _FULL: Final = 65535  # largest number of 16 bits
 
-Command = Callable[[Path, Path, Path, float], list[str]]
-"""Words of a command, from the input, the output, a folder for settings and a setting."""
+Command = Callable[[Path, Path, Path, float], list[str]]  # from input, output, folder for settings, setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +47,10 @@ class Peer:
     def write_input(self, encoded: NDArray[np.float32], path: Path) -> None:
         """Write a picture `(height, width, 3)`, 0 to 1, as this program takes it."""
         numbers = light_numbers(encoded)
-        if not self.raw:
+        if self.raw:
+            write_raw(np.moveaxis(numbers, -1, 0), path)
+        else:
             tifffile.imwrite(path, numbers, photometric="rgb")
-            return
-        write_raw(np.moveaxis(numbers, -1, 0), path)
 
     def run(self, source: Path, folder: Path, setting: float) -> tuple[Path, float]:
         """Run the program on a file; return its picture, and the CPU seconds of the process."""
@@ -64,14 +60,9 @@ class Peer:
         target.unlink(missing_ok=True)
         words = self.command(source, target, folder, setting)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        around = os.environ | {"HOME": str(folder), "OMP_NUM_THREADS": "2"}
         try:
-            done = subprocess.run(
-                words,
-                capture_output=True,
-                check=False,
-                timeout=_LIMIT_S,
-                env=os.environ | {"HOME": str(folder), "OMP_NUM_THREADS": "2"},
-            )
+            done = subprocess.run(words, capture_output=True, check=False, timeout=_LIMIT_S, env=around)
         except subprocess.TimeoutExpired as error:
             raise InvalidInputError(f"{self.program} did not end within {_LIMIT_S} s") from error
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -133,8 +124,7 @@ def _rawtherapee(source: Path, target: Path, folder: Path, setting: float) -> li
     profile = folder / "rawtherapee.pp3"
     enabled = "true" if setting else "false"
     profile.write_text(_CAPTURE.format(enabled=enabled, radius=setting or 1.0), encoding="utf-8")
-    words = ["rawtherapee-cli", "-Y", "-t", "-b16", "-o", str(target), "-p", str(profile)]
-    return [*words, "-c", str(source)]
+    return ["rawtherapee-cli", "-Y", "-t", "-b16", "-o", str(target), "-p", str(profile), "-c", str(source)]
 
 
 _HISTORY = """<?xml version="1.0" encoding="UTF-8"?>
@@ -160,9 +150,9 @@ def _darktable(source: Path, target: Path, folder: Path, setting: float) -> list
     return ["darktable-cli", *files, *core, "--conf", "plugins/imageio/format/tiff/bpp=16"]
 
 
+# each at the setting that is timed
 PEERS: Final[tuple[Peer, ...]] = (
     Peer("G'MIC Richardson-Lucy", "gmic", _gmic, 20.0),
     Peer("darktable lens deblur", "darktable-cli", _darktable, 16.0),
     Peer("RawTherapee capture sharpening", "rawtherapee-cli", _rawtherapee, 1.15, raw=True),
 )
-"""Each at the setting that is timed."""

@@ -1,8 +1,4 @@
-"""Scenes that hurt: what corrections fail on in public, drawn over a photograph; and dead leaves.
-
-Each of `HARD_SCENES` is `scene(photograph, rng) -> Planes` in linear light, white-balanced; values above 1
-are brighter than white.
-"""
+"""Scenes that hurt, drawn over a photograph in linear light (values above 1 are lamps), and dead leaves."""
 
 from __future__ import annotations
 
@@ -15,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
+from lab.images import middle
 from lensmodel.core.types import Planes
 from lensmodel.simulate import demo_scene
 
@@ -26,15 +23,11 @@ _OVER: Final = 3  # drawings are made larger by this factor and averaged: sample
 _LAMPS: Final[tuple[Colour, ...]] = ((1.0, 0.85, 0.6), (1.0, 0.6, 0.25), (0.7, 0.9, 1.0), (1.0, 0.15, 0.1))
 """Linear light of street lamps: warm white, sodium, cold white and red, chosen."""
 
+# linear sRGB of light to dark skin in daylight (chosen)
 _SKIN: Final[tuple[Colour, ...]] = (
-    (0.62, 0.36, 0.25),
-    (0.30, 0.16, 0.10),
-    (0.50, 0.28, 0.18),
-    (0.70, 0.45, 0.34),
-    (0.14, 0.07, 0.045),
-    (0.42, 0.24, 0.14),
-)
-"""Linear sRGB of light to dark skin in daylight, chosen."""
+    (0.62, 0.36, 0.25), (0.30, 0.16, 0.10), (0.50, 0.28, 0.18),
+    (0.70, 0.45, 0.34), (0.14, 0.07, 0.045), (0.42, 0.24, 0.14),
+)  # fmt: skip
 
 
 def photograph_of(name: str, height: int, width: int) -> Planes:
@@ -43,8 +36,7 @@ def photograph_of(name: str, height: int, width: int) -> Planes:
     short = [max(want - have, 0) for have, want in zip(scene.shape[1:], (height, width), strict=True)]
     if any(short):
         scene = np.pad(scene, ((0, 0), *((s // 2, s - s // 2) for s in short)), mode="symmetric")
-    top, left = (scene.shape[1] - height) // 2, (scene.shape[2] - width) // 2
-    return np.ascontiguousarray(scene[:, top : top + height, left : left + width])
+    return middle(scene, height, width)
 
 
 def hard_scene(name: str, height: int, width: int, rng: np.random.Generator) -> Planes:
@@ -160,16 +152,9 @@ def text(scene: Planes, rng: np.random.Generator) -> Planes:
 
 
 HARD_SCENES: Final[Mapping[str, Scenery]] = {
-    "faces": faces,
-    "foliage": foliage,
-    "lamps": lamps,
-    "night": night,
-    "red-cars": red_cars,
-    "sky": sky,
-    "snow": snow,
-    "text": text,
+    scene.__name__.replace("_", "-"): scene
+    for scene in (faces, foliage, lamps, night, red_cars, sky, snow, text)
 }
-"""By name."""
 
 _OVER_WHAT: Final = {"red-cars": "colosseum", "snow": "lake", "sky": "lake"} | dict.fromkeys(
     ("faces", "foliage"), "tea-gardens"
@@ -227,12 +212,8 @@ def _car(scene: Planes, rng: np.random.Generator, top: float, left: float, lengt
         wheel = (middle - 0.09 * length, top + 0.72 * tall, middle + 0.09 * length, top + 1.25 * tall)
         scene = _over(scene, _shape(scene, "ellipse", wheel), (0.02, 0.02, 0.022))
     for at in (0.34, 0.52, 0.66):
-        seam = (
-            left + at * length,
-            top + 0.42 * tall,
-            left + at * length + rng.uniform(0.4, 1.5),
-            top + 0.95 * tall,
-        )
+        edge = left + at * length
+        seam = (edge, top + 0.42 * tall, edge + rng.uniform(0.4, 1.5), top + 0.95 * tall)
         scene = _over(scene, _shape(scene, "rectangle", seam), (0.25, 0.02, 0.02))
     glint = (left + 0.1 * length, top + 0.47 * tall, left + 0.9 * length, top + 0.485 * tall)
     return _over(scene, _shape(scene, "rectangle", glint), (6.0, 4.5, 4.0))
@@ -251,11 +232,7 @@ def _branch(
         angle += float(rng.normal(0.0, 0.18))
         length = float(rng.uniform(10.0, 28.0))
         end = x + length * math.cos(angle), y + length * math.sin(angle)
-        pen.line(
-            (_OVER * x, _OVER * y, _OVER * end[0], _OVER * end[1]),
-            fill=255,
-            width=max(round(_OVER * thickness), 1),
-        )
+        pen.line([_OVER * v for v in (x, y, *end)], fill=255, width=max(round(_OVER * thickness), 1))
         x, y = end
         if thickness > 0.5 and rng.random() < 0.55:
             _branch(pen, rng, (x, y), angle + float(rng.choice([-0.7, 0.7])), 0.6 * thickness)
@@ -297,41 +274,34 @@ def _face(
         lashes, pen = _sheet(scene)
         for t in np.linspace(-1.0, 1.0, 14):
             foot = x + 0.17 * wide * t, y - 0.055 * radius * math.sqrt(max(1.0 - t * t, 0.0))
-            pen.line(
-                [_OVER * v for v in (*foot, foot[0] + 3.0 * t, foot[1] - 5.0)], fill=255, width=_OVER // 2
-            )
+            lash = [_OVER * v for v in (*foot, foot[0] + 3.0 * t, foot[1] - 5.0)]
+            pen.line(lash, fill=255, width=_OVER // 2)
         brow = (x - 0.22 * wide, y - 0.2 * radius, x + 0.22 * wide, y - 0.1 * radius)
         pen.arc([_OVER * v for v in brow], 190, 350, fill=230, width=2 * _OVER)
         scene = _over(scene, _averaged(lashes), (0.02, 0.015, 0.01))
     mouth = (col - 0.33 * wide, row + 0.42 * radius, col + 0.33 * wide, row + 0.56 * radius)
-    scene = _over(
-        scene, _shape(scene, "ellipse", mouth), (0.9 * skin[0] + 0.05, 0.5 * skin[1], 0.55 * skin[2])
-    )
+    lips = (0.9 * skin[0] + 0.05, 0.5 * skin[1], 0.55 * skin[2])
+    scene = _over(scene, _shape(scene, "ellipse", mouth), lips)
     line = (col - 0.32 * wide, row + 0.487 * radius, col + 0.32 * wide, row + 0.487 * radius + 1.2)
     return _over(scene, _shape(scene, "rectangle", line), (0.08, 0.02, 0.02))
 
 
 def dead_leaves(
-    height: int,
-    width: int,
-    rng: np.random.Generator,
-    *,
-    smallest: float = 1.5,
-    largest: float = 150.0,
-    oversampling: int = 3,
+    height: int, width: int, rng: np.random.Generator, *, smallest: float = 1.5, largest: float = 150.0
 ) -> Planes:
     """Discs that cover one another, radii with density ~ r^-3, 0.02..0.95, averaged over the pixels.
 
     Source: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", IJCV 41, 2001.
     """
-    size = (height * oversampling, width * oversampling)
+    size = (height * _OVER, width * _OVER)
     canvas = np.zeros((*size, 3), dtype=np.float32)
     empty = np.ones(size, dtype=bool)
     # painted from the front: a leaf shows where nothing lies yet
     for _ in range(200_000):
         if not empty.any():
             break
-        radius = _leaf_radius(rng, smallest, largest) * oversampling
+        # by inversion of the distribution of r^-3
+        radius = float((smallest**-2 - rng.random() * (smallest**-2 - largest**-2)) ** -0.5) * _OVER
         row, col = rng.uniform(-radius, size[0] + radius), rng.uniform(-radius, size[1] + radius)
         colour = _leaf_colour(rng)
         top, left = max(int(row - radius), 0), max(int(col - radius), 0)
@@ -346,14 +316,8 @@ def dead_leaves(
         canvas[top:bottom, left:right][leaf] = colour
         free[leaf] = False
     canvas[empty] = _leaf_colour(rng)
-    fine = canvas.reshape(height, oversampling, width, oversampling, 3)
+    fine = canvas.reshape(height, _OVER, width, _OVER, 3)
     return np.ascontiguousarray(fine.mean(axis=(1, 3)).transpose(2, 0, 1))
-
-
-def _leaf_radius(rng: np.random.Generator, smallest: float, largest: float) -> float:
-    """Draw from a density ~ r^-3 between the limits, by inversion of its distribution."""
-    u = rng.random()
-    return float((smallest**-2 - u * (smallest**-2 - largest**-2)) ** -0.5)
 
 
 def _leaf_colour(rng: np.random.Generator) -> NDArray[np.float32]:

@@ -36,11 +36,9 @@ def code_of(*modules: str, root: Path = ROOT) -> list[Path]:
             continue
         seen[name] = path
         left += _imports(path, root)
-    folders = {path.parent for path in seen.values()} | {path.parent / "data" for path in seen.values()}
-    data = {
-        path for folder in folders if folder.is_dir() for path in folder.iterdir() if path.suffix in _DATA
-    }
-    return sorted({*seen.values(), *data})
+    folders = {folder for path in seen.values() for folder in (path.parent, path.parent / "data")}
+    beside = {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
+    return sorted({*seen.values(), *(path for path in beside if path.suffix in _DATA)})
 
 
 def _file_of(name: str, root: Path) -> Path | None:
@@ -61,8 +59,7 @@ def _imports(path: Path, root: Path) -> list[str]:
     return found
 
 
-Unit: TypeAlias = dict[str, Any]
-"""What one file holds: plain values."""
+Unit: TypeAlias = dict[str, Any]  # what one file holds: plain values
 
 
 def stored(path: Path, make: Callable[[], Unit]) -> Unit:

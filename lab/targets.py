@@ -1,8 +1,7 @@
 """The printed target as simulated cameras photograph it.
 
 It is drawn `FINE` times finer than pixels and brought to the pixel grid by leaving out the frequencies that
-pixels cannot hold: the kernels of simulated lenses are known on the pixel grid only. This shares nothing with
-how `lensmodel.measured` renders its references but the page itself.
+pixels cannot hold. This shares nothing with how `lensmodel.measured` renders its references but the page.
 """
 
 from __future__ import annotations
@@ -18,11 +17,8 @@ from scipy import fft
 from lensmodel.core.types import Planes
 from lensmodel.measured.page import TargetPage
 
-FINE: Final = 3
-"""Drawn samples a pixel along each axis."""
-
-MARGIN: Final = 28
-"""Pixels around the frame for the lens to blur in: half of the largest kernel."""
+FINE: Final = 3  # drawn samples a pixel along each axis
+MARGIN: Final = 28  # pixels around the frame for the lens to blur in: half of the largest kernel
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +40,7 @@ def target_scene(page: TargetPage, shape: tuple[int, int], setup: Setup) -> Plan
     rows, cols = fine_grid(shape)
     up, right = seen(rows, cols, shape, setup)
     scale = page.shape[0] / (shape[0] * setup.fill)
-    places = (
-        up * scale + (page.shape[0] - 1) / 2.0,
-        right * scale + (page.shape[1] - 1) / 2.0,
-    )
+    places = up * scale + (page.shape[0] - 1) / 2.0, right * scale + (page.shape[1] - 1) / 2.0
     light = np.power(np.clip(0.03 + 0.94 * page.at(*places), 0.0, 1.0), setup.gamma)
     plane = to_pixels(light) * falloff(shape, setup)
     return np.ascontiguousarray(np.broadcast_to(plane.astype(np.float32), (3, *plane.shape)))
@@ -82,9 +75,8 @@ def falloff(shape: tuple[int, int], setup: Setup) -> NDArray[np.float32]:
     r = np.linspace(-1.0, 1.0, shape[0] + 2 * MARGIN)[:, None]
     c = np.linspace(-1.0, 1.0, shape[1] + 2 * MARGIN)[None, :]
     down, right, corner = setup.falloff
-    return (
-        (1.0 - down * (r + 1) / 2) * (1.0 - right * (c + 1) / 2) * (1.0 - corner * (r * r + c * c) / 2)
-    ).astype(np.float32)
+    share = (1.0 - down * (r + 1) / 2) * (1.0 - right * (c + 1) / 2) * (1.0 - corner * (r * r + c * c) / 2)
+    return share.astype(np.float32)
 
 
 def to_pixels(fine: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""PSFs of a traced lens at nodes of the field, as a file, and the lens that answers between them."""
+"""Lenses whose PSFs are known: drawn ones, and traced ones, PSFs at nodes of the field in a file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,22 +19,17 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import as_kernel, centroid, resized
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
+from lensmodel.simulate import SimulatedLens, draw_lens
 
-FORMAT: Final = 1
-"""Raised when files of an older form can no longer be read."""
-
+FORMAT: Final = 1  # raised when files of an older form can no longer be read
 _CENTRED_PX: Final = 5e-3  # that a centre of mass may stay off the middle (chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class GridField:
-    """The PSF field of a traced lens at one aperture: a `PsfField` that is smooth between its nodes.
+    """The PSF field of a traced lens at one aperture: cubic splines through nodes, clipped at zero."""
 
-    Nodes stand on a square grid over the disc of the field, (right, up) in half diagonals; kernels
-    between are cubic splines through them, clipped at zero.
-    """
-
-    axis: NDArray[np.float64]  # (n,), ascending places of the nodes along both axes
+    axis: NDArray[np.float64]  # (n,), ascending places of the nodes along both axes, in half diagonals
     # (3, n, n, k, k), Of channels r, g, b; rows of nodes run upwards, columns to the right. Each sums to 1
     # and has its centre of mass on the middle pixel.
     kernels: NDArray[np.float16]
@@ -108,14 +103,11 @@ class GridField:
     def write(self, path: str | Path) -> None:
         """Write as npz, whole or not at all."""
         with atomic(Path(path)) as stream:
+            facts = np.array(json.dumps(dict(self.facts), sort_keys=True))
             np.savez_compressed(
-                stream,
-                format=np.array(FORMAT),
-                axis=self.axis,
-                kernels=self.kernels,
-                centers_px=self.centers_px,
-                facts=np.array(json.dumps(dict(self.facts), sort_keys=True)),
-            )
+                stream, format=np.array(FORMAT), axis=self.axis, kernels=self.kernels,
+                centers_px=self.centers_px, facts=facts,
+            )  # fmt: skip
 
 
 def read_grid(path: str | Path) -> GridField:
@@ -123,12 +115,8 @@ def read_grid(path: str | Path) -> GridField:
     with np.load(path, allow_pickle=False) as stored:
         if int(stored["format"]) != FORMAT:
             raise InvalidInputError(f"{path} has grid format {stored['format']}, expected {FORMAT}")
-        return GridField(
-            stored["axis"],
-            stored["kernels"],
-            stored["centers_px"],
-            json.loads(str(stored["facts"])),
-        )
+        facts = json.loads(str(stored["facts"]))
+        return GridField(stored["axis"], stored["kernels"], stored["centers_px"], facts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +133,14 @@ class GridLens:
         return cls(read_grid(path))
 
     @property
+    def design(self) -> str:
+        """Name of the design that it is a copy of."""
+        return str(self.grid.facts["design"])
+
+    @property
     def model(self) -> str:
         """As written into the metadata of its photos."""
-        return f"Traced {self.grid.facts['design'].title()} {self.focal_mm[0]:.0f}mm f/{self.widest():g}"
+        return f"Traced {self.design.title()} {self.focal_mm[0]:.0f}mm f/{self.widest():g}"
 
     @property
     def focal_mm(self) -> tuple[float, ...]:
@@ -191,6 +184,17 @@ class GridLens:
         c1, c3 = self.grid.lateral[channel]
         half_diagonal_px = 1000.0 * float(self.grid.facts["half_diagonal_mm"]) / self.grid.pitch_um
         return (c1 * r + c3 * r**3) / half_diagonal_px
+
+
+@lru_cache(maxsize=16)
+def known_lens(seed: int, grid: Path | None = None) -> SimulatedLens | GridLens:
+    """Return the lens of third order that a seed draws, or the traced one of a file."""
+    return draw_lens(seed) if grid is None else GridLens.read(grid)
+
+
+def wide_open(lens: SimulatedLens | GridLens) -> LensSettings:
+    """Settings of photos with the widest aperture of the shortest focal length."""
+    return LensSettings(aperture=lens.widest(lens.focal_mm[0]), focal_mm=lens.focal_mm[0])
 
 
 def _centred(kernel: Kernel) -> Kernel:

@@ -19,8 +19,7 @@ from scipy import fft
 from lab.cases import DATA
 from lensmodel.core.types import Kernel, Plane
 
-BORDER: Final = 28
-"""Pixels along the rim that do not count: light from outside the patch reaches so far."""
+BORDER: Final = 28  # pixels along the rim that do not count: light from outside the patch reaches so far
 
 Spectrum = NDArray[np.complex128]
 
@@ -62,11 +61,8 @@ class PatchMixture:
         for j in range(len(self.log_weights)):
             noisy = self.values[j] + np.float32(variance)
             turned = flat @ (self.vectors[j] / np.sqrt(noisy))
-            score = (
-                self.log_weights[j]
-                - 0.5 * np.log(noisy).sum()
-                - np.float32(0.5) * np.einsum("nd,nd->n", turned, turned)
-            )
+            likeness = np.float32(0.5) * np.einsum("nd,nd->n", turned, turned)
+            score = self.log_weights[j] - 0.5 * np.log(noisy).sum() - likeness
             better = score > best
             best[better], which[better] = score[better], j
         out = np.empty_like(flat)

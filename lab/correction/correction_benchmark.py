@@ -8,7 +8,6 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from lab.images import to_srgb
 from lab.kernels import gaussian
 from lab.page import table
 from lab.peers import Peer
+from lensmodel import correction
 from lensmodel.core.geometry import Frame
 from lensmodel.core.jit import jit
 from lensmodel.core.types import (
@@ -32,31 +32,21 @@ from lensmodel.core.types import (
     StepHook,
     ignore_step,
 )
-from lensmodel.correction import (
-    Deconvolver,
-    Roi,
-    SaturationAwareRichardsonLucy,
-    Sensor,
-    correct_planes,
-    deconvolvers,
-)
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.compiled.common import Real, to_plane, to_spectrum
+
+Window = tuple[int, int, int, int] | None
 
 _TILE = 256  # pixels: a tile of the engine
 _KERNEL = 25  # pixels: of a blur of 2 px (chosen)
 
 
-@dataclass(frozen=True, slots=True)
 class SoftCorners:
-    """A lens for timing: a Gaussian whose width grows from the centre to the corner."""
-
-    center_px: float = 0.7  # standard deviation in pixels
-    corner_px: float = 1.8
+    """A lens for timing: a Gaussian whose standard deviation grows from .7 to 1.8 pixels in the corner."""
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of a place; red is a little wider, as diffraction makes it."""
-        width = self.center_px + (self.corner_px - self.center_px) * position.r**2
+        width = 0.7 + 1.1 * position.r**2
         width *= {"r": 1.05, "g": 1.0, "b": 0.97}[channel]
         # Round, and so a product of two profiles: a lens that were slow would be timed with the methods.
         profile = np.diff(special.ndtr((np.arange(size + 1) - size / 2.0) / width))
@@ -71,27 +61,29 @@ def run_correct_benchmark(
     workers: int = 1,
     repeats: int = 1,
     peers: Sequence[Peer] = (),
-    roi: tuple[int, int, int, int] | None = None,
+    roi: Window = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
     """Time the methods on a photo or a part of it, the Richardson-Lucy step, and installed peers."""
     noise = [NoiseModel(1 / 50_000, 1e-6)] * 3
-    window = Roi.of(Frame(*photo.shape[1:]), roi)
+    window = correction.Roi.of(Frame(*photo.shape[1:]), roi)
     part = photo[:, window.top : window.top + window.height, window.left : window.left + window.width]
     small = np.ascontiguousarray(photo[:, :200, :200])
     total = len(methods) + 1 + len(peers)
     results: dict[str, dict[str, float]] = {}
 
-    def timed(light: Planes, method: Deconvolver, part: tuple[int, int, int, int] | None) -> list[float]:
+    def timed(
+        light: Planes, method: correction.Deconvolver, part: tuple[int, int, int, int] | None
+    ) -> list[float]:
         wall, cpu = time.perf_counter(), time.process_time()
-        correct_planes(
+        correction.correct_planes(
             light, SoftCorners(), Frame(*light.shape[1:]), noise=noise, method=method, cfa=cfa,
             workers=workers, roi=part,
         )  # fmt: skip
         return [time.process_time() - cpu, time.perf_counter() - wall]
 
     for done, name in enumerate(methods, start=1):
-        method = deconvolvers.create(name)
+        method = correction.deconvolvers.create(name)
         timed(small, method, None)  # compiling and first-use tables stay out of the figures
         cpu, wall = np.median([timed(photo, method, roi) for _ in range(repeats)], axis=0)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -117,39 +109,25 @@ def run_correct_benchmark(
 def correct_table(report: Mapping[str, Any]) -> str:
     """Tables of a report of `run_correct_benchmark`, in Markdown."""
     methods, per = report["methods"], 3 * report["megapixels"]
-    rows = [
-        [
-            name,
-            f"{row['wall_s']:.2f}",
-            f"{row['cpu_s']:.2f}",
-            f"{row['cpu_s'] / per:.3f}",
-            f"{row['peak_mib']:.0f}",
-        ]
-        for name, row in methods.items()
-    ]
-    peers = [
-        [name, "not installed", *[""] * len(methods)]
-        if seconds is None
-        else [
-            name,
-            f"{seconds:.1f}",
-            *(f"{row['cpu_s'] / max(seconds, 1e-3):.2f} of it" for row in methods.values()),
-        ]
-        for name, seconds in report["peers"].items()
-    ]
+    rows = []
+    for name, row in methods.items():
+        spent = (f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", f"{row['cpu_s'] / per:.3f}")
+        rows.append([name, *spent, f"{row['peak_mib']:.0f}"])
+    peers = []
+    for name, seconds in report["peers"].items():
+        shares = [f"{row['cpu_s'] / max(seconds or 0.0, 1e-3):.2f} of it" for row in methods.values()]
+        found = ["not installed", *[""] * len(shares)] if seconds is None else [f"{seconds:.1f}", *shares]
+        peers.append([name, *found])
+    steps = [[name.replace("_", " "), f"{value:.4f}"] for name, value in report["kernel"].items()]
     parts = [
         f"{report['megapixels']:.2f} megapixels{', RAW' if report['raw'] else ''}, "
         f"workers {report['workers']}; {report['machine']}",
         table(["method", "wall s", "CPU s", "CPU s per megapixel and channel", "memory so far MiB"], rows),
-        table(
-            ["Richardson-Lucy step", "value"],
-            [[name.replace("_", " "), f"{value:.4f}"] for name, value in report["kernel"].items()],
-        ),
+        table(["Richardson-Lucy step", "value"], steps),
     ]
     if peers:
-        parts.append(
-            table(["program", "CPU s, files left out", *(f"{name} takes" for name in methods)], peers)
-        )
+        head = ["program", "CPU s, files left out", *(f"{name} takes" for name in methods)]
+        parts.append(table(head, peers))
     return "\n\n".join(parts)
 
 
@@ -176,28 +154,23 @@ def _kernel_times() -> dict[str, float]:
     rng = np.random.default_rng(0)
     plane = (0.2 + 0.5 * rng.random((_TILE - _KERNEL + 1, _TILE - _KERNEL + 1))).astype(np.float32)
     blur = UniformBlur(gaussian(_KERNEL, np.eye(2) * 4.0))
-    sensor = Sensor(NoiseModel(1 / 50_000, 1e-6), clip=1.0)
+    sensor = correction.Sensor(NoiseModel(1 / 50_000, 1e-6), clip=1.0)
     steps, megapixels = 25, plane.size / 1e6
-
+    ours = correction.SaturationAwareRichardsonLucy(steps)
     wide = (0.2 + 0.5 * rng.random((1024, 1024))).astype(np.float32)
     small = blur.kernel.astype(np.float32)
     canvas = np.zeros(fast_shape((_TILE, _TILE)), dtype=np.float32)
     spent = _cpu(
         {
-            "ours": lambda: SaturationAwareRichardsonLucy(steps).deconvolve(plane, blur, sensor=sensor),
+            "ours": lambda: ours.deconvolve(plane, blur, sensor=sensor),
             "scikit_image": lambda: restoration.richardson_lucy(wide, small, num_iter=4),  # type: ignore[no-untyped-call]
             "bare": lambda: _bare_transforms(canvas, 2 * steps),
         }
     )
-    ours, bare = (spent[name] / steps / megapixels for name in ("ours", "bare"))
+    own, bare = (spent[name] / steps / megapixels for name in ("ours", "bare"))
     theirs = spent["scikit_image"] / 4 / (wide.size / 1e6)
-    return {
-        "ours": ours,
-        "scikit_image": theirs,
-        "share_of_scikit_image": ours / theirs,
-        "bare_transforms": bare,
-        "over_bare_transforms": ours / bare,
-    }
+    ratios = {"share_of_scikit_image": own / theirs, "over_bare_transforms": own / bare}
+    return {"ours": own, "scikit_image": theirs, "bare_transforms": bare, **ratios}
 
 
 def _cpu(works: Mapping[str, Callable[[], object]], repeats: int = 5) -> dict[str, float]:

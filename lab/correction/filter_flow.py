@@ -1,13 +1,10 @@
-"""A field of kernels: the efficient filter flow, by which tests blur pictures.
-
-A correction solves in cells of one kernel instead.
-"""
+"""A field of kernels: the efficient filter flow; a correction solves in cells of one kernel instead."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +15,10 @@ from lensmodel.core.types import Channel, Kernel, Plane
 from lensmodel.correction.blur import UniformBlur
 
 
-class _Window(NamedTuple):
-    """One window of the latent plane, with the kernel of its centre."""
-
-    rows: slice
-    cols: slice
-    weight: NDArray[np.float32]
-    blur: UniformBlur
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class EfficientFilterFlow:
     """Blur that changes over the field: y = sum_r place_r(a_r * (w_r . crop_r(x))), sum_r w_r = 1.
 
-    The windows act on the sharp plane, so each point of the scene keeps one kernel and all of its light.
     Source: M. Hirsch, S. Sra, B. Schölkopf, S. Harmeling, "Efficient filter flow for space-variant multiframe
     blind deconvolution", CVPR 2010.
     """
@@ -71,25 +58,17 @@ class EfficientFilterFlow:
         reach = self.reach
         # Each window lands with a margin of the kernel's half side; the frame is cut out at the end.
         full = np.zeros((latent.shape[0] + 2 * reach, latent.shape[1] + 2 * reach))
-        for rows, cols, weight, blur in self._windows():
-            piece = np.pad(latent[rows, cols] * weight, 2 * reach)
-            full[rows.start : rows.stop + 2 * reach, cols.start : cols.stop + 2 * reach] += blur.forward(
-                piece
-            )
+        rows, cols = (
+            list(_widened(partition(extent, parts), reach))
+            for extent, parts in ((self.height, len(self.kernels)), (self.width, len(self.kernels[0])))
+        )
+        for (i, (top, rise)), (j, (left, run)) in product(enumerate(rows), enumerate(cols)):
+            weight = np.outer(rise, run).astype(np.float32)
+            part = latent[top : top + len(rise), left : left + len(run)] * weight
+            blurred = UniformBlur(self.kernels[i][j]).forward(np.pad(part, 2 * reach))
+            full[top : top + blurred.shape[0], left : left + blurred.shape[1]] += blurred
         cut = 2 * reach
         return np.asarray(full[cut : cut + self.height, cut : cut + self.width], dtype=np.float32)
-
-    def _windows(self) -> Iterator[_Window]:
-        reach = self.reach
-        down, across = len(self.kernels), len(self.kernels[0])
-        for i, (top, rise) in enumerate(_widened(partition(self.height, down), reach)):
-            for j, (left, run) in enumerate(_widened(partition(self.width, across), reach)):
-                yield _Window(
-                    slice(top, top + len(rise)),
-                    slice(left, left + len(run)),
-                    np.outer(rise, run).astype(np.float32),
-                    UniformBlur(self.kernels[i][j]),
-                )
 
 
 def _widened(

@@ -2,9 +2,8 @@
 
     python -m lab.correction.judge [--frames clipped-lamps text] [--widths 1 1.2] [--method standard]
 
-The frames are those of the gallery, foliage and faces behind ray-traced lenses. Printed are the gain in PSNR
-by zone, the figures of `lab.gallery.measure`, the share of the correction that was held back, and CPU seconds
-a megapixel. Widths other than 1 hand over kernels so many times as wide, with the error that they have.
+The frames are those of the gallery, foliage and faces behind ray-traced lenses. Widths other than 1 hand over
+kernels so many times as wide, with the error that they have.
 """
 
 from __future__ import annotations
@@ -15,12 +14,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from lab.gallery.measure import measured
+from lab.gallery.page import measured
 from lab.gallery.pictures import FRAMES, SimulatedFrame, rendered, take
 from lab.page import table
 from lab.reproduce.cases import repository_grids
@@ -71,19 +71,12 @@ def judged(frame: SimulatedFrame, folder: Path, width: float, method: str) -> li
     path, truth = take(frame, folder)
     seen, true = develop(path), frame.truth()
     wide = Widened(true, width)
+    field, error = (true, 0.0) if width == 1.0 else (wide, wide.error)
     correct = partial(
-        correct_planes,
-        seen.planes,
-        true if width == 1.0 else wide,
-        seen.frame,
-        noise=seen.correction_noise,
-        clip=seen.clip,
-        cfa=seen.cfa,
-        stored=StoredColour.of_photo(seen),
-        lateral=lateral_of(seen),
-        method=method,
-        psf_error=0.0 if width == 1.0 else wide.error,
-    )
+        correct_planes, seen.planes, field, seen.frame, noise=seen.correction_noise, clip=seen.clip,
+        cfa=seen.cfa, stored=StoredColour.of_photo(seen), lateral=lateral_of(seen), method=method,
+        psf_error=error,
+    )  # fmt: skip
     correct(strength=0.0)  # asks for all kernels
     start = time.process_time()
     after = correct()
@@ -111,11 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--method", default="standard")
     wanted = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        rows = [
-            judged(known[name], Path(folder), width, wanted.method)
-            for name in wanted.frames
-            for width in wanted.widths
-        ]
+        cases = product(wanted.frames, wanted.widths)
+        rows = [judged(known[name], Path(folder), width, wanted.method) for name, width in cases]
     print(table(_HEAD, rows))
 
 

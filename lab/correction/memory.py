@@ -3,8 +3,7 @@
     python -m lab.correction.memory --photo FILE [--as-it-is] [--method fast]
 
 Makes a RAW photo of the picture FILE, develops it, corrects it with the lens of `lensmodel bench correct` and
-writes a 16-bit TIFF, as `lensmodel correct` does; `--as-it-is` corrects FILE itself. Peaks are those of each
-part, by Linux's own count.
+writes a 16-bit TIFF; `--as-it-is` corrects FILE itself.
 """
 
 from __future__ import annotations
@@ -52,15 +51,9 @@ def main() -> None:
         tell("developed")
         lateral_of(photo)
         corrected = correct_planes(
-            photo.planes,
-            SoftCorners(),
-            photo.frame,
-            method=wanted.method,
-            noise=photo.correction_noise,
-            clip=photo.clip,
-            cfa=photo.cfa,
-            workers=wanted.workers,
-        )
+            photo.planes, SoftCorners(), photo.frame, method=wanted.method, noise=photo.correction_noise,
+            clip=photo.clip, cfa=photo.cfa, workers=wanted.workers,
+        )  # fmt: skip
         tell("corrected")
         print(f"photo and correction: {2 * corrected.planes.nbytes / 2**20:.0f} MiB", flush=True)
         encoding = photo.encoding

@@ -12,17 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Shown: TypeAlias = NDArray[np.floating]
-"""A picture `(row, col, 3)`, sRGB-encoded, 0 to 1."""
-
-STANDS_OUT: Final = 0.06
-"""Fifteen of 255: chosen as what one sees at a glance on an even ground."""
-
-COLOURED: Final = 0.12
-"""Distance of chromaticity, see `chromaticity`: chosen, a colour cast that one names without comparison."""
-
-HUE_REACH: Final = 3
-"""Pixels around a place whose colours it may take: as far as lateral colour moves them."""
+Shown: TypeAlias = NDArray[np.floating]  # a picture `(row, col, 3)`, sRGB-encoded, 0 to 1
+STANDS_OUT: Final = 0.06  # fifteen of 255: chosen as what one sees at a glance on an even ground
+COLOURED: Final = 0.12  # distance of chromaticity (chosen): a cast that one names without comparison
+HUE_REACH: Final = 3  # pixels around a place whose colours it may take: as far as lateral colour moves them
 
 TRACE: Final = 0.006
 """Least curvature that a point of contrast 1 leaves when it is blurred, after a Gaussian of one pixel.
@@ -30,11 +23,8 @@ TRACE: Final = 0.006
 Behind a Gaussian of s pixels it is 1 / (2 pi (1 + s^2)^2): .072 at s = .7, .027 at 1.2, .0064 at 2.
 """
 
-BANDS: Final = {"coarse": (0.06, 0.15), "middle": (0.15, 0.3), "fine": (0.3, 0.5)}
-"""Cycles per pixel."""
-
-_FAR: Final = 2.0
-"""Ranges beyond the range of a dot (chosen): with 1.5 correct twigs and letters had dots."""
+BANDS: Final = {"coarse": (0.06, 0.15), "middle": (0.15, 0.3), "fine": (0.3, 0.5)}  # cycles per pixel
+_FAR: Final = 2.0  # ranges beyond the range of a dot (chosen): with 1.5 correct twigs and letters had dots
 _HINT: Final = 0.1  # share of a colour that the original must have there for its line to be traced (chosen)
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
@@ -43,20 +33,17 @@ _SPECTRUM_OF_GRAIN: Final = 8.0
 """Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
 _FLAT_SHARE: Final = 0.1  # of the squares, the flattest; so many at least (chosen: medians of fewer jump)
 _FLAT_BLOCKS: Final = 8
-_LEAST_GRAIN: Final = 1e-3
-"""Standard deviation below which a place holds rounding to eight bits and no grain."""
+_LEAST_GRAIN: Final = 1e-3  # standard deviation below which a place holds rounding to eight bits
 
 
 _EDGE_GRID: Final = 16  # pixels of a square, of which one edge is taken at most (chosen)
 _REACH: Final = 12  # pixels of a profile to either side; from `_PLATEAU` on it must be even (chosen)
 _PLATEAU: Final = 7
 _STEP: Final = 0.2  # least step of an edge, full scale is 1 (chosen: 50 of 255)
-_EVEN: Final = 0.06
-"""Standard deviation of a plateau beside an edge, as a share of the step: chosen, half of the bar."""
+_EVEN: Final = 0.06  # standard deviation of a plateau beside an edge over the step (chosen): half of the bar
 _HALO: Final = 5.0
 """Percent of the step beyond its plateaus at an edge that counts (chosen): with 25 the truth overshoots."""
-_LEAST_EDGES: Final = 50
-"""Chosen: below it the 99th percentile is the worst edge."""
+_LEAST_EDGES: Final = 50  # chosen: below it the 99th percentile is the worst edge
 
 
 def luma(picture: Shown) -> NDArray[np.float64]:
@@ -76,11 +63,8 @@ def chromaticity(picture: Shown) -> NDArray[np.float32]:
 def dots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.bool_]:
     """Pixels that stand alone where the original has no such value and nothing that could become one.
 
-    In a channel, a dot exceeds the range of the original's 5 x 5 pixels by twice that range and by
-    `STANDS_OUT` at least, and at most one of its own eight neighbours goes with it: what is sharpened
-    along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`. Where the truth
-    is known, what it has within a pixel, but for `STANDS_OUT`, is no dot: where thin twigs cross, a perfect
-    correction brings back pixels of which the blur left no bump.
+    At most one of a dot's eight neighbours goes with it: what is sharpened along an edge or a line has two. A
+    true point that was blurred left a bump, see `TRACE`. What a known truth has within a pixel is none.
     """
     found = np.zeros(before.shape[:2], dtype=bool)
     for k in range(3):
@@ -118,11 +102,8 @@ def _dots(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.bool
 def hue_flips(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.bool_]:
     """Pixels whose hue the original has nowhere within `HUE_REACH` pixels, and no trace of it either.
 
-    With c the chromaticity of a pixel and o those around the same place of the original, it is a flip
-    where |c| exceeds the largest part of any o along c by `COLOURED` and by half of |c|: a colour may
-    get purer, up to twice, but not turn into another one. A small thing whose colour blur has washed out
-    left a tenth of it, and a ridge (`TRACE`); only where all around it has the opposite hue did it leave
-    nothing, and counts. Where the truth is known, what it has within a pixel, but for `COLOURED`, is no flip.
+    Its chromaticity exceeds the largest part of any around along it by `COLOURED` and by half of itself. A
+    small thing that blur has washed out left a tenth of its colour, and a ridge.
     """
     old, new = chromaticity(before), chromaticity(after)
     size = np.linalg.norm(new, axis=-1)
@@ -178,11 +159,8 @@ def _second_derivatives(plane: NDArray[np.floating]) -> tuple[NDArray[np.float32
 def overshoots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.float64]:
     """Overshoot beside each clean edge of the original, in both pictures.
 
-    An edge is the steepest place of a square of 16 pixels where the original's lightness changes by a fifth
-    or more from one even plateau to another, each 7 to 12 pixels away, with nothing between. Its
-    profile is the mean of five lines across it; the overshoot is how far it leaves the plateaus 1 to 6 pixels
-    away, in percent of the step. Where the truth is known, edges beside which it has a line that blur hid
-    are left out as well: a perfect correction "overshoots" there.
+    The mean of five lines across it leaves the plateaus 1 to 6 pixels away by so many percent of the step.
+    Edges beside which the truth has a line that blur hid are left out.
     """
     old, new = luma(before), luma(after)
     if min(old.shape) < 3 * _REACH:
@@ -215,17 +193,14 @@ def _steepest(slope: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
     """Place of the steepest pixel of each square, where it is steep enough for a step to be there."""
     inner = slope[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2]
     height, width = (n // _EDGE_GRID * _EDGE_GRID for n in inner.shape)
-    squares = inner[:height, :width].reshape(
-        height // _EDGE_GRID, _EDGE_GRID, width // _EDGE_GRID, _EDGE_GRID
-    )
-    flat = squares.transpose(0, 2, 1, 3).reshape(height // _EDGE_GRID, width // _EDGE_GRID, _EDGE_GRID**2)
+    down, across = height // _EDGE_GRID, width // _EDGE_GRID
+    squares = inner[:height, :width].reshape(down, _EDGE_GRID, across, _EDGE_GRID)
+    flat = squares.transpose(0, 2, 1, 3).reshape(down, across, _EDGE_GRID**2)
     at = flat.argmax(axis=-1)
-    down, across = np.nonzero(flat.max(axis=-1) > _STEP / (2 * _REACH))
-    best = at[down, across]
-    return (
-        down * _EDGE_GRID + best // _EDGE_GRID + _REACH + 2,
-        across * _EDGE_GRID + best % _EDGE_GRID + _REACH + 2,
-    )
+    steep = np.nonzero(flat.max(axis=-1) > _STEP / (2 * _REACH))
+    best = at[steep]
+    inside = np.array(steep) * _EDGE_GRID + np.divmod(best, _EDGE_GRID) + _REACH + 2
+    return inside[0], inside[1]
 
 
 def _profiles(
@@ -249,19 +224,15 @@ def _profiles(
 def grain(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.float64]:
     """Noise power of lightness in each even place and band of frequency, in both pictures.
 
-    Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
-    the original, more of it than rounding. Where the truth is known and has as much in a band, it is texture.
-    Which of them are the flattest `grain_ratio` decides.
+    Squares with a spectrum of grain (`_SPECTRUM_OF_GRAIN`), more of it than rounding; where a known truth has
+    as much in a band, it is texture. Which of them are the flattest `grain_ratio` decides.
     """
     height, width = (n // _BLOCK for n in before.shape[:2])
     lights = [None if p is None else luma(p) for p in (before, after, truth)]
     found = []
     for down in range(height):
         for across in range(width):
-            window = (
-                slice(down * _BLOCK, (down + 1) * _BLOCK),
-                slice(across * _BLOCK, (across + 1) * _BLOCK),
-            )
+            window = tuple(slice(n * _BLOCK, (n + 1) * _BLOCK) for n in (down, across))
             if not (before[window].min() > 0.02 and before[window].max() < 0.98):
                 continue
             old, new, true = (None if p is None else _detrended(p[window]) for p in lights)

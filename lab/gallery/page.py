@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,39 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lab.gallery.measure import bars, measured
-from lab.gallery.pictures import Picture, Rendered, taken
-from lab.gallery.work import AFTER, BEFORE, Words, work
-from lab.images import BLOCK, crop_boxes, side_by_side
+from lab.gallery import figures
+from lab.gallery.pictures import AFTER, BEFORE, Picture, Rendered, Words, work
+from lab.images import BLOCK, crop_boxes, gains, side_by_side
 from lab.images import Picture as Shown
 from lab.page import Page, table
 from lab.stored import Unit, stored, version_of
 
 SIDE: Final = 96
-ZOOM: Final = 3
-"""Pixels of a crop, and how many times each is shown."""
-
+ZOOM: Final = 3  # pixels of a crop, and how many times each is shown
 WORST: Final = 3  # crops of the worst places (chosen)
 _SQUARE: Final = 48  # pixels of a square that is scored: half a crop, so that one shows all of it
-_EVEN: Final = 0.02
-"""Added to the local contrast: a change of an even place counts against it, not against nothing."""
+_EVEN: Final = 0.02  # added to the local contrast: a change of an even place counts against it
 
 CACHE, CROPS = "cache", "crops"
 
+# the column of each bar's figure
 _COLUMNS: Final = {
-    "dots": "dots",
-    "hue flips": "hue flips",
-    "overshoot": "overshoot %",
-    "grain": "grain",
-    "zones": "gain dB",
-    "blocks": "blocks < -0.5 dB",
-}
-"""Bar -> column of its figure."""
-
+    "dots": "dots", "hue flips": "hue flips", "overshoot": "overshoot %", "grain": "grain",
+    "zones": "gain dB", "blocks": "blocks < -0.5 dB",
+}  # fmt: skip
 _HEAD: Final = ("picture", "state", *_COLUMNS.values(), "worst block")
 
-Place = tuple[str, int, int]
-"""Name, first row and first column."""
+Place = tuple[str, int, int]  # name, first row and first column
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +65,12 @@ def _entry(picture: Picture, output: Path, workers: int, say: Words) -> GalleryE
     if picture.unreadable:
         unit: Unit = {"state": "not read", "reason": picture.unreadable, "note": "", "announced": {}}
         return GalleryEntry(picture, unit, {}, {}, {})
-    say("taking the photo")
-    taken(picture)
     folder, unit = work(picture, output / CACHE, workers, say)
     before = np.load(folder / BEFORE, mmap_mode="r")
     after = np.load(folder / AFTER, mmap_mode="r") if (folder / AFTER).exists() else before
     truth = None if picture.truth is None else np.load(picture.truth, mmap_mode="r")
     say("measuring")
-    name = f"figures-{version_of('lab.gallery.measure')[:8]}.json"
+    name = f"figures-{version_of(__name__)[:8]}.json"
     found = stored(folder / name, lambda: measured(before, after, truth))
     sheets = {"original": before, "corrected": after} | ({} if truth is None else {"truth": truth})
     named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
@@ -162,19 +150,16 @@ def _cells(entry: GalleryEntry) -> list[str]:
     found, row = entry.figures, [entry.picture.name, entry.work["state"]]
     if not found:
         return [*row, *[""] * (len(_HEAD) - 2)]
-    overshoot, grain, gains = found["overshoot"], found["grain"], found["gains"]
-    row += [
-        str(found["dots"]),
-        str(found["hue_flips"]),
-        f"few edges ({found['edges']})"
-        if overshoot is None
-        else "{1:.1f} (original {0:.1f})".format(*overshoot),
-        "nothing even" if grain is None else " ".join(f"{ratio:.2f}" for ratio in grain.values()),
-    ]
-    if gains is None:
+    overshoot, grain, gained = found["overshoot"], found["grain"], found["gains"]
+    row += [str(found["dots"]), str(found["hue_flips"]), f"few edges ({found['edges']})", "nothing even"]
+    if overshoot is not None:
+        row[-2] = "{1:.1f} (original {0:.1f})".format(*overshoot)
+    if grain is not None:
+        row[-1] = " ".join(f"{ratio:.2f}" for ratio in grain.values())
+    if gained is None:
         return [*row, "", "", ""]
-    zones = ", ".join(f"{zone} {value:+.2f}" for zone, value in gains["zones"].items())
-    return [*row, zones, f"{100 * gains['loss_share']:.1f} %", f"{gains['worst_db']:+.2f}"]
+    zones = ", ".join(f"{zone} {value:+.2f}" for zone, value in gained["zones"].items())
+    return [*row, zones, f"{100 * gained['loss_share']:.1f} %", f"{gained['worst_db']:+.2f}"]
 
 
 def _summary(entries: Sequence[GalleryEntry]) -> list[str]:
@@ -215,9 +200,8 @@ def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
         page.title(entry.picture.name)
         unit = entry.work
         words = [unit["state"] + (f" ({unit['reason']})" if unit["reason"] else ""), unit["note"]]
-        words += (
-            [f"{100 * entry.figures['changed']:.1f} % of the pixels changed visibly"] if entry.figures else []
-        )
+        if entry.figures:
+            words.append(f"{100 * entry.figures['changed']:.1f} % of the pixels changed visibly")
         words += [
             f"announced in {zone}: {'not known' if value is None else f'{value:+.1f} dB'}"
             for zone, value in unit["announced"].items()
@@ -226,3 +210,81 @@ def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
         for shown, file in entry.crops.items():
             page.picture(file, shown)
     return page.write(output / "index.md", "Gallery")[1]
+
+
+# --- the figures of one picture, tile by tile, and which bars they keep ---
+
+TILE: Final = 1024  # side of a tile: a multiple of the squares of the figures; bounds the memory
+
+OVERSHOOT_PERCENT: Final = 12.0
+GRAIN: Final = (0.8, 1.0)
+ZONE_LOSS_DB: Final = 0.05
+LOSS_SHARE: Final = 0.01
+"""Bars (chosen): most overshoot in percent, grain over the original's, a zone's loss, losing blocks."""
+
+_MARGIN: Final = 14  # pixels around a tile: the reach of a profile, and two for its slope
+
+Figures = dict[str, Any]
+
+
+def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figures:
+    """Take all figures of a picture."""
+    faults: dict[str, list[NDArray[np.intp]]] = {"dots": [], "hue_flips": []}
+    edges, places, changed = [], [], 0
+    for row, col, window, inner in _tiles(*before.shape[:2]):
+        old, new = _unit(before[window]), _unit(after[window])
+        true = None if truth is None else _unit(truth[window])
+        for name, find in (("dots", figures.dots), ("hue_flips", figures.hue_flips)):
+            faults[name].append(np.argwhere(find(old, new, true)[inner]) + np.array([row, col]))
+        edges.append(figures.overshoots(old, new, true))
+        places.append(figures.grain(old[inner], new[inner], None if true is None else true[inner]))
+        changed += int((np.abs(new[inner] - old[inner]).max(axis=-1) > 1.0 / 255.0).sum())
+    counts: Figures = {}
+    for name, tiles in faults.items():
+        pixels = np.concatenate(tiles)
+        counts |= {name: len(pixels), f"{name}_at": _densest(pixels)}
+    edge_table = np.concatenate(edges)
+    gained = None if truth is None else gains(before, after, truth)
+    return {
+        **counts,
+        "edges": len(edge_table),
+        "overshoot": figures.percentile_of_edges(edge_table),
+        "grain": figures.grain_ratio(np.concatenate(places)),
+        "changed": changed / float(np.prod(before.shape[:2])),
+        "gains": None if gained is None else asdict(gained),
+    }
+
+
+def bars(found: Figures) -> dict[str, bool]:
+    """Say which bars a picture keeps; one that could not be measured on it is left out."""
+    kept = {"dots": found["dots"] == 0, "hue flips": found["hue_flips"] == 0}
+    if found["overshoot"] is not None:
+        kept["overshoot"] = found["overshoot"][1] <= OVERSHOOT_PERCENT
+    if found["grain"] is not None:
+        kept["grain"] = all(GRAIN[0] <= round(ratio, 2) <= GRAIN[1] for ratio in found["grain"].values())
+    if found["gains"] is not None:
+        kept["zones"] = min(found["gains"]["zones"].values()) >= -ZONE_LOSS_DB
+        kept["blocks"] = found["gains"]["loss_share"] <= LOSS_SHARE
+    return kept
+
+
+def _densest(pixels: NDArray[np.intp]) -> list[int] | None:
+    """Middle of the square that holds most of some pixels."""
+    if len(pixels) == 0:
+        return None
+    squares, numbers = np.unique(pixels // _SQUARE, axis=0, return_counts=True)
+    return [int(k) * _SQUARE + _SQUARE // 2 for k in squares[numbers.argmax()]]
+
+
+def _unit(part: Rendered) -> NDArray[np.float32]:
+    return np.asarray(part, dtype=np.float32) / np.float32(65535.0)
+
+
+def _tiles(height: int, width: int) -> Iterator[tuple[int, int, tuple[slice, slice], tuple[slice, slice]]]:
+    """First row and column of each tile, the tile with its margin, and the tile within that."""
+    for row in range(0, height, TILE):
+        for col in range(0, width, TILE):
+            top, left = max(row - _MARGIN, 0), max(col - _MARGIN, 0)
+            window = (slice(top, row + TILE + _MARGIN), slice(left, col + TILE + _MARGIN))
+            bottom, right = min(row + TILE, height) - top, min(col + TILE, width) - left
+            yield row, col, window, (slice(row - top, bottom), slice(col - left, right))

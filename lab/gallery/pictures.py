@@ -1,11 +1,12 @@
-"""Which pictures entries_of in the gallery: every real one of the test data, and frames of hard scenes."""
+"""The pictures of the gallery: every real one of the test data, and frames of hard scenes; corrected."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -13,20 +14,20 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from lab.reproduce.cases import MARGIN
-from lab.reproduce.shots import JPEG_QUALITY
+import lensmodel
+from lab.reproduce.cases import BASE_ISO, JPEG_QUALITY, MARGIN
 from lab.scenes import hard_scene
-from lab.stored import version_of
-from lab.traced import GridLens
+from lab.stored import Unit, stored, version_of
+from lab.traced import GridLens, known_lens, wide_open
+from lensmodel.blind.sampling import CalibrationEvent
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotAnImageError
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import LensSettings, Planes
+from lensmodel.core.types import Planes
 from lensmodel.photo import Encoding, develop, inspect, write_image
-from lensmodel.simulate import SimulatedCamera, SimulatedLens, draw_lens, photograph, write_photo
+from lensmodel.simulate import SimulatedCamera, SimulatedLens, photograph, write_photo
 
-Rendered = NDArray[np.uint16]
-"""A picture `(row, col, 3)`, sRGB, 0 to 65535, in sensor orientation."""
+Rendered = NDArray[np.uint16]  # a picture `(row, col, 3)`, sRGB, 0 to 65535, in sensor orientation
 
 
 def rendered(planes: Planes, encoding: Encoding) -> Rendered:
@@ -44,18 +45,12 @@ def read_rendered(path: Path) -> Rendered:
 
 
 HEIGHT: Final = 832
-WIDTH: Final = 1248
-"""A megapixel: all demo photographs cover it, and it is calibrated in half a minute."""
+WIDTH: Final = 1248  # a megapixel: all demo photographs cover it, and it is calibrated in half a minute
 
 FOLDERS: Final = ("real", "large", "raw", "series", "meta")
-STARS: Final = ("psf", (".tif", ".tiff"))
-"""Star fields lie among other measurements of points."""
-
-SUBJECTS: Final = {"faces": (215, 230)}
-"""An eye and the skin below it."""
-
-SMALLEST: Final = 64
-"""Shorter side of a picture that shows anything; stand-ins for metadata are smaller."""
+STARS: Final = ("psf", (".tif", ".tiff"))  # star fields lie among other measurements of points
+SUBJECTS: Final = {"faces": (215, 230)}  # an eye and the skin below it
+SMALLEST: Final = 64  # shorter side of a picture that shows anything; stand-ins for metadata are smaller
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,35 +61,34 @@ class SimulatedFrame:
     scene: str  # name in `lab.scenes.HARD_SCENES`
     lens: int  # seed of the lens
     jpeg: bool = False  # whether it is a camera's JPEG, else a DNG
-    full_well_electrons: float = 50_000.0  # of the sensor at this ISO, electrons
-    read_noise: float = 50.0
+    camera: SimulatedCamera = BASE_ISO
     grid: Path | None = None  # of a ray-traced lens that takes the place of the drawn one
 
     @property
     def optics(self) -> SimulatedLens | GridLens:
         """The lens."""
-        return draw_lens(self.lens) if self.grid is None else GridLens.read(self.grid)
-
-    @property
-    def settings(self) -> LensSettings:
-        """Wide open."""
-        focal = self.optics.focal_mm[0]
-        return LensSettings(aperture=self.optics.widest(focal), focal_mm=focal)
+        return known_lens(self.lens, self.grid)
 
     def truth(self) -> PsfField:
         """Return the true PSF field."""
-        return self.optics.field(self.settings)
+        return self.optics.field(wide_open(self.optics))
 
     @property
     def file(self) -> str:
         """Name of its file."""
         return f"{self.name}{'.jpg' if self.jpeg else '.dng'}"
 
+    @property
+    def truth_file(self) -> str:
+        """Name of the file of its truth, npy."""
+        return f"{self.name}-truth.npy"
 
+
+HIGH_ISO: Final = SimulatedCamera(full_well_electrons=2500.0, read_noise=7.5)
 FRAMES: Final = (
     SimulatedFrame("clipped-lamps", "lamps", 1000),
     SimulatedFrame("red-cars", "red-cars", 1001),
-    SimulatedFrame("night-high-iso", "night", 1002, full_well_electrons=2500.0, read_noise=7.5),
+    SimulatedFrame("night-high-iso", "night", 1002, camera=HIGH_ISO),
     SimulatedFrame("snow-twigs", "snow", 1003),
     SimulatedFrame("faces", "faces", 1004, jpeg=True),
     SimulatedFrame("foliage", "foliage", 1005),
@@ -108,21 +102,18 @@ def take(
     frame: SimulatedFrame, folder: Path, *, height: int = HEIGHT, width: int = WIDTH
 ) -> tuple[Path, Path]:
     """Take a frame unless it is there."""
-    photo, truth = folder / frame.file, folder / f"{frame.name}-truth.npy"
+    photo, truth = folder / frame.file, folder / frame.truth_file
     if photo.exists() and truth.exists():
         return photo, truth
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([frame.lens, 18])
-    camera = SimulatedCamera(
-        height, width, full_well_electrons=frame.full_well_electrons, read_noise=frame.read_noise
-    )
+    camera = replace(frame.camera, height=height, width=width)
     scene = hard_scene(frame.scene, height + 2 * MARGIN, width + 2 * MARGIN, rng)
-    taken = photograph(scene, frame.optics, frame.settings, camera, rng)
+    taken = photograph(scene, frame.optics, wide_open(frame.optics), camera, rng)
     raw = folder / f"{frame.name}.dng"
     write_photo(raw, taken)
     developed = develop(raw)
-    with atomic(truth) as file:
-        np.save(file, rendered(taken.sharp, developed.encoding), allow_pickle=False)
+    _save(truth, rendered(taken.sharp, developed.encoding))
     if frame.jpeg:
         planes, encoding = developed.planes, developed.encoding
         write_image(photo, planes, encoding, format="jpeg", color_space="srgb", quality=JPEG_QUALITY)
@@ -136,10 +127,15 @@ class Picture:
 
     name: str  # for people: folder and file, or "simulated/" and the frame
     path: Path  # the photo; of a simulated frame it is taken when its turn comes
-    truth: Path | None = None  # npy of what a perfect lens would have shown; only of simulated frames
+    frame: SimulatedFrame | None = None
     unreadable: str = ""  # why the file cannot be read; "" where it can
     # pixel `(row, col)` of what the picture is about, where the usual places may miss it
     subject: tuple[int, int] | None = None
+
+    @property
+    def truth(self) -> Path | None:
+        """Path of what a perfect lens would have shown (npy); None for real pictures."""
+        return None if self.frame is None else self.path.with_name(self.frame.truth_file)
 
     @property
     def slug(self) -> str:
@@ -156,38 +152,24 @@ def real_pictures(folder: Path) -> list[Picture]:
         name = f"{path.parent.name}/{path.name}"
         try:
             info = inspect(path)
+            if min(info.width, info.height) >= SMALLEST:
+                found.append(Picture(name, path))
         except NotAnImageError:
             continue
         except LensModelError as error:
             found.append(Picture(name, path, unreadable=str(error)))
-            continue
-        if min(info.width, info.height) >= SMALLEST:
-            found.append(Picture(name, path))
     if not found:
-        raise InvalidInputError(
-            f"{folder} has no picture in {', '.join(FOLDERS)}; name the test data's folder"
-        )
+        raise InvalidInputError(f"{folder} has no picture in {', '.join(FOLDERS)}; name the test data")
     return found
 
 
 def simulated_pictures(cache: Path) -> list[Picture]:
     """Name the simulated frames; they are taken when their turn comes."""
-    folder = cache / f"frames-{version_of('lab.gallery.pictures')[:12]}"
+    folder = cache / f"frames-{version_of(__name__)[:12]}"
     return [
-        Picture(
-            f"simulated/{frame.name}",
-            folder / frame.file,
-            folder / f"{frame.name}-truth.npy",
-            subject=SUBJECTS.get(frame.name),
-        )
+        Picture(f"simulated/{frame.name}", folder / frame.file, frame, subject=SUBJECTS.get(frame.name))
         for frame in FRAMES
     ]
-
-
-def taken(picture: Picture) -> None:
-    """Take a simulated frame whose turn has come."""
-    if picture.truth is not None:
-        take(next(frame for frame in FRAMES if frame.file == picture.path.name), picture.path.parent)
 
 
 def chosen(pictures: Sequence[Picture], only: Sequence[str]) -> list[Picture]:
@@ -197,3 +179,61 @@ def chosen(pictures: Sequence[Picture], only: Sequence[str]) -> list[Picture]:
             names = ", ".join(picture.name for picture in pictures)
             raise InvalidInputError(f"no picture is called {text!r}; there are {names}")
     return [p for p in pictures if not only or any(text in p.name for text in only)]
+
+
+# --- calibrated from themselves and corrected by default, unless that is stored ---
+
+BEFORE, AFTER = "before.npy", "after.npy"  # pictures as stored, rendered
+ANY_APERTURE: Final = 5.6  # of photos that do not say theirs (chosen): of no effect where one photo is all
+
+Words = Callable[[str], None]
+
+
+def work(picture: Picture, cache: Path, workers: int, say: Words) -> tuple[Path, Unit]:
+    """Return the folder of the pictures, before and after, and how they were made."""
+    if picture.frame is not None:
+        say("taking the photo")
+        take(picture.frame, picture.path.parent)
+    with picture.path.open("rb") as file:
+        content = hashlib.file_digest(file, "sha256").hexdigest()[:8]
+    folder = cache / f"{picture.slug}-{content}-{version_of(__name__)[:8]}"
+    return folder, stored(folder / "work.json", lambda: _worked(picture, folder, workers, say))
+
+
+def _worked(picture: Picture, folder: Path, workers: int, say: Words) -> Unit:
+    say("developing")
+    developed = develop(picture.path)
+    _save(folder / BEFORE, rendered(developed.planes, developed.encoding))
+    aperture = ANY_APERTURE if developed.info.metadata.aperture is None else None
+    note = "" if aperture is None else "the file does not say its aperture, which was given as by --aperture"
+    unit: Unit = {"state": "left alone", "reason": "", "note": note, "announced": {}}
+    reasons: list[str] = []
+
+    def heard(event: CalibrationEvent) -> None:
+        if event.stage == "skipped":
+            reasons.append(event.detail)
+
+    say("calibrating")
+    try:
+        lens = lensmodel.calibrate(picture.path, aperture=aperture, workers=workers, on_event=heard)
+    except LensModelError as error:
+        return {**unit, "reason": f"calibration was refused: {reasons[0] if reasons else error}"}
+    say("correcting")
+    with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
+        output = Path(name) / "corrected.tif"
+        try:
+            corrected = lensmodel.correct(
+                picture.path, lens, output, aperture=aperture, color_space="srgb", workers=workers
+            )
+        except LensModelError as error:
+            return {**unit, "reason": f"correction was refused: {error}"}
+        _save(folder / AFTER, read_rendered(output))
+    announced = {zone: report.expected_gain_db for zone, report in corrected.zones.items()}
+    return {**unit, "state": "corrected", "announced": announced}
+
+
+def _save(path: Path, values: Rendered) -> None:
+    """Keep an array, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(path) as file:
+        np.save(file, values, allow_pickle=False)

@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 
 from lab.population import library, scenes, sets
-from lab.population.grids import grid_of
 from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
-from lab.population.traced import draw
+from lab.population.traced import draw, grid_of
 from lensmodel.core.files import write_atomically
 from lensmodel.neural import FieldNetwork
 from lensmodel.neural.network import WEIGHTS
@@ -26,18 +25,14 @@ def _arguments() -> argparse.Namespace:
     commands = parser.add_subparsers(dest="command", required=True)
     make = commands.add_parser("scenes", help="scale photographs down to sharp scenes, draw others")
     make.add_argument("--photos", type=Path, required=True, help="folder of sharp photographs (PNG)")
-    make.add_argument(
-        "--git", type=Path, nargs="*", default=[], help="git repositories of photographs (JPEG)"
-    )
+    make.add_argument("--git", type=Path, nargs="*", default=[], help="git repositories of JPEGs")
     lenses = commands.add_parser("lenses", help="draw lenses and take photos through them; resumable")
     lenses.add_argument("--family", choices=library.FAMILIES, default="wavefront")
     lenses.add_argument("--first", type=int, default=0, help="first shard of 25 lenses")
     lenses.add_argument("--shards", type=int, default=400)
     lenses.add_argument("--of-errors", action="store_true", help="for `train-errors`")
     lenses.add_argument("--held-out", action="store_true", help="lenses, designs and scenes to judge by")
-    lenses.add_argument(
-        "--plain", action="store_true", help="held out, with five RAW photos that nothing spoils"
-    )
+    lenses.add_argument("--plain", action="store_true", help="held out, RAW photos that nothing spoils")
     lenses.add_argument("--through", type=Path, help="take other photos through the lenses of this folder")
     lenses.add_argument("--rescaled", action="store_true", help="before pixels of another size then")
     lenses.add_argument("--processes", type=int, default=2)
@@ -62,16 +57,13 @@ def _arguments() -> argparse.Namespace:
     grid.add_argument("--stopped", type=float, default=0.0, help="stops closed from wide open")
     publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
     publish.add_argument("weights", type=Path)
-    publish.add_argument(
-        "--fixed", type=Path, required=True, help="small set to hold them by; made if missing"
-    )
+    publish.add_argument("--fixed", type=Path, required=True, help="set to hold them by, made if missing")
     return parser.parse_args()
 
 
 def _judge(asked: argparse.Namespace) -> None:
-    network = (
-        FieldNetwork.load() if asked.weights is None else FieldNetwork.from_bytes(asked.weights.read_bytes())
-    )
+    data = (asked.weights or WEIGHTS).read_bytes()
+    network = FieldNetwork.from_bytes(data)
     lenses = sets.load_library(asked.folder / "plain", set(), families=(asked.family,))
     print(f"{asked.family}, {len(lenses)} lenses, weights {network.name}: relative L2 of PSFs")
     for photos in (1, 2, 5):

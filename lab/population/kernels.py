@@ -1,15 +1,13 @@
 """From a wavefront to a PSF on pixels, fast: the transform of the pupil, integrated over pixels.
 
-The incoherent PSF of a pupil P(x) = A(x) exp(2 pi i W(x) / lambda) of radius 1 and f-number N is the squared
-modulus of its Fourier transform (J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, section
-6.3); its samples at half of lambda N determine it. Integrating over square pixels is a product with sinc(f
-pitch) in frequency.
+The PSF of a pupil P(x) = A(x) exp(2 pi i W(x) / lambda) of f-number N is the squared modulus of its Fourier
+transform (J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, section 6.3); its samples at half
+of lambda N determine it. Integrating over square pixels is a product with sinc(f pitch) in frequency.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
 from functools import cache
 from math import factorial
 from typing import Final, Protocol, runtime_checkable
@@ -19,15 +17,9 @@ import scipy.fft
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from lensmodel.core.types import Channel
 from lensmodel.neural.network import BLOCK, COARSE, FINE, SIDE
 
-WAVELENGTHS_UM: Final[dict[Channel, tuple[float, float]]] = {
-    "r": (0.59, 0.63),
-    "g": (0.52, 0.555),
-    "b": (0.45, 0.485),
-}
-"""Two for each colour: its band of a Bayer filter."""
+WAVELENGTHS_UM: Final = np.array([0.59, 0.63, 0.52, 0.555, 0.45, 0.485])  # two for each of r, g, b
 
 TERMS: Final = tuple((n, m) for n in range(2, 11) for m in range(n % 2, min(n, 6) + 1, 2))
 """Zernike terms (n, m) of a wavefront; each has a cosine and a sine."""
@@ -102,43 +94,34 @@ def basis(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]
     return np.array(columns)
 
 
-@dataclass(frozen=True, slots=True)
-class _Pupil:
-    """Points of the unit disc on a grid of n x n, with the terms and their slopes there."""
-
-    rows: NDArray[np.int64]
-    cols: NDArray[np.int64]
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    terms: NDArray[np.float32]
-
-
 @cache
-def _pupil(n: int) -> _Pupil:
+def _pupil(n: int) -> tuple[tuple[NDArray[np.intp], ...], NDArray[np.float32], NDArray[np.float32]]:
+    """Rows and columns of the points of the unit disc on a grid of n x n, (x, y), and the terms there."""
     g = (np.arange(n) + 0.5) / n * 2.0 - 1.0
     y, x = np.meshgrid(-g, g, indexing="ij")
-    rows, cols = np.nonzero(x * x + y * y <= 1.0)
-    x, y = x[rows, cols], y[rows, cols]
-    return _Pupil(rows, cols, x.astype(np.float32), y.astype(np.float32), basis(x, y).astype(np.float32))
+    inside = np.nonzero(x * x + y * y <= 1.0)
+    x, y = x[inside], y[inside]
+    return inside, np.array([x, y], np.float32), basis(x, y).astype(np.float32)
+
+
+def _inner(n: int, most: float) -> NDArray[np.float64]:
+    """Points (x, y) of a grid of n x n over the pupil up to a squared radius."""
+    g = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    y, x = np.meshgrid(g, g, indexing="ij")
+    inside = x * x + y * y <= most
+    return np.array([x[inside], y[inside]])
 
 
 @cache
 def _slopes() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """A coarse grid of the pupil and the terms' derivatives there, by central differences."""
-    g = (np.arange(20) + 0.5) / 10.0 - 1.0
-    y, x = np.meshgrid(g, g, indexing="ij")
-    inside = x * x + y * y <= 0.98
-    x, y = x[inside], y[inside]
-    h = 1e-4
+    (x, y), h = _inner(20, 0.98), 1e-4
     return x, y, (basis(x + h, y) - basis(x - h, y)) / (2 * h), (basis(x, y + h) - basis(x, y - h)) / (2 * h)
 
 
 def stopped_down(ratio: float) -> NDArray[np.float64]:
     """Matrix by which rows of coefficients become those of the inner part, `ratio` of the radius."""
-    g = (np.arange(40) + 0.5) / 20.0 - 1.0
-    y, x = np.meshgrid(g, g, indexing="ij")
-    inside = x * x + y * y <= 1.0
-    x, y = x[inside], y[inside]
+    x, y = _inner(40, 1.0)
     flat = np.vstack([basis(x, y), np.ones_like(x)[None], x[None], y[None]])
     return np.linalg.lstsq(flat.T, basis(ratio * x, ratio * y).T, rcond=None)[0][:COLUMNS].T
 
@@ -151,13 +134,20 @@ def spots(
     rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * f_number)
     weight = np.ones(rays.shape[:2])
     if circles is not None:
-        for c in range(circles.shape[1]):
-            cx, cy, radius = circles[:, c, :].T
-            weight *= (x - cx[:, None]) ** 2 + (y - cy[:, None]) ** 2 <= radius[:, None] ** 2
+        weight *= _within(x, y, circles)
     weight /= np.maximum(weight.sum(1, keepdims=True), 1.0)
     centre = (rays * weight[..., None]).sum(1)
     spread = ((rays - centre[:, None]) ** 2 * weight[..., None]).sum((1, 2))
     return centre, np.sqrt(spread / 2.0)
+
+
+def _within(
+    x: NDArray[np.floating], y: NDArray[np.floating], circles: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """Which points lie in all of some circles (..., circle, 3)."""
+    cx, cy, radius = np.moveaxis(circles[..., None], -2, 0)
+    inside: NDArray[np.bool_] = ((x - cx) ** 2 + (y - cy) ** 2 <= radius**2).all(-2)
+    return inside
 
 
 class Renderer:
@@ -177,9 +167,7 @@ class Renderer:
         """Kernel (SIDE, SIDE), its centre of mass so far right and up; sum 1 of what falls inside."""
         x, y, dx, dy = _slopes()
         rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * self._f_number)
-        open_ = np.ones(x.size, bool)
-        for cx, cy, radius in circles:
-            open_ &= (x - cx) ** 2 + (y - cy) ** 2 <= radius * radius
+        open_ = _within(x, y, circles)
         if not open_.any():
             open_[:] = True
         centre = rays[open_].mean(0) - np.asarray(offset_px) * self._pitch
@@ -188,20 +176,18 @@ class Renderer:
         side = SIDE if reach > 0.45 * FINE * self._pitch else FINE
         period = min(2.0 * reach, 1.06 * side * self._pitch)
         n = next((s for s in _SIDES if s * step >= period), _SIDES[-1])
-        pupil = _pupil(n)
-        inside = np.ones(pupil.x.size, bool)
-        for cx, cy, radius in circles:
-            inside &= (pupil.x - cx) ** 2 + (pupil.y - cy) ** 2 <= radius * radius
-        path = coefficients.astype(np.float32) @ pupil.terms
+        where, pupil, terms = _pupil(n)
+        inside = _within(pupil[0], pupil[1], circles)
+        path = coefficients.astype(np.float32) @ terms
         matrix = self._matrix(n, wavelength_um, side)
         at = np.arange(side) - (side - 1) / 2.0
         for _ in range(3):  # tails outside the window move the centre of mass: the second pass mends that
-            tilt = (centre[0] * pupil.x + centre[1] * pupil.y) / np.float32(2.0 * self._f_number)
+            tilt = (centre[0] * pupil[0] + centre[1] * pupil[1]) / np.float32(2.0 * self._f_number)
             phase = (path - tilt) * np.float32(2.0 * np.pi / wavelength_um)
             field = np.zeros((n, 2 * n), np.complex64)
             wave = np.empty(phase.shape, np.complex64)  # quicker than a complex exponential
             wave.real, wave.imag = inside * np.cos(phase), inside * np.sin(phase)
-            field[pupil.rows, pupil.cols] = wave
+            field[where] = wave
             # a ray at +2 N grad W: the transform with exp(-i) moves light towards the slope
             amplitude = scipy.fft.fft(scipy.fft.fft(field, axis=1).T.copy(), 2 * n, axis=1).T
             kernel = np.maximum(matrix @ (amplitude.real**2 + amplitude.imag**2) @ matrix.T, 0.0)
@@ -238,7 +224,7 @@ def kernels_of(
 ) -> NDArray[np.float32]:
     """Kernels of a lens, shape (place, 3, SIDE, SIDE): red, green, blue; each centred on its own centroid."""
     used = lens.working(f_number)
-    wavelengths = np.array([w for pair in WAVELENGTHS_UM.values() for w in pair])
+    wavelengths = WAVELENGTHS_UM
     coefficients = lens.wavefronts(xy, wavelengths, f_number)
     circles = lens.aperture(xy, f_number)
     if isinstance(lens, LateralColour):  # light of one channel lands side by side: a blur along the radius

@@ -27,8 +27,7 @@ from lensmodel.neural.statistics import to_octant
 
 Family = Literal["wavefront", "third-order", "traced"]
 FAMILIES: Final[tuple[Family, ...]] = ("wavefront", "third-order", "traced")
-SHARD: Final = 25
-"""Lenses in a shard: a minute's work at most is lost when a run is ended."""
+SHARD: Final = 25  # lenses in a shard: a minute's work at most is lost when a run is ended
 
 _KIND_SHARES: Final = (0.64, 0.12, 0.24)
 _PHOTO_COUNTS: Final = ((1, 2, 3, 5), (0.3, 0.2, 0.2, 0.3))
@@ -52,17 +51,10 @@ def places(rng: np.random.Generator, cells: int = 4) -> NDArray[np.float64]:
     """8 + cells^2 places of a frame: the centre, three about it, a jittered grid, near the four corners."""
     aspect = rng.choice([1.5, 1.5, 4 / 3, 16 / 9])
     hx, hy = aspect / np.hypot(aspect, 1), 1 / np.hypot(aspect, 1)
-    at = [(0.001, 0.0005)]
-    at += [tuple(rng.normal(0, 0.15, 2)) for _ in range(3)]
-    side = 2 / cells
-    for i in range(cells):
-        at += [
-            (((i + rng.random()) * side - 1) * hx, ((j + rng.random()) * side - 1) * hy) for j in range(cells)
-        ]
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            t = rng.uniform(0.82, 0.98)
-            at.append((sx * hx * t, sy * hy * t))
+    half = np.array([hx, hy])
+    at = [np.array([0.001, 0.0005]), *rng.normal(0, 0.15, (3, 2))]
+    at += [((np.array(cell) + rng.random(2)) * (2 / cells) - 1) * half for cell in np.ndindex(cells, cells)]
+    at += [np.array([sx, sy]) * half * rng.uniform(0.82, 0.98) for sx in (-1, 1) for sy in (-1, 1)]
     return np.array(at)
 
 
@@ -127,9 +119,8 @@ def make_lens(
     stacked = np.array([kernels_of(state.lens, on_lens, state.f_number) for state in states])
     if not plain:
         stacked = behind_sensor(stacked, *draw_sensor(rng))
-    kind: PatchKind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     set_so = np.array([(s.f_number, s.focal_mm, s.focus_m) for s in states], np.float32)
-    return _photographed(rng, scenes, kind, xy, stacked, set_so, states[0].lens.pitch_um, plain=plain)
+    return _photographed(rng, scenes, xy, stacked, set_so, states[0].lens.pitch_um, plain=plain)
 
 
 def retake(
@@ -137,8 +128,8 @@ def retake(
     scenes: Scenes,
     rng: np.random.Generator,
     *,
-    plain: bool = False,
-    rescaled: bool = False,
+    plain: bool,
+    rescaled: bool,
 ) -> dict[str, Any] | None:
     """Take other photos through a lens of the library; None where its kernels hold a file's processing."""
     pitch, kind = stored["facts"]
@@ -149,40 +140,27 @@ def retake(
     if rescaled:
         scale = float(np.exp(rng.uniform(*np.log(_RESCALED))))
         kernels, pitch = scaled(kernels, scale), pitch / scale
-    other: PatchKind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
-    xy = stored["xy"].astype(np.float64)
-    states = stored["states"].astype(np.float32)
-    return _photographed(
-        rng, scenes, other, xy, kernels.astype(np.float32), states, float(pitch), plain=plain
-    )
+    xy, states = stored["xy"].astype(np.float64), stored["states"].astype(np.float32)
+    return _photographed(rng, scenes, xy, kernels.astype(np.float32), states, float(pitch), plain=plain)
 
 
 def _photographed(
-    rng: np.random.Generator,
-    scenes: Scenes,
-    kind: PatchKind,
-    xy: NDArray[np.float64],
-    stacked: NDArray[np.float32],
-    states: NDArray[np.float32],
-    pitch_um: float,
-    *,
-    plain: bool,
-) -> dict[str, Any] | None:
+    rng: np.random.Generator, scenes: Scenes, xy: NDArray[np.float64], stacked: NDArray[np.float32],
+    states: NDArray[np.float32], pitch_um: float, *, plain: bool,
+) -> dict[str, Any] | None:  # fmt: skip
     """Take photos through a lens: what a shard holds of it; None where they hardly show anything."""
+    kind: PatchKind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     camera = Camera(rng, scenes, kind, xy, stacked, plain)
     photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
     count = int(rng.choice([32, 56, 110], p=[0.35, 0.4, 0.25]))
-    patches = camera.take(5, 5 * _PLAIN_PATCHES) if plain else camera.take(photos, count)
-    if len(patches.place) < 8:
+    statistics, of = camera.take(5, 5 * _PLAIN_PATCHES) if plain else camera.take(photos, count)
+    if len(of) < 8:
         return None
     if camera.processing is not None:
         stacked = camera.processing.applied(stacked)
-    turned = to_octant(patches.statistics, xy[patches.place])
     return {
-        "statistics": turned.astype(np.float16),
-        "place": patches.place.astype(np.int16),
-        "photo": patches.photo.astype(np.int16),
-        "state": patches.state.astype(np.int16),
+        "statistics": to_octant(statistics, xy[of[:, 0]]).astype(np.float16),
+        **dict(zip(("place", "photo", "state"), of.T.astype(np.int16), strict=True)),
         "xy": xy.astype(np.float32),
         "fine": fine_of(stacked).astype(np.float16),
         "coarse": coarse_of(stacked).astype(np.float16),
@@ -206,12 +184,11 @@ class Order:
 
     def lenses(self, shard: int) -> Iterator[dict[str, Any] | None]:
         """Make the lenses of a shard."""
+        crops = Scenes(self.scenes, held_out=self.held_out)
         if self.through is None:
-            crops = Scenes(self.scenes, held_out=self.held_out)
             for number in range(shard * SHARD, (shard + 1) * SHARD):
                 yield make_lens(self.family, number, crops, held_out=self.held_out, plain=self.plain)
         elif (path := _path(self.through, self.family, shard)).exists():
-            crops = Scenes(self.scenes, held_out=self.held_out)
             for number, stored in enumerate(load_shard(path)):
                 rng = np.random.default_rng([number, shard, FAMILIES.index(self.family), int(self.rescaled)])
                 yield retake(stored, crops, rng, plain=self.plain, rescaled=self.rescaled)
@@ -226,23 +203,27 @@ class Order:
             return 0
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as file:
-            np.savez(file, **{f"{i}/{name}": v for i, lens in enumerate(lenses) for name, v in lens.items()})
+            np.savez(file, **numbered(lenses))
         return len(lenses)
 
 
 def generate(order: Order, shards: Sequence[int], processes: int) -> Iterator[int]:
     """Make the shards that are not there yet; yield how many lenses each has got."""
     with ProcessPoolExecutor(processes) as pool:
-        for job in [pool.submit(order.make, shard) for shard in shards]:
-            yield job.result()
+        yield from pool.map(order.make, shards)
 
 
 def _path(folder: Path, family: Family, shard: int) -> Path:
     return folder / f"{family}-{shard:05d}.npz"
 
 
+def numbered(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Arrays of several rows under one name each, as a file holds them."""
+    return {f"{i}/{name}": value for i, row in enumerate(rows) for name, value in row.items()}
+
+
 def load_shard(path: Path) -> list[dict[str, NDArray[Any]]]:
-    """Read the lenses of a shard."""
+    """Read what `numbered` arrays make up."""
     lenses: dict[str, dict[str, NDArray[Any]]] = {}
     with np.load(path) as shard:
         for key in shard.files:

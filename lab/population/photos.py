@@ -2,10 +2,8 @@
 
 Per patch a crop of a scene is blurred by the kernel of its place, with lateral colour, and where the photo
 has parts out of focus or was shaken, by a disc or a line as well; sampled by a Bayer mosaic with shot and
-read noise and clipping. Files of the kinds "tiff" and "jpeg" are demosaicked (H. S. Malvar, L. He, R.
-Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned color images", ICASSP 2004),
-smoothed and sharpened, and a JPEG has a tone curve and is compressed with its chroma halved. What such a
-file is to be corrected for is the lens together with its processing: `Processing.applied` gives that kernel.
+read noise and clipping. A file of the kind "tiff" or "jpeg" is to be corrected for the lens together with its
+processing: `Processing.applied` gives that kernel.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ import scipy.fft
 import scipy.ndimage
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.special import j1
 
 from lab.images import to_srgb
 from lab.population.scenes import busiest
@@ -51,8 +50,8 @@ class Scenes:
             and (entry["slope"] < _SOFTEST or entry["name"].startswith(("leaves", "text")))
         ]
         self._scenes = [np.load(folder / entry["file"], mmap_mode="r") for entry in chosen]
+        # variance of each scene's own blur, px^2, which a photo of it undoes
         self.blur = tuple(min(float(entry["blur"]), _OWN_BLUR) for entry in chosen)
-        """Variance of each scene's own blur, px^2, which a photo of it undoes."""
 
     def __len__(self) -> int:
         return len(self._scenes)
@@ -123,11 +122,8 @@ class Processing:
         v = np.clip(luma + chroma, 0.0, 1.0)
         if not self.quality:
             return srgb_to_linear(v)
-        data = io.BytesIO()
-        Image.fromarray((v.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)).save(
-            data, "JPEG", quality=self.quality, subsampling="4:2:0"
-        )
-        data.seek(0)
+        data, eight = io.BytesIO(), (v.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
+        Image.fromarray(eight).save(data, "JPEG", quality=self.quality, subsampling="4:2:0")
         with Image.open(data) as picture:
             return srgb_to_linear(np.asarray(picture, np.float32).transpose(2, 0, 1) / 255.0)
 
@@ -157,7 +153,7 @@ _OTHER: Final = np.array(
 
 
 def demosaic(mosaic: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear interpolation of Malvar, He and Cutler for a mosaic with red in its first corner."""
+    """Interpolate a mosaic with red in its first corner linearly (H. S. Malvar et al., ICASSP 2004)."""
     colours = bayer(*mosaic.shape)
     cross, along, across, other = (
         scipy.ndimage.correlate(mosaic, kernel, mode="mirror")
@@ -182,16 +178,6 @@ class _Exposure:
     focus_error: float  # radius of a disc in pixels, 0: in focus
     focus_normal: tuple[float, float, float]  # half plane of the frame that is out of focus: nx, ny, offset
     shake: tuple[float, float]  # vector of a line, pixels
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Patches:
-    """Patches of some photos of one lens."""
-
-    statistics: NDArray[np.float32]  # (n, LENGTH), in the frame of the image
-    place: NDArray[np.int64]  # (n,), of which place, photo, and state of the lens
-    photo: NDArray[np.int64]
-    state: NDArray[np.int64]
 
 
 @dataclass
@@ -258,23 +244,20 @@ class Camera:
             sources=sources, tilts=tilts, focus_error=error, focus_normal=normal, shake=shake,
         )  # fmt: skip
 
-    def take(self, photos: int, patches: int) -> Patches:
-        """Take some photos at random states of the lens, `patches` patches altogether."""
+    def take(self, photos: int, patches: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Take some photos: statistics (n, LENGTH) of patches, and (n, 3) place, photo and state of each."""
         rng = self.rng
         states, places = self.kernels.shape[:2]
         counts = rng.multinomial(patches, np.ones(photos) / photos)
-        statistics, where, of_photo, of_state = [], [], [], []
+        statistics, of = [], []
         for photo, count in enumerate(counts):
             exposure, state = self._expose(), int(rng.integers(states))
             for place in rng.integers(0, places, count):
                 made = self._patch(exposure, state, int(place))
                 if made is not None:
                     statistics.append(made)
-                    where.append(int(place))
-                    of_photo.append(photo)
-                    of_state.append(state)
-        stacked = np.array(statistics, np.float32).reshape(-1, LENGTH)
-        return Patches(stacked, np.array(where, int), np.array(of_photo, int), np.array(of_state, int))
+                    of.append((int(place), photo, state))
+        return np.array(statistics, np.float32).reshape(-1, LENGTH), np.array(of, int).reshape(-1, 3)
 
     def _otf(self, state: int, place: int) -> NDArray[np.complex64]:
         """Transfer functions of one place, with lateral colour; kept while there is room."""
@@ -332,15 +315,7 @@ class Camera:
         return patch_statistics(np.ascontiguousarray(sampled), colours, _DEVELOPED_READ, 0.0)
 
 
-@cache
-def _disc_table() -> NDArray[np.float32]:
-    from scipy.special import j1  # noqa: PLC0415 - for a table only
-
-    z = 2 * np.pi * np.arange(1, 8192) / 1024
-    return np.concatenate([[1.0], 2 * j1(z) / z]).astype(np.float32)
-
-
 def _disc(cycles: NDArray[np.float32]) -> NDArray[np.float32]:
     """Transfer function of a uniform disc: frequency times radius in, 2 J1(2 pi x) / (2 pi x) out."""
-    table = _disc_table()
-    return table[np.minimum((cycles * 1024).astype(np.int64), len(table) - 1)]
+    z = 2 * np.pi * np.maximum(cycles, 1e-6)
+    return (2 * j1(z) / z).astype(np.float32)

@@ -22,13 +22,11 @@ from lensmodel.core.errors import InvalidInputError
 
 Array = NDArray[np.float64]
 
-D_UM: Final = 0.58756
-"""Wavelength of n_d, helium."""
+D_UM: Final = 0.58756  # wavelength of n_d, helium
 
 _F_UM, _C_UM, _G_UM = 0.48613, 0.65627, 0.43584
 
-LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
-"""Designs that development may see, whatever their place in the order."""
+LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})  # in development
 
 _UNSEEN: Final = frozenset({"telephoto", "field-corrector", "aspheric", "noct"})
 """Designs that are held out, whatever theirs."""
@@ -117,19 +115,13 @@ def _parsed(row: dict[str, Any]) -> Prescription:
         if len(s) > 4:
             asphere[i, : len(s[4])] = s[4]
         glass[i] = _glass(tuple(s[2]) if s[2] else None)
+    curvature = np.array([1.0 / s[0] if s[0] else 0.0 for s in surfaces])
+    thickness = np.array([float(s[1]) for s in surfaces])
+    conic = np.array([float(s[3]) if len(s) > 3 else 0.0 for s in surfaces])
     return Prescription(
-        row["name"],
-        row["source"],
-        row["focal"],
-        row["f_number"],
-        row["half_field_deg"],
-        np.array([1.0 / s[0] if s[0] else 0.0 for s in surfaces]),
-        np.array([float(s[1]) for s in surfaces]),
-        np.array([float(s[3]) if len(s) > 3 else 0.0 for s in surfaces]),
-        asphere,
-        glass,
-        int(row["stop"]),
-    )
+        row["name"], row["source"], row["focal"], row["f_number"], row["half_field_deg"],
+        curvature, thickness, conic, asphere, glass, int(row["stop"]),
+    )  # fmt: skip
 
 
 def _glass(glass: Any) -> tuple[float, float, float]:  # noqa: ANN401 - a tuple of two or three, or a name
@@ -154,8 +146,7 @@ def _held_out() -> frozenset[str]:
     return frozenset(name for name, one in PRESCRIPTIONS.items() if one.family in unseen)
 
 
-PRESCRIPTIONS: Final = _read()
-"""All designs by name, in sorted order."""
+PRESCRIPTIONS: Final = _read()  # all designs by name, in sorted order
 
 HELD_OUT: Final = _held_out()
 """Names of the designs that nothing may be trained on: every other patent or book page in sorted order."""

@@ -31,11 +31,10 @@ _SHARPEST: Final = 0.10  # least share of gradient energy in the finest band; be
 _SCALES: Final = (1.0, 1.5, 2.3)  # further factors that each photograph is scaled down by
 
 _SPECTRUM_SIDE: Final = 128  # pixels of windows that a scene's spectrum is of: those of a patch
-_NATURAL_SLOPE: Final = 2.0
-"""Of power against frequency: D. J. Field, "Relations between the statistics of natural images and the
-response properties of cortical cells", JOSA A 4, 1987."""
+_NATURAL_SLOPE: Final = 2.0  # of power against frequency: D. J. Field, JOSA A 4, 1987
 _SLOPE_HELD: Final = 1.0  # how many rings' worth of weight that has in a fit (chosen)
 
+# originals of the photographs of the test half, as their collections name them
 TEST_HALF: Final = (
     "beacon-street-sunset",
     "canyon-wren",
@@ -50,7 +49,6 @@ TEST_HALF: Final = (
     "Oppo R7 Plus",
     "Samsung SM-N900A (Galaxy Note 3)",
 )
-"""Originals of the photographs of the test half, as their collections name them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +76,8 @@ def objects_of(repository: Path, under: str) -> Iterator[Source]:
         facts, _, name = line.partition("\t")
         size = facts.split()[3]
         if size.isdigit() and int(size) > 300_000 and name.lower().endswith((".jpg", ".jpeg")):
-            blob = facts.split()[2]
-            data = subprocess.run(
-                ["git", "-C", str(repository), "cat-file", "blob", blob], capture_output=True, check=True
-            ).stdout
-            yield Source(Path(name).stem, data)
+            read = ["git", "-C", str(repository), "cat-file", "blob", facts.split()[2]]
+            yield Source(Path(name).stem, subprocess.run(read, capture_output=True, check=True).stdout)
 
 
 def linear(data: bytes) -> NDArray[np.float32]:
@@ -115,14 +110,8 @@ def sharpness(scene: NDArray[np.float32]) -> float:
     wide = np.abs(green[:, 2:-2] * 2 - green[:, :-4] - green[:, 4:])
     tile = 64
     rows, cols = (n // tile for n in wide.shape)
-    parts = [
-        v[: rows * tile, : cols * tile]
-        .reshape(rows, tile, cols, tile)
-        .swapaxes(1, 2)
-        .reshape(-1, tile * tile)
-        for v in (fine, wide)
-    ]
-    energy = [np.square(v).mean(1) for v in parts]
+    parts = (v[: rows * tile, : cols * tile].reshape(rows, tile, cols, tile) for v in (fine, wide))
+    energy = [np.square(part).swapaxes(1, 2).reshape(-1, tile * tile).mean(1) for part in parts]
     busy = energy[1] > np.quantile(energy[1], 0.7)
     return float(np.median(energy[0][busy] / energy[1][busy]))
 

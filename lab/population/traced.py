@@ -20,13 +20,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.population.kernels import basis, draw_pitch_um
+from lab.population.kernels import WAVELENGTHS_UM, basis, draw_pitch_um, kernels_of
 from lab.population.prescriptions import PRESCRIPTIONS
 from lab.population.tracing import AIM_UM, Array, Crossing, Nominal, System, aimed, principal
+from lab.traced import GridField
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.neural.network import SIDE
 
-GREEN_UM: Final = (0.52, 0.555)
-"""Light that autofocus and the limits on blur look at."""
+GREEN_UM: Final = (0.52, 0.555)  # light that autofocus and the limits on blur look at
 
 _FOCUS_PLACES: Final = ((0.0, 1.0), (0.35, 0.5), (0.65, 0.25))
 """Where an autofocus looks: radius and weight of rings of four points. Chosen: mostly the middle."""
@@ -43,6 +44,8 @@ _WORST_MISFIT_UM: Final = 0.1  # r.m.s.: beyond it the terms do not hold the tra
 _SOFT_PX: Final = (1.5, 5.0)  # r.m.s. spots in the centre of copies that are opened beyond their design
 _COLOURS_UM: Final = (0.45, 0.54, 0.63)
 _TRIES: Final = 60
+_AT_ONCE: Final = 64  # places whose rays are traced together
+_INSIDE: Final = 1.001  # half diagonals: designs are traced no farther out than the corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +72,13 @@ class Faults:
 
 
 class _Light(NamedTuple):
-    """Rays in pupil coordinates: `p` (2, places, waves, rays), `path_um` and `depth` (places, waves, rays).
+    """Rays in pupil coordinates, at (places, waves, rays)."""
 
-    `outside` is 1 at the rim that a ray is nearest to, larger outside; `slope` (2, ...) L / N and M / N.
-    """
-
-    p: Array
+    p: Array  # (2, ...)
     path_um: Array
-    depth: Array
-    outside: Array
-    place_um: Array
-    slope: Array
+    outside: Array  # 1 at the rim that a ray is nearest to, larger outside
+    place_um: Array  # (2, ...)
+    slope: Array  # (2, ...), L / N and M / N
     circles: Array
 
 
@@ -147,17 +146,9 @@ class TracedLens:
                 turn[i] = rotation
                 origin[i] = front + rotation @ (origin[i] - front) + np.array([*shift / 1000.0, 0.0])
         powers = self.scale ** -(3.0 + 2.0 * np.arange(one.asphere.shape[1]))
-        return System(
-            one.curvature / self.scale,
-            one.conic,
-            one.asphere * powers,
-            one.glass,
-            np.where(one.glass[:, 0] > 1.0, faults.index, 0.0),
-            origin,
-            turn,
-            one.stop,
-            self.nominal.rims,
-        )
+        index = np.where(one.glass[:, 0] > 1.0, faults.index, 0.0)
+        shapes = (one.curvature / self.scale, one.conic, one.asphere * powers, one.glass)
+        return System(*shapes, index, origin, turn, one.stop, self.nominal.rims)
 
     def stop_mm(self, f_number: float) -> float:
         """Radius of the stop at an aperture."""
@@ -205,9 +196,8 @@ class TracedLens:
     def aperture(self, xy: Array, f_number: float | None = None) -> NDArray[np.float32]:
         """Circles `(p, 4, 3)`, (x, y, radius) in pupil radii: what is in all and in the unit disc is open."""
         xy = np.asarray(xy, dtype=np.float64)
-        return self._light(xy, np.array([AIM_UM]), f_number or self.f_number, self.focus_mm).circles.astype(
-            np.float32
-        )
+        light = self._light(xy, np.array([AIM_UM]), f_number or self.f_number, self.focus_mm)
+        return light.circles.astype(np.float32)
 
     def lateral_um(
         self, xy: Array, wavelengths_um: Array, f_number: float | None = None
@@ -215,9 +205,9 @@ class TracedLens:
         """Shift `(p, w, 2)` of the image in each wavelength against their mean: the tilt that was removed."""
         return self._fitted(xy, wavelengths_um, f_number)[1]
 
-    def spots_px(self, xy: Array, f_number: float | None = None) -> Array:
+    def spots_px(self, xy: Array) -> Array:
         """Root mean square of the rays from their middle along one axis, green, in pixels, `(p,)`."""
-        light = self._light(np.asarray(xy), np.array(GREEN_UM), f_number or self.f_number, self.focus_mm)
+        light = self._light(np.asarray(xy), np.array(GREEN_UM), self.f_number, self.focus_mm)
         open_ = light.outside <= 1.0
         spot = _centred(light.place_um, open_)
         square = (spot**2).sum(axis=(0, 3)) / np.maximum(open_.sum(axis=2), 1)
@@ -249,11 +239,7 @@ class TracedLens:
         rms = np.sqrt((misfit**2 * inside).sum(axis=2) / np.maximum(inside.sum(axis=2), 1))
         shift = 2.0 * N * solved[..., 1:3]
         shift = shift - shift.mean(axis=1, keepdims=True)
-        return (
-            solved[..., 3:].astype(np.float32),
-            shift.astype(np.float32),
-            np.asarray(rms),
-        )
+        return solved[..., 3:].astype(np.float32), shift.astype(np.float32), np.asarray(rms)
 
     def _rays(self, xy: Array, waves: Array, f_number: float) -> tuple[Crossing, Array]:
         """Trace overfilled bundles; also the entrance area `(p,)` per area of the stop."""
@@ -267,9 +253,8 @@ class TracedLens:
         radius = self.stop_mm(f_number)
         maps = aimed(self.nominal, self.system, self.scale, directions, theta, azimuth, radius, distance)
         entrance = maps[:, :, :2] @ (_OVERFILL * radius * _sunflower(_RAYS)) + maps[:, :, 2:]
-        return self.system.launch(directions, entrance, waves, distance), np.abs(
-            np.linalg.det(maps[:, :, :2])
-        )
+        area = np.abs(np.linalg.det(maps[:, :, :2]))
+        return self.system.launch(directions, entrance, waves, distance), area
 
     def _light(self, xy: Array, waves: Array, f_number: float, focus_mm: float) -> _Light:
         seen, _ = self._rays(xy, waves, f_number)
@@ -292,15 +277,8 @@ class TracedLens:
         working = self.working(f_number)
         centre, circles = _pupil(L[:, :, middle], rims[:, :, :, middle], arrived[:, middle], working)
         p = -2.0 * working * (L - centre[:, :, None, None])
-        return _Light(
-            np.where(arrived, p, 0.0),
-            np.where(arrived, 1000.0 * path, np.nan),
-            seen.cosines[2],
-            outside,
-            np.where(arrived, 1000.0 * (place - x0), 0.0),
-            np.where(arrived, slope, 0.0),
-            circles,
-        )
+        p, place, slope = (np.where(arrived, v, 0.0) for v in (p, 1000.0 * (place - x0), slope))
+        return _Light(p, np.where(arrived, 1000.0 * path, np.nan), outside, place, slope, circles)
 
 
 def draw(rng: np.random.Generator, designs: Sequence[str], *, opened: bool = False) -> TracedLens:
@@ -348,22 +326,13 @@ def _candidate(rng: np.random.Generator, design: str, *, opened: bool) -> Traced
     care = float(np.exp(rng.normal(0.0, 0.7)))
     shift = np.clip(8.0 * care * rng.normal(size=(elements, 2)), -28.0, 28.0) * size
     tilt = np.clip(0.7 * care * rng.normal(size=(elements, 2)), -2.1, 2.1)
-    return TracedLens(
-        design,
-        half_diagonal,
-        float(rng.uniform(0.7, 1.0)),
-        f_number,
-        draw_pitch_um(rng),
-        Faults(
-            shift,
-            tilt,
-            rng.uniform(-0.003, 0.003, surfaces),
-            rng.uniform(-0.0005, 0.0005, surfaces),
-            (_limited(rng, 6.0, 20.0), _limited(rng, 6.0, 20.0)),
-            float(rng.normal(0.0, 0.12) * rng.choice([1.0, 1.0, 2.5])),
-        ),
-        float(rng.uniform(0.25, 1.0)),
+    cover, pitch_um = float(rng.uniform(0.7, 1.0)), draw_pitch_um(rng)
+    space, index = (rng.uniform(-most, most, surfaces) for most in (0.003, 0.0005))
+    sensor = (_limited(rng, 6.0, 20.0), _limited(rng, 6.0, 20.0))
+    faults = Faults(
+        shift, tilt, space, index, sensor, float(rng.normal(0.0, 0.12) * rng.choice([1.0, 1.0, 2.5]))
     )
+    return TracedLens(design, half_diagonal, cover, f_number, pitch_um, faults, float(rng.uniform(0.25, 1.0)))
 
 
 def _limited(rng: np.random.Generator, deviation: float, limit: float) -> float:
@@ -376,11 +345,7 @@ def _nominal(design: str) -> Nominal:
 
 
 def _pupil(L: Array, rims: Array, arrived: Array, f_number: float) -> tuple[Array, Array]:
-    """Cosines `(2, p)` at the middle of the stop, and circles `(p, 4, 3)` around the open pupil.
-
-    The stop's ellipse is enclosed by the two circles that touch it where it is narrowest; of another rim one
-    circle follows the part within it.
-    """
+    """Cosines `(2, p)` at the middle of the stop, and circles `(p, 4, 3)` around the open pupil."""
     count = L.shape[1]
     p = -2.0 * f_number * L
     circles = np.zeros((count, 4, 3))
@@ -394,7 +359,7 @@ def _pupil(L: Array, rims: Array, arrived: Array, f_number: float) -> tuple[Arra
         centre[:, i] = middle / (-2.0 * f_number)
         axes, lengths, _ = np.linalg.svd(shape)
         a, b = lengths
-        radius = (a * a / b + b) / 2.0
+        radius = (a * a / b + b) / 2.0  # of the two circles that touch the ellipse where it is narrowest
         narrow = axes[:, 1] * (radius - b)
         circles[i, 0] = (*narrow, radius)
         circles[i, 1] = (*-narrow, radius)
@@ -441,9 +406,8 @@ def _mean(values: Array, chosen: NDArray[np.bool_]) -> Array:
 def _rotation(about_x: float, about_y: float) -> Array:
     """Rotation about the right, then about the up axis."""
     cx, sx, cy, sy = math.cos(about_x), math.sin(about_x), math.cos(about_y), math.sin(about_y)
-    return np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]]) @ np.array(
-        [[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]]
-    )
+    x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    return np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]]) @ x
 
 
 @cache
@@ -455,3 +419,38 @@ def _sunflower(count: int) -> Array:
     golden = math.pi * (3.0 - math.sqrt(5.0))
     angle = np.concatenate([golden * np.arange(count - edge), 2.0 * math.pi * np.arange(edge) / edge])
     return radius * np.vstack([np.cos(angle), np.sin(angle)])
+
+
+def grid_of(
+    lens: TracedLens, f_number: float | None = None, *, step: float = 0.1, size: int = 55
+) -> GridField:
+    """Kernels of odd side `size` of a traced lens at nodes of the field, wide open by default.
+
+    Nodes lie `step` half diagonals apart, which divides 1; those beyond the corner repeat the nearest inside.
+    """
+    reach = round(1.0 / step) + 1
+    axis = np.arange(-reach, reach + 1, dtype=np.float64) * step
+    right, up = np.meshgrid(axis, axis)
+    radius = np.hypot(right, up)
+    inside = np.argwhere(radius <= _INSIDE)
+    xy = np.stack([right[tuple(inside.T)], up[tuple(inside.T)]], -1)
+    parts = [kernels_of(lens, xy[i : i + _AT_ONCE], f_number) for i in range(0, len(xy), _AT_ONCE)]
+    margin = (SIDE - size) // 2
+    cut = np.concatenate(parts)[:, :, margin : SIDE - margin, margin : SIDE - margin]
+    cut = cut / cut.sum((-1, -2), keepdims=True)
+    shifts = np.concatenate(
+        [lens.lateral_um(xy[i : i + _AT_ONCE], WAVELENGTHS_UM, f_number) for i in range(0, len(xy), _AT_ONCE)]
+    )
+    of_colours = shifts.reshape(len(xy), 3, 2, 2).mean(2) / lens.pitch_um
+    n = axis.size
+    kernels = np.zeros((3, n, n, size, size), np.float16)
+    centers = np.zeros((3, n, n, 2), np.float32)
+    kernels[:, inside[:, 0], inside[:, 1]] = cut.transpose(1, 0, 2, 3)
+    centers[:, inside[:, 0], inside[:, 1]] = (of_colours - of_colours[:, 1:2]).transpose(1, 0, 2)
+    for i, j in np.argwhere(radius > _INSIDE):
+        near = inside[np.argmin(np.hypot(*(inside - (i, j)).T))]
+        kernels[:, i, j], centers[:, i, j] = kernels[:, near[0], near[1]], centers[:, near[0], near[1]]
+    known = {name: getattr(lens, name) for name in ("design", "focal_mm", "pitch_um", "half_diagonal_mm")}
+    apertures = {"widest": lens.f_number, "f_number": f_number or lens.f_number}
+    facts = known | apertures | {"source": PRESCRIPTIONS[lens.design].source}
+    return GridField(axis, kernels, centers, facts)

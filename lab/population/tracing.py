@@ -20,9 +20,7 @@ from lensmodel.core.errors import InvalidInputError
 
 Array = NDArray[np.float64]
 
-AIM_UM: Final = 0.54
-"""Wavelength that rays are aimed at the stop in."""
-
+AIM_UM: Final = 0.54  # wavelength that rays are aimed at the stop in
 _NEWTON: Final = 10  # steps towards an asphere; two to four are taken
 _SAG_MM: Final = 1e-9  # that they stop at: 1e-6 um of path
 _FIELDS: Final = 24  # principal rays between axis and the published field
@@ -32,17 +30,13 @@ _WIDEST: Final = 2.6  # times the published aperture: where axial rays end
 
 
 class Crossing(NamedTuple):
-    """Rays at the image plane and on the way; not finite where they do not arrive.
+    """Rays at the image plane and on the way, in the system's unit; not finite where they do not arrive."""
 
-    `place` (2, p, w, r) and `path` (p, w, r) in the unit of the system, `cosines` (3, p, w, r), `stop`
-    (2, p, w, r) and `rims` (k, 2, p, w, r) where they cross the stop and the rims.
-    """
-
-    place: Array
-    path: Array
-    cosines: Array
-    stop: Array
-    rims: Array
+    place: Array  # (2, p, w, r)
+    path: Array  # (p, w, r)
+    cosines: Array  # (3, p, w, r)
+    stop: Array  # (2, p, w, r), where they cross it
+    rims: Array  # (k, 2, p, w, r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +54,7 @@ class System:
     rims: tuple[int, ...]  # surfaces whose crossing is recorded
 
     def trace(self, start: Array, direction: Array, index: Array) -> Crossing:
-        """Trace rays from places (3, p, 1, r) in directions (3, p, 1, 1 or r).
-
-        `index` (s, w) is that behind each surface.
-        """
+        """Trace rays from places (3, p, 1, r) in directions (3, p, 1, 1 or r); index (s, w) behind each."""
         p, w, r = start.shape[1], index.shape[1], start.shape[3]
         X = np.broadcast_to(start, (3, p, w, r)).copy()
         D = np.broadcast_to(direction, (3, p, w, r)).copy()
@@ -200,17 +191,8 @@ class Nominal:
         origin = np.zeros((count + 1, 3))
         origin[1:, 2] = np.cumsum(one.thickness)
         turn = np.broadcast_to(np.eye(3), (count + 1, 3, 3))
-        return System(
-            one.curvature,
-            one.conic,
-            one.asphere,
-            one.glass,
-            np.zeros(count),
-            origin,
-            turn,
-            one.stop,
-            self.rims,
-        )
+        shapes = (one.curvature, one.conic, one.asphere, one.glass)
+        return System(*shapes, np.zeros(count), origin, turn, one.stop, self.rims)
 
     def paraxial(self, wavelength_um: float) -> Array:
         """Heights and angles behind each surface, `(s, 2, 2)`, of the rays (y, u) = (1, 0) and (0, 1)."""
@@ -266,16 +248,12 @@ class Nominal:
 
 
 class Principal(NamedTuple):
-    """Principal rays of a design, from the axis outwards.
+    """Principal rays of a design, from the axis outwards."""
 
-    `angles` (n,) of their objects in radians; `heights` (n,) on the design's image plane and `slopes` (n,)
-    there, along +x; `maps` (n, 2, 3) from the stop to the entrance.
-    """
-
-    angles: Array
-    heights: Array
-    slopes: Array
-    maps: Array
+    angles: Array  # (n,), of their objects in radians
+    heights: Array  # (n,), on the design's image plane, along +x
+    slopes: Array  # (n,), there
+    maps: Array  # (n, 2, 3), from the stop to the entrance
 
 
 @lru_cache(maxsize=512)
@@ -335,23 +313,15 @@ def _aimed(
         if (seen.sum(axis=1) < 6).any():
             return None
         basis = np.where(seen, np.stack([*stop, np.ones_like(stop[0])]), 0.0).transpose(1, 2, 0)
-        goal = np.where(seen[:, None], entrance, 0.0).transpose(0, 2, 1)
-        maps = np.linalg.solve(basis.transpose(0, 2, 1) @ basis, basis.transpose(0, 2, 1) @ goal).transpose(
-            0, 2, 1
-        )
+        goal, across = np.where(seen[:, None], entrance, 0.0).swapaxes(1, 2), basis.swapaxes(1, 2)
+        maps = np.linalg.solve(across @ basis, across @ goal).swapaxes(1, 2)
     return maps
 
 
 def aimed(
-    nominal: Nominal,
-    system: System,
-    scale: float,
-    directions: Array,
-    angles: Array,
-    azimuth: Array,
-    radius: float,
-    distance: float,
-) -> Array:
+    nominal: Nominal, system: System, scale: float, directions: Array, angles: Array, azimuth: Array,
+    radius: float, distance: float,
+) -> Array:  # fmt: skip
     """Maps `(p, 2, 3)` from the stop to the entrance of a copy, `scale` times as large as its design."""
     known, _, _, maps = principal(nominal, distance / scale)
     flat = maps.reshape(len(maps), 6)

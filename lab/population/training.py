@@ -1,8 +1,7 @@
 """Training of the network of `lensmodel.neural` on a library of lenses; needs PyTorch, resumable at any time.
 
-The batch is made in NumPy by the very functions that the product uses; here is only what learns. A set is
-some patches of some photos of one lens and some places with their true kernels. The loss is the relative L2
-distance of kernels, the r.m.s. difference of their MTFs, and how far the told errors are from those made.
+The batch is made in NumPy by the very functions that the product uses. The loss is the relative L2 distance
+of kernels, the r.m.s. difference of their MTFs, and how far the told errors are from those made.
 """
 
 from __future__ import annotations
@@ -47,9 +46,7 @@ _SET_SIZES: Final = ((1, 2, 4, 8, 16, 32, 64, 110), (0.05, 0.04, 0.06, 0.12, 0.1
 _GREEN_WEIGHT: Final = 1.4
 _ERROR_RATE: Final = 1e-3  # of learning in `train_errors`
 _TOLD_WEIGHT, _RING_WEIGHT = 0.1, 0.05
-_DROPPED: Final = 0.1
-"""Share of statistics, tokens and hidden values that are left out at random in training, so that no lens is
-recognised by a few of its numbers."""
+_DROPPED: Final = 0.1  # share of values left out, so that no lens is recognised by a few of its numbers
 _AVERAGED: Final = 0.004  # pace of the moving average of weights
 _SAVED_SECONDS: Final = 240.0
 
@@ -235,15 +232,14 @@ def collate(sets: list[Set]) -> dict[str, Tensor]:
     return tensors
 
 
-def batches(lenses: list[Lens], rng: np.random.Generator, load: int = 1024) -> Iterator[dict[str, Tensor]]:
-    """Endless batches of about `load` samples."""
+def batches(lenses: list[Lens], rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
+    """Endless batches of about 1024 samples."""
     while True:
         samples = int(rng.choice(_SET_SIZES[0], p=_SET_SIZES[1]))
-        count = int(np.clip(load // samples, 10, 72))
+        count = int(np.clip(1024 // samples, 10, 72))
         queries = 2 if samples <= 2 else 4 if samples <= 4 else 6 if samples <= 16 else 12
-        yield collate(
-            [draw_set(lenses[i], samples, queries, rng) for i in rng.integers(0, len(lenses), count)]
-        )
+        chosen = rng.integers(0, len(lenses), count)
+        yield collate([draw_set(lenses[i], samples, queries, rng) for i in chosen])
 
 
 def start(network: Network, lenses: list[Lens]) -> None:
@@ -262,15 +258,13 @@ def start(network: Network, lenses: list[Lens]) -> None:
 
 
 @torch.no_grad()
-def held_out(network: Network, lenses: list[Lens], samples: int, seed: int = 1) -> dict[str, float]:
+def held_out(network: Network, lenses: list[Lens], samples: int) -> dict[str, float]:
     """Errors on lenses that were not trained on: of each colour, of green by zone, and as told."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     relative, told, radius = [], [], []
     for first in range(0, len(lenses), 20):
-        sets = [
-            draw_set(lens, samples, 1 if samples == 1 else 24, rng, varied=False)
-            for lens in lenses[first : first + 20]
-        ]
+        queries, some = 1 if samples == 1 else 24, lenses[first : first + 20]
+        sets = [draw_set(lens, samples, queries, rng, varied=False) for lens in some]
         batch = collate(sets)
         shares, told_log = network(batch)
         relative.append(losses(shares, batch["truth"])[0].reshape(-1, 3))
@@ -281,6 +275,11 @@ def held_out(network: Network, lenses: list[Lens], samples: int, seed: int = 1) 
     out |= {zone: float(r[inside, 1].mean()) for zone, inside in zone_masks(at).items() if inside.any()}
     right = np.abs(np.log(t[:, 1] / r[:, 1])) < math.log(1.5)
     return {**out, "told": float(t[:, 1].mean()), "told_right": float(right.mean())}
+
+
+def _print_figures(figures: Mapping[int, Mapping[str, float]]) -> None:
+    for n, values in figures.items():
+        print(f"held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in values.items()), flush=True)
 
 
 def export(network: Network, provenance: Mapping[str, Any], path: Path) -> None:
@@ -351,13 +350,9 @@ class Sitting:
         """Judge, and write `state.pt` to go on from and `weights.npz` as the product reads them."""
         average = self.average.to("cpu").eval()
         figures = {n: held_out(average, apart, n) for n in (1, 8, 64)}
-        for n, values in figures.items():
-            print(
-                f"  held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in values.items()), flush=True
-            )
-        self.curve.append(
-            {"minutes": self.minutes, "step": self.step, "lenses": facts["lenses"], "figures": figures}
-        )
+        _print_figures(figures)
+        known = {"minutes": self.minutes, "step": self.step, "lenses": facts["lenses"]}
+        self.curve.append(known | {"figures": figures})
         part = self.folder / "state.part"
         torch.save(
             {
@@ -430,8 +425,7 @@ def train_errors(folder: Path, minutes: float, *, threads: int, seed: int) -> No
         optimiser.step()
         share = (time.monotonic() - began) / 60 / minutes
     figures = {n: held_out(network, apart, n) for n in (1, 8, 64)}
-    for n, values in figures.items():
-        print(f"held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in values.items()))
+    _print_figures(figures)
     path = folder / "weights.npz"
     facts = FieldNetwork.from_bytes(path.read_bytes()).provenance
     export(network, {**facts, "lenses_of_errors": len(lenses), "told": figures}, path)

@@ -1,15 +1,14 @@
 """Lenses as random wavefront fields: aberrations of all orders that vary over the field, wavelength and copy.
 
-Two families. "wavefront" draws Zernike terms up to the eighth order, each a polynomial of the field with
+The family "wavefront" draws Zernike terms up to the eighth order, each a polynomial of the field with
 decaying random weights around a node of its own (R. V. Shack, K. Thompson, "Influence of alignment errors of
 a telescope system on its aberration field", Proc. SPIE 251, 1980). "third-order" keeps the five Seidel
-terms, defocus and what decentring adds to them. Both have axial, lateral and spherical colour, tilt of the
-sensor, vignetting by two rims, an autofocus with an error, and optionally a second focal length or focus
-distance between which the field changes smoothly.
+terms, defocus and what decentring adds to them.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -165,8 +164,7 @@ class RandomLens:
 
     def at_state(self, state: float) -> RandomLens:
         """Return the lens at another focal length or focus: 0 and 1 are the two fields that were drawn."""
-        other = object.__new__(RandomLens)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other.state = state
         return other
 

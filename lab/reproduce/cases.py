@@ -1,11 +1,10 @@
-"""What a reproduction runs: which lenses, behind which frames, learned from how many photos of what."""
+"""What a reproduction runs: which lenses, behind which frames, learned from how many photos; and these."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
@@ -13,24 +12,22 @@ import numpy as np
 from PIL import Image
 
 import lensmodel
-from lab import traced as stored
+from lab import traced
 from lab.cases import list_photos, photo_half
+from lab.images import middle
 from lab.population.prescriptions import LOOKED_AT
 from lab.stored import version_of
-from lab.traced import GridLens
+from lab.traced import GridLens, known_lens, wide_open
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import atomic, save_array
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import LensSettings, Planes
-from lensmodel.simulate import CameraLens, SimulatedCamera, SimulatedField, draw_lens, load_scene
+from lensmodel.photo import develop, write_image
+from lensmodel.simulate import SimulatedCamera, SimulatedLens, edge_chart, load_scene, photograph, write_photo
 
 Size: TypeAlias = Literal["quick", "default"]
-Family: TypeAlias = Literal["third order", "ray-traced"]
 
-PROTOCOL: Final = 8
-"""Part of every key of a stored result; raised when what is measured changes."""
-
-METHOD: Final = "standard"
-"""Non-blind method of all corrections but the paper's own way."""
+PROTOCOL: Final = 8  # part of every key of a stored result; raised when what is measured changes
 
 # Names of what becomes of the photos of a lens, beside what was learned by default, see `learned`.
 BEFORE: Final = "without correction"
@@ -40,16 +37,10 @@ PAPER_WAY: Final = "the paper's own way"
 MEASURED: Final = "measured with a target"
 TRUE: Final = "true PSF"
 
-FIRST_SEED: Final = 1000
-"""Seeds of third-order lenses below are for development, and parameters are chosen on them."""
-
-SEEDS: Final = (1008, *range(1001, 1008))
-"""Of third-order lenses, one of each kind; the soft 1008 instead of 1000, so that half are unseen."""
-
+FIRST_SEED: Final = 1000  # seeds of third-order lenses below are for development
+SEEDS: Final = (1008, *range(1001, 1008))  # one of each kind; 1008 for 1000, so that half are unseen
 SOFT_SEED: Final = 1008
-
-SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
-"""Of those beyond: results of these were looked into during development."""
+SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})  # during development
 
 # Seeds of ray-traced lenses (chosen): above those of drawn ones, so many that designs hardly share one.
 _TRACED_FROM: Final = 2000
@@ -58,10 +49,8 @@ _TRACED: Final = 100_000
 _QUICK_FRAME: Final = (640, 960)  # rows and columns (chosen): 0.6 megapixels
 _PHOTOS: Final = {"quick": (1, 2), "default": (1, 2, 5, 10)}
 
-
-MARGIN: Final = 28
-"""Pixels that a scene reaches beyond the frame on every side: half a kernel."""
-
+BASE_ISO: Final = SimulatedCamera(full_well_electrons=50_000.0, read_noise=50.0)
+MARGIN: Final = 28  # pixels that a scene reaches beyond the frame on every side: half a kernel
 _GRIDS: Final = ((1, 1), (1, 2), (2, 2))  # rows and columns of photographs in a frame
 
 
@@ -91,25 +80,12 @@ def repository_grids() -> tuple[Path, ...]:
     return tuple(sorted(folder.glob("traced-*.npz")))
 
 
-@lru_cache(maxsize=16)
-def traced(path: Path) -> GridLens:
-    """Read a ray-traced lens at the one aperture of a grid file."""
-    return GridLens.read(path)
-
-
-def design(path: Path) -> str:
-    """Name of the design of a grid."""
-    return str(traced(path).grid.facts["design"])
-
-
 @dataclass(frozen=True, slots=True)
 class Case:
     """One lens wide open, and the numbers of photos it is learned from."""
 
     # of `draw_lens`, or the number of a ray-traced lens; it also mixes the order of the photographs
     seed: int
-    focal_mm: float  # how the lens is set
-    aperture: float
     photos: tuple[int, ...]  # ascending: the model is measured after each of these numbers of photos
     height: int  # of the camera, pixels
     width: int
@@ -117,59 +93,64 @@ class Case:
     grid: Path | None = None  # PSFs of a ray-traced lens; None means a lens of third order
 
     @property
-    def lens(self) -> CameraLens:
+    def lens(self) -> SimulatedLens | GridLens:
         """The lens."""
-        return draw_lens(self.seed) if self.grid is None else traced(self.grid)
+        return known_lens(self.seed, self.grid)
 
     @property
-    def family(self) -> Family:
+    def settings(self) -> LensSettings:
+        """Settings of all photos."""
+        return wide_open(self.lens)
+
+    @property
+    def family(self) -> Literal["third order", "ray-traced"]:
         """Which family it is of."""
         return "third order" if self.grid is None else "ray-traced"
 
     @property
     def unseen(self) -> bool:
         """Whether nothing was developed, chosen or trained on it."""
-        if self.grid is None:
-            return self.seed >= FIRST_SEED and self.seed not in SEEDS_LOOKED_AT
-        return design(self.grid) not in LOOKED_AT
+        if isinstance(self.lens, GridLens):
+            return self.lens.design not in LOOKED_AT
+        return self.seed >= FIRST_SEED and self.seed not in SEEDS_LOOKED_AT
 
     @property
     def source(self) -> str:
         """Where the lens comes from."""
-        return (
-            f"drawn, seed {self.seed}" if self.grid is None else str(traced(self.grid).grid.facts["source"])
-        )
+        if isinstance(self.lens, GridLens):
+            return str(self.lens.grid.facts["source"])
+        return f"drawn, seed {self.seed}"
 
     @property
     def name(self) -> str:
         """Short and unique within a run."""
-        which = str(self.seed) if self.grid is None else design(self.grid)
-        return f"{which}-{self.focal_mm:.3g}mm-f{self.aperture:.2g}"
+        which = self.lens.design if isinstance(self.lens, GridLens) else self.seed
+        return f"{which}-{self.settings.focal_mm:.3g}mm-f{self.settings.aperture:.2g}"
 
     @property
     def title(self) -> str:
         """For people."""
         model = self.lens.model.removeprefix("Simulated ")
-        return f"{model} at {self.focal_mm:.3g} mm f/{self.aperture:.2g}"
-
-    @property
-    def settings(self) -> LensSettings:
-        """Settings of all photos."""
-        return LensSettings(aperture=self.aperture, focal_mm=self.focal_mm)
+        return f"{model} at {self.settings.focal_mm:.3g} mm f/{self.settings.aperture:.2g}"
 
     @property
     def camera(self) -> SimulatedCamera:
         """The sensor at base ISO."""
-        sensor = SimulatedCamera(
-            height=self.height, width=self.width, full_well_electrons=50_000.0, read_noise=50.0
+        sensor = replace(BASE_ISO, height=self.height, width=self.width)
+        return (
+            replace(sensor, pitch_um=self.lens.grid.pitch_um) if isinstance(self.lens, GridLens) else sensor
         )
-        return sensor if self.grid is None else replace(sensor, pitch_um=traced(self.grid).field().pitch_um)
 
     def truth(self) -> PsfField:
         """Return the true PSF field."""
-        if self.grid is not None:
-            return traced(self.grid).field(self.settings)
-        return SimulatedField(draw_lens(self.seed), self.settings, self.camera.pitch_um)
+        return self.lens.field(self.settings)
+
+    def parts(self) -> tuple[object, ...]:
+        """All that its photos depend on, beside the photographs and the code that takes them."""
+        grid = None
+        if self.grid is not None:  # the file, and the code that answers between its nodes
+            grid = hashlib.sha256(self.grid.read_bytes() + Path(traced.__file__).read_bytes()).hexdigest()
+        return (self.seed, self.settings, self.height, self.width, grid, self.layout)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,28 +170,18 @@ class Reproduction:
         return scene_files(self.scenes)
 
 
-def fingerprint() -> str:
-    """Hash of the code and data that figures depend on; pages leave stored results as they are."""
-    return version_of("lab.reproduce.job")
-
-
 def photos_of(case: Case, plan: Reproduction) -> str:
     """Name of the folder of a case's photos: of the lens, the frames, and what takes them."""
-    parts = (_lens_of(case), case.layout, content_of(plan.files()), version_of("lab.reproduce.shots"))
-    return f"{case.name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"
+    return _name(case, case.parts(), content_of(plan.files()), version_of(__name__))
 
 
 def key_of(case: Case, plan: Reproduction, code: str) -> str:
     """Name under which the results of a case are stored: of all that they depend on."""
-    parts = (PROTOCOL, code, _lens_of(case), case.layout, content_of(plan.files()))
+    return _name(case, PROTOCOL, code, case.parts(), content_of(plan.files()))
+
+
+def _name(case: Case, *parts: object) -> str:
     return f"{case.name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"
-
-
-def _lens_of(case: Case) -> tuple[object, ...]:
-    lens = None
-    if case.grid is not None:  # the file, and the code that answers between its nodes
-        lens = hashlib.sha256(case.grid.read_bytes() + Path(stored.__file__).read_bytes()).hexdigest()
-    return (case.seed, case.focal_mm, case.aperture, case.height, case.width, lens)
 
 
 def planned(
@@ -218,34 +189,26 @@ def planned(
 ) -> Reproduction:
     """Plan a run."""
     files = scene_files(scenes)
-    chosen: Sequence[int | Path] = [_lens(text) for text in lenses]
-    if not chosen:
-        seeds = (SEEDS[0], SEEDS[4]) if size == "quick" else SEEDS
-        chosen = [*seeds, *repository_grids()]
+    seeds = (SEEDS[0], SEEDS[4]) if size == "quick" else SEEDS
     frame = _QUICK_FRAME if size == "quick" else None
     layout = layout_for(files, frame)
-    cases = tuple(_case(one, _PHOTOS[size], frame or layout.frame, layout) for one in chosen)
+    cases = tuple(
+        Case(seed, _PHOTOS[size], *(frame or layout.frame), layout, grid)
+        for seed, grid in map(_lens, lenses or [*map(str, seeds), *map(str, repository_grids())])
+    )
     if len({case.name for case in cases}) < len(cases):
         raise InvalidInputError("two lenses are of one design and aperture; give one of each")
     return Reproduction(cases, scenes, size, compare)
 
 
-def _lens(text: str) -> int | Path:
+def _lens(text: str) -> tuple[int, Path | None]:
     if text.isdigit():
-        return int(text)
+        return int(text), None
     if not Path(text).is_file():
         raise InvalidInputError(f"{text!r} is neither the seed of a lens nor a file of a ray-traced one")
-    return Path(text)
-
-
-def _case(which: int | Path, photos: tuple[int, ...], frame: tuple[int, int], layout: Layout) -> Case:
-    if isinstance(which, int):
-        lens = draw_lens(which)
-        mm = lens.focal_mm[0]
-        return Case(which, mm, lens.at_focal(mm).f_number, photos, *frame, layout)
     # a number of the design's name takes the place of a seed, whatever else is run
-    number = _TRACED_FROM + int(hashlib.sha256(design(which).encode()).hexdigest(), 16) % _TRACED
-    return Case(number, traced(which).focal_mm[0], traced(which).widest(), photos, *frame, layout, which)
+    design = GridLens.read(text).design
+    return _TRACED_FROM + int(hashlib.sha256(design.encode()).hexdigest(), 16) % _TRACED, Path(text)
 
 
 # --- frames composed of sharp photographs -------------------------------------------------------
@@ -266,31 +229,33 @@ def scene_files(folder: Path | None) -> tuple[Path, ...]:
 
 def layout_for(files: Sequence[Path], wanted: tuple[int, int] | None = None) -> Layout:
     """Decide how to make frames that cover `wanted` rows and columns; the largest where it is None."""
-    grids = [(rows, cols) for rows, cols in _GRIDS if 2 * rows * cols <= len(files)]
-    if not grids:
+    layouts = [_layout(files, *grid) for grid in _GRIDS if 2 * grid[0] * grid[1] <= len(files)]
+    if not layouts:
         raise InvalidInputError(f"two photographs are needed at least, there are {len(files)}")
-    layouts = [_layout(files, grid) for grid in grids]
+    rows, cols = wanted or (0, 0)
     for layout in layouts if wanted else layouts[-1:]:
-        rows, cols = wanted or (0, 0)
         if layout.rows * layout.tile[0] >= rows and layout.cols * layout.tile[1] >= cols:
             return layout
     raise InvalidInputError(f"the photographs do not cover frames of {wanted}: give larger ones, or more")
 
 
-def _layout(files: Sequence[Path], grid: tuple[int, int]) -> Layout:
-    sizes = np.array([_turned_size(path, upright=grid[1] > grid[0]) for path in files])
-    height, width = (int(n) // 2 * 2 for n in sizes.min(axis=0))
-    return Layout(*grid, (height, width))
+def _layout(files: Sequence[Path], rows: int, cols: int) -> Layout:
+    sizes = []
+    for path in files:
+        with Image.open(path) as image:
+            sizes.append(sorted(image.size, reverse=cols > rows))
+    height, width = (int(n) // 2 * 2 for n in np.min(sizes, axis=0))
+    return Layout(rows, cols, (height, width))
 
 
 def frame_scene(files: Sequence[Path], layout: Layout, number: int | None) -> Planes:
-    """Compose a frame from photographs in the given order."""
+    """Compose a frame from photographs in the given order; None means the held-out one."""
     per = layout.rows * layout.cols
+    others = files[per:]
+    indices = range((number or 0) * per, ((number or 0) + 1) * per)
     if number is None:
         parts = [_part(path, layout, 0) for path in files[:per]]
     else:
-        others = files[per:]
-        indices = range(number * per, (number + 1) * per)
         parts = [_part(others[i % len(others)], layout, i // len(others)) for i in indices]
     rows = [parts[i * layout.cols : (i + 1) * layout.cols] for i in range(layout.rows)]
     return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1))
@@ -298,14 +263,10 @@ def frame_scene(files: Sequence[Path], layout: Layout, number: int | None) -> Pl
 
 def centred_cut(scene: Planes, height: int, width: int) -> Planes:
     """Cut the middle so that the scene exceeds `height` x `width` by twice the margin, or by less, evenly."""
-    cut = []
-    for have, want in zip(scene.shape[1:], (height, width), strict=True):
-        if have < want:
-            raise InvalidInputError(f"a scene of {scene.shape[1:]} does not cover {height} x {width}")
-        spare = min((have - want) // 2, MARGIN)
-        start = (have - want - 2 * spare) // 2
-        cut.append(slice(start, start + want + 2 * spare))
-    return np.ascontiguousarray(scene[:, cut[0], cut[1]])
+    if scene.shape[1] < height or scene.shape[2] < width:
+        raise InvalidInputError(f"a scene of {scene.shape[1:]} does not cover {height} x {width}")
+    sides = zip(scene.shape[1:], (height, width), strict=True)
+    return middle(scene, *(want + 2 * min((have - want) // 2, MARGIN) for have, want in sides))
 
 
 def content_of(files: Sequence[Path]) -> str:
@@ -321,14 +282,80 @@ def _part(path: Path, layout: Layout, use: int) -> Planes:
     scene = load_scene(path)
     if (scene.shape[1] > scene.shape[2]) != (layout.tile[0] > layout.tile[1]):
         scene = np.rot90(scene, axes=(1, 2))
-    height, width = layout.tile
-    top, left = (scene.shape[1] - height) // 2, (scene.shape[2] - width) // 2
-    return scene[:, top : top + height, left : left + width][
-        :, :: -1 if use & 2 else 1, :: -1 if use & 1 else 1
-    ]
+    return middle(scene, *layout.tile)[:, :: -1 if use & 2 else 1, :: -1 if use & 1 else 1]
 
 
-def _turned_size(path: Path, *, upright: bool) -> tuple[int, int]:
-    with Image.open(path) as image:
-        short, long = sorted(image.size)
-    return (long, short) if upright else (short, long)
+# --- photos: kept, and taken again only if lens, frame or photographs change ---
+
+Container: TypeAlias = Literal["dng", "tiff", "jpeg"]
+
+JPEG_QUALITY: Final = 92  # of 100 (chosen): that of a fine JPEG of a camera
+
+SUFFIXES: Final[dict[Container, str]] = {"dng": ".dng", "tiff": ".tif", "jpeg": ".jpg"}
+
+
+@dataclass(frozen=True, slots=True)
+class Shots:
+    """Files of the photos of one case."""
+
+    learn: tuple[Path, ...]  # in the order in which the lens learns from them
+    held_out: Path  # never used for calibration
+    chart: Path
+    sharp: Path  # npy, the light that a perfect lens would have put on the sensor for `held_out`
+
+    @classmethod
+    def of(cls, case: Case, folder: Path) -> Shots:
+        """Name the files of a case in a folder."""
+        return cls(
+            tuple(folder / f"photo-{i:02d}.dng" for i in range(case.photos[-1])),
+            folder / "held-out.dng",
+            folder / "chart.dng",
+            folder / "held-out-sharp.npy",
+        )
+
+    def truth(self) -> Planes:
+        """Load the truth behind `held_out`: camera colours, not white-balanced."""
+        planes: Planes = np.load(self.sharp, allow_pickle=False)
+        return planes
+
+
+def take(case: Case, files: Sequence[Path], folder: Path, *, photos: int | None = None) -> Shots:
+    """Take the photos of a case that are not there yet; the first `photos` alone if that is given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shots, camera = Shots.of(case, folder), case.camera
+    order = np.random.default_rng(case.seed).permutation(len(files))
+    mixed = [files[i] for i in order]
+    wanted: list[tuple[Path, int | None]] = [(path, i) for i, path in enumerate(shots.learn[:photos])]
+    wanted += [] if photos else [(shots.held_out, None), (shots.chart, None)]
+    for path, number in wanted:
+        if path.exists():
+            continue
+        if path == shots.chart:
+            scene = edge_chart(camera.frame, guard=guard_of(case)).scene
+        else:
+            scene = centred_cut(frame_scene(mixed, case.layout, number), case.height, case.width)
+        seed = [case.seed, len(SUFFIXES) if path == shots.chart else 0 if number is None else number + 10]
+        photo = photograph(scene, case.lens, case.settings, camera, np.random.default_rng(seed))
+        if path == shots.held_out:
+            with atomic(shots.sharp) as file:
+                save_array(file, photo.sharp)
+        write_photo(path, photo)  # last, and whole or not at all: a photo that is there is complete
+    return shots
+
+
+def in_container(path: Path, container: Container) -> Path:
+    """Return a photo as another kind of file, developed by the library in sRGB; made where it is missing."""
+    made = path.with_suffix(SUFFIXES[container])
+    if not made.exists():
+        developed = develop(path)
+        kind: Literal["jpeg", "tiff16"] = "jpeg" if container == "jpeg" else "tiff16"
+        write_image(
+            made, developed.planes, developed.encoding, format=kind, color_space="srgb", quality=JPEG_QUALITY
+        )
+    return made
+
+
+def guard_of(case: Case) -> int:
+    """Pixels between an edge and the border of its tile of the chart: half a kernel if it fits."""
+    tile = min(case.height // 6, case.width // 8)
+    return min(27, (tile - 32) // 2)

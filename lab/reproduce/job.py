@@ -1,80 +1,70 @@
 """What a reproduction does for a lens: photograph, learn, correct, measure; nothing stored is computed anew.
 
-Stored for each case, one JSON file each, under a name that hashes all that it depends on::
-
-    <key>/truth.json                  as photographed, with the true PSF
-    <key>/learned-<n>.json            after n photos
-    <key>/path-<container>.json       learned and corrected as another kind of file
-    <key>/paper-<n>.json              the same the paper's own way from end to end
-    <key>/measured.json               with PSFs measured on a target
-    <key>/general.json                with a general profile of the lens model
-    <key>/rival.json                  corrected with the PSFs of a rival (`lab.schuler`), from the first photo
-
-They hold figures only, by the names of states (`cases`), some ten kilobytes a lens. Photos lie in `photos` of
-the output folder, pictures in `pictures`.
+Each result (`CaseJob.units`) is a JSON file of figures by states, in a folder whose name hashes all that it
+depends on. Photos lie in `photos` of the output folder, pictures in `pictures`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+import numpy as np
 from PIL import Image
 
 from lab.cases import photo_half
 from lab.images import as_shown, strip
-from lab.reproduce import figures, measure
+from lab.reproduce import cases, figures, measure
 from lab.reproduce.cases import (
     BEFORE,
-    GENERAL,
     MEASURED,
-    PAPER_WAY,
     RIVAL,
     TRUE,
     Case,
+    Container,
     Reproduction,
-    fingerprint,
-    key_of,
+    Shots,
+    in_container,
     learned,
-    photos_of,
+    take,
 )
 from lab.reproduce.fields import general_field, general_words, measured_field
-from lab.reproduce.learners import Learner, Roi, corrected_with, paper_way
-from lab.reproduce.shots import Container, Shots, in_container, take
+from lab.reproduce.measure import Place, Roi
 from lab.schuler import Schuler
-from lab.stored import Unit, read, stored
-from lensmodel.blind.sampling import PRESETS
+from lab.stored import Unit, read, stored, version_of
+from lensmodel import api
+from lensmodel.blind import sampling
+from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import Planes
-from lensmodel.photo import develop
+from lensmodel.core.types import Kernel, LensSettings, Planes
+from lensmodel.correction import correct_planes
+from lensmodel.model import LensModel, ModelSettings
+from lensmodel.photo import LinearPhoto, develop
 
 CROP_PX: Final = 128  # side of a crop in a strip (chosen)
 
-PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")
-"""Kinds of files that each lens is learned from and corrected in too, one photo of each."""
+PATHS: Final[tuple[Container, ...]] = ("tiff", "jpeg")  # that each lens is learned from and corrected in too
+_PARTS: Final = ("states", "psf", "seconds", "refused", "paths", "pictures")  # of stored results
+_SMALL_FRAME: Final = 2e6  # pixels (chosen): below, the paper's way takes kernels of the default's size
 
-_PARTS: Final = ("states", "psf", "seconds", "refused", "paths", "pictures")
-"""What stored results consist of: figures by state, errors of PSFs, and so on."""
-
-OnWork: TypeAlias = Callable[[str, int, int], None]
-"""Takes what was done, and how many of how many results are there."""
+OnWork: TypeAlias = Callable[[str, int, int], None]  # takes what was done, and how many of how many
 
 
 def run_reproduction(
     plan: Reproduction, folder: Path, *, on_work: OnWork, workers: int = 1
 ) -> dict[str, Any]:
     """Run what is missing and return everything."""
-    version = fingerprint()
+    version = version_of(__name__)
     cache, shown = folder / "cache", folder / "pictures"
     shown.mkdir(parents=True, exist_ok=True)
     jobs = [
-        CaseJob(case, plan, cache / key_of(case, plan, version), folder / "photos", shown, workers)
+        CaseJob(case, plan, cache / cases.key_of(case, plan, version), folder / "photos", shown, workers)
         for case in plan.cases
     ]
     done, total = 0, sum(len(job.units) for job in jobs) + plan.compare
@@ -117,12 +107,7 @@ class CaseJob:
     @property
     def photos(self) -> Path:
         """Folder of its photos."""
-        return self.taken / photos_of(self.case, self.plan)
-
-    @cached_property
-    def truth(self) -> PsfField:
-        """The true PSFs."""
-        return self.case.truth()
+        return self.taken / cases.photos_of(self.case, self.plan)
 
     @cached_property
     def shots(self) -> Shots:
@@ -139,10 +124,10 @@ class CaseJob:
         found |= {f"path-{name}": partial(self._path, name) for name in PATHS}
         if self.plan.compare:
             for n in self.case.photos:
-                name = f"{PAPER_WAY}, n = {n}"
+                name = f"{cases.PAPER_WAY}, {learned(n)}"
                 found[f"paper-{n}"] = partial(self._learned, paper, n, name, f"way-paper-n{n}")
             found["measured"] = self._measured
-            found["general"] = lambda: self._by_field(general_field(self.case), 0.0, GENERAL, "general")
+            found["general"] = lambda: self._by_field(general_field(self.case), 0.0, cases.GENERAL, "general")
             found["rival"] = self._rival
         return found
 
@@ -153,14 +138,16 @@ class CaseJob:
             for part, values in stored(self.folder / f"{name}.json", make).items():
                 parts[part] |= values
             told(f"{case.title}: {name}")
+        told_of = ("name", "title", "family", "unseen", "source")
         return {
-            "name": case.name,
-            "title": case.title,
-            "family": case.family,
-            "unseen": case.unseen,
-            "source": case.source,
+            **{name: getattr(case, name) for name in told_of},
             "general_profile": general_words(case) if self.plan.compare else "",
-            "settings": {k: v for k, v in asdict(case).items() if k not in {"layout", "grid"}},
+            "settings": {
+                **asdict(case.settings),
+                "seed": case.seed,
+                "height": case.height,
+                "width": case.width,
+            },
             **parts,
         }
 
@@ -170,7 +157,7 @@ class CaseJob:
         before = measure.state(chart, photo, shots, self.case)
         before["light"] = measure.light(photo, shots, self.case)
         pictures = {"before": self._picture("before", photo), "scene": self._picture("scene", shots.truth())}
-        true = self._corrected(self.truth, TRUE, "true")
+        true = self._corrected(self.case.truth(), TRUE, "true")
         return {"states": {BEFORE: before, **true["states"]}, "pictures": pictures | true["pictures"]}
 
     def _path(self, container: Container) -> Unit:
@@ -178,14 +165,12 @@ class CaseJob:
         first, asked = (in_container(p, container) for p in (self.shots.learn[0], self.shots.held_out))
         photo, learner = develop(asked), Learner(PRESETS["default"], self.workers)
         refused = learner.learn([first])
-        true = corrected_with(photo, self.truth, self._parts, workers=self.workers)
+        true = corrected_with(photo, self.case.truth(), self._parts, workers=self.workers)
         after = photo.planes if refused else learner.corrected(asked, self._parts)[0]
         states = {BEFORE: photo.planes, TRUE: true, "after": after}
         made = {name: measure.state(None, v, self.shots, self.case, raw=False) for name, v in states.items()}
-        return {
-            "paths": {container: made},
-            "pictures": {container: self._picture(container, after, raw=False)},
-        }
+        picture = self._picture(container, after, raw=False)
+        return {"paths": {container: made}, "pictures": {container: picture}}
 
     def _measured(self) -> Unit:
         """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
@@ -210,23 +195,16 @@ class CaseJob:
         answers = [(field.kernel_at(*place, measure.PSF_SIZE), float("nan")) for place in measure.places()]
         return {
             **self._corrected(field, name, label),
-            "psf": {name: measure.psf_errors(answers, self.truth)},
+            "psf": {name: measure.psf_errors(answers, self.case.truth())},
             "seconds": {name: round(seconds, 1)},
         }
 
     def _corrected(self, field: PsfField, name: str, label: str) -> Unit:
         """Correct and measure chart and photo with a field."""
-        edges, after = (
-            corrected_with(develop(path), field, parts, workers=self.workers)
-            for path, parts in (
-                (self.shots.chart, measure.chart_parts(self.case)),
-                (self.shots.held_out, self._parts),
-            )
-        )
-        return {
-            "states": {name: measure.state(edges, after, self.shots, self.case)},
-            "pictures": {label: self._picture(label, after)},
-        }
+        photos = (self.shots.chart, measure.chart_parts(self.case)), (self.shots.held_out, self._parts)
+        edges, after = (corrected_with(develop(p), field, parts, workers=self.workers) for p, parts in photos)
+        state = measure.state(edges, after, self.shots, self.case)
+        return {"states": {name: state}, "pictures": {label: self._picture(label, after)}}
 
     @property
     def _parts(self) -> list[Roi]:
@@ -248,7 +226,7 @@ class CaseJob:
         return {
             **unit,
             "states": {name: state},
-            "psf": {name: measure.psf_errors(answers, self.truth)},
+            "psf": {name: measure.psf_errors(answers, self.case.truth())},
             "pictures": {label: self._picture(label, after)},
         }
 
@@ -263,3 +241,92 @@ class CaseJob:
         crops = strip(as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name
+
+
+# --- what is under test: from photo files to a lens model and to corrected photos, as a user goes ---
+
+
+def paper_way(case: Case) -> Config:
+    """Return the paper's own way from end to end, as it suits the frames of a case."""
+    if case.height * case.width >= _SMALL_FRAME:
+        return PRESETS["paper"]
+    return replace(PRESETS["paper"], kernel_size=sampling.DEFAULT_KERNEL_SIZE)
+
+
+class Learner:
+    """One lens that learns from photos by a preset, answers for its PSF, and corrects photos."""
+
+    def __init__(self, way: Config, workers: int) -> None:
+        self.seconds = 0.0  # that learning took
+        self._way, self._workers = way, workers
+        self._seen: dict[str, str] = {}  # why photos did not count, by their identity
+        self.model: LensModel | None = None  # None until a photo has counted
+
+    def learn(self, photos: Sequence[Path]) -> list[str]:
+        """Learn from photos that are new; say which of all did not count, and why."""
+        began, refused = time.monotonic(), []
+        for photo in photos:
+            name = sampling.photo_id(photo)
+            if name not in self._seen:
+                self._seen[name] = self._learned(photo)
+            if self._seen[name]:
+                refused.append(f"{photo.stem}: {self._seen[name]}")
+        self.seconds += time.monotonic() - began
+        return refused
+
+    def _learned(self, photo: Path) -> str:
+        try:
+            samples = sampling.samples_of_photo(photo, self._way, workers=self._workers)
+        except LensModelError as error:
+            return str(error)
+        chosen = ModelSettings(mode=self._way.model)
+        self.model = LensModel.fit(samples, chosen) if self.model is None else self.model.added(samples)
+        return ""
+
+    def answers(
+        self, places: Sequence[Place], settings: LensSettings, size: int
+    ) -> list[tuple[Kernel, float]]:
+        """Return the PSFs at some places, and the relative L2 error that the model expects of each."""
+        assert self.model is not None, "only asked after a photo has counted"
+        found = [self.model.query(place, settings.with_channel(channel), size) for place, channel in places]
+        return [(answer.kernel, answer.predicted_error) for answer in found]
+
+    def corrected(self, photo: Path, parts: Sequence[Roi]) -> tuple[Planes, Mapping[str, float | None]]:
+        """Correct parts of a photo; also the expected gain in PSNR by zone, mean over the parts."""
+        assert self.model is not None, "only asked after a photo has counted"
+        developed = develop(photo)
+        settings = developed.info.metadata.settings()
+        field = api.psfs_for(developed, self.model, settings, method=self._way.method)
+        lateral = api.lateral_of(developed)
+        planes, said = developed.planes.copy(), dict[str, list[float | None]]()
+        for roi in parts:
+            done = api.correct_photo(
+                developed, self.model, settings, method=self._way.method, lateral=lateral, known=field,
+                roi=roi, workers=self._workers,
+            )  # fmt: skip
+            planes[_inside(roi)] = done.planes
+            for zone, report in done.zones.items():
+                said.setdefault(zone, []).append(report.expected_gain_db)
+        expected = {
+            zone: None if None in told else float(np.mean([v for v in told if v is not None]))
+            for zone, told in said.items()
+        }
+        return planes, expected
+
+
+def corrected_with(
+    developed: LinearPhoto, field: PsfField, parts: Sequence[Roi], *, workers: int = 1
+) -> Planes:
+    """Correct parts of a photo with a PSF field taken as right, as a learner does with its own."""
+    lateral, made = api.lateral_of(developed), developed.planes.copy()
+    for roi in parts:
+        made[_inside(roi)] = correct_planes(
+            developed.planes, field, developed.frame, method="standard", noise=developed.correction_noise,
+            clip=developed.clip, lateral=lateral, cfa=developed.cfa, roi=roi, workers=workers,
+        ).planes  # fmt: skip
+    return made
+
+
+def _inside(roi: Roi) -> tuple[slice, slice, slice]:
+    row, col, height, width = roi
+    return slice(None), slice(row, row + height), slice(col, col + width)

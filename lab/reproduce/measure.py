@@ -5,29 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from lab.charts import by_zone, measure_edges
-from lab.images import BLOCK, BORDER, fidelity
+from lab.images import blocks, by_zone, fidelity, measure_edges
 from lab.kernels import distance
 from lab.model_benchmark import asked_places
-from lab.reproduce.cases import Case
-from lab.reproduce.learners import Place, Roi
-from lab.reproduce.shots import Shots, guard_of
+from lab.reproduce.cases import Case, Shots, guard_of
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import CHANNELS, ZONES, Kernel, Planes, Zone
+from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, Planes, Zone
 from lensmodel.simulate import edge_chart
 
+Place: TypeAlias = tuple[FieldPosition, Channel]
+Roi: TypeAlias = tuple[int, int, int, int]  # row, column, height and width of a part of a frame
+
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
-NEAR: Final = 1.5
-"""A predicted error within this factor of the true one counts as right."""
-
-PART: Final = 256
-"""Pixels: side of the parts of a frame that are compared (chosen: four blocks and their borders)."""
-
+NEAR: Final = 1.5  # a predicted error within this factor of the true one counts as right
+PART: Final = 256  # pixels of a side (chosen): four blocks and their borders
 _EDGES: Final = 6  # of the chart, in its order
 
 
@@ -71,7 +67,6 @@ def edges(chart: Planes, case: Case) -> dict[Zone, dict[str, Any]]:
     """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH."""
     found = {zone: asdict(row) for zone, row in by_zone(measure_edges(chart[1], _edge_boxes(case))).items()}
     for row in found.values():
-        del row["zone"]
         for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
             row[name] = None if math.isnan(row[name]) else row[name] * case.height
     return found
@@ -85,11 +80,8 @@ def picture(photo: Planes, shots: Shots, case: Case, *, raw: bool = True) -> dic
 
 
 def _blocks(case: Case) -> list[tuple[int, int]]:
-    every = []
-    for row, col, height, width in parts(case.camera.frame):
-        rows, cols = ({*range(0, n - BLOCK, BLOCK - 2 * BORDER), n - BLOCK} for n in (height, width))
-        every += [(row + r, col + c) for r in sorted(rows) for c in sorted(cols)]
-    return every
+    places = parts(case.camera.frame)
+    return [(row + r, col + c) for row, col, *size in places for r, c in blocks(Frame(*size))]
 
 
 def light(photo: Planes, shots: Shots, case: Case) -> dict[Zone, float]:
@@ -112,7 +104,5 @@ def state(
     chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, raw: bool = True
 ) -> dict[str, Any]:
     """Everything about one version of the chart, if there is one, and of the held-out photo."""
-    return {
-        "edges": {} if chart is None else edges(chart, case),
-        "psnr": picture(photo, shots, case, raw=raw),
-    }
+    found = {} if chart is None else edges(chart, case)
+    return {"edges": found, "psnr": picture(photo, shots, case, raw=raw)}

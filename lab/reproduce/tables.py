@@ -5,39 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lab.reproduce.cases import BEFORE, GENERAL, MEASURED, PAPER_WAY, RIVAL, SOFT_SEED, TRUE, learned
 from lensmodel.core.types import CHANNELS, ZONES
 
 Result = Mapping[str, Any]
-Zones = dict[str, float | None]
-"""A figure in each zone; None where nothing tells it."""
-
+Zones = dict[str, float | None]  # a figure in each zone; None where nothing tells it
 TOLERATED_DB: Final = 0.05  # dB of a zone (chosen): less counts as equal
-
-MEASURABLE_DB: Final = 0.2
-"""A gain of the true PSF below this says nothing of a lens."""
+MEASURABLE_DB: Final = 0.2  # a gain of the true PSF below this says nothing of a lens
 
 FEWER: Final = "2"
-MORE: Final = "5"
-"""Numbers of photos that are compared: the larger may be worse in nothing."""
-
-SMALL_GAIN: Final = 0.05
-"""Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
+MORE: Final = "5"  # numbers of photos that are compared: the larger may be worse in nothing
+SMALL_GAIN: Final = 0.05  # where the true PSF raises MTF50 by less, the share of its gain says nothing
 
 EDGE_FIGURES: Final = ("mtf50", "tangential_mtf50", "sagittal_mtf50", "mtf_max", "overshoot")
 
-_ORDER: Final = (BEFORE, RIVAL, GENERAL, PAPER_WAY, "n = ", MEASURED, TRUE)
-"""How names of states begin, in the order of the tables."""
+_ORDER: Final = (BEFORE, RIVAL, GENERAL, PAPER_WAY, "n = ", MEASURED, TRUE)  # how names of states begin
 
 
 def groups(result: Result) -> dict[str, Result]:
     """Split the lenses by family: means over both would compare nothing."""
-    found: dict[str, list[Result]] = {}
-    for case in result["cases"]:
-        found.setdefault(case["family"], []).append(case)
-    return {family: {**result, "cases": cases} for family, cases in found.items()}
+    families = dict.fromkeys(case["family"] for case in result["cases"])
+    own = {name: [case for case in result["cases"] if case["family"] == name] for name in families}
+    return {name: {**result, "cases": cases} for name, cases in own.items()}
 
 
 def names(every: Iterable[Iterable[str]]) -> list[str]:
@@ -53,10 +44,8 @@ def names(every: Iterable[Iterable[str]]) -> list[str]:
 
 def counts(cases: Sequence[Result]) -> list[str]:
     """Numbers of photos that occur, ascending."""
-    found = {
-        name.removeprefix("n = ") for case in cases for name in case["states"] if name.startswith("n = ")
-    }
-    return sorted(found, key=int)
+    every = {name for case in cases for name in case["states"] if name.startswith("n = ")}
+    return sorted((name.removeprefix("n = ") for name in every), key=int)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
@@ -69,7 +58,7 @@ def get(case: Result, *path: str) -> Any:  # noqa: ANN401 - of a JSON document
     """What lies under some keys; None where one of them is not there."""
     found: Any = case
     for key in path:
-        found = None if found is None else found.get(key)
+        found = (found or {}).get(key)
     return found
 
 
@@ -97,7 +86,7 @@ def kept(case: Result, state: str, zone: str) -> float | None:
 def summary(result: Result) -> dict[str, Any]:
     """Return everything that the tables show, by figure, state or number of photos, and zone."""
     cases = result["cases"]
-    states, known = names(case["states"] for case in cases), names(case["psf"] for case in cases)
+    states, known = (names(case[part] for case in cases) for part in ("states", "psf"))
     numbers = counts(cases)
 
     def by_count(of: Callable[[Result, str, str], float | None]) -> dict[str, Zones]:
@@ -105,6 +94,9 @@ def summary(result: Result) -> dict[str, Any]:
 
     def edge(state: str, zone: str, figure: str) -> float | None:
         return mean(get(case, "states", state, "edges", zone, figure) for case in cases)
+
+    def psf(figure: str, state: str, *path: str) -> float | None:
+        return mean(get(case, "psf", state, figure, *path) for case in cases)
 
     return {
         "lenses": len(cases),
@@ -114,16 +106,8 @@ def summary(result: Result) -> dict[str, Any]:
         "psnr": {s: {z: mean(get(c, "states", s, "psnr", z) for c in cases) for z in ZONES} for s in states},
         "psnr_kept": by_count(kept),
         "worse": {n: counted(gain(c, learned(n), z) for c in cases for z in ZONES) for n in numbers},
-        "psf": {
-            s: {
-                c: {z: mean(get(one, "psf", s, "rel_l2", c, z) for one in cases) for z in ZONES}
-                for c in CHANNELS
-            }
-            for s in known
-        },
-        "predicted_right": {
-            n: mean(get(case, "psf", learned(n), "predicted_right") for case in cases) for n in numbers
-        },
+        "psf": {s: {c: {z: psf("rel_l2", s, c, z) for z in ZONES} for c in CHANNELS} for s in known},
+        "predicted_right": {n: psf("predicted_right", learned(n)) for n in numbers},
         "forecast_off": {n: _forecast_off(cases, n) for n in numbers},
     }
 
@@ -143,7 +127,7 @@ def _highest_mtf(cases: Sequence[Result], n: str, zone: str) -> float | None:
 
 def paths(result: Result) -> dict[str, dict[str, Any]]:
     """What other kinds of files gain, by their names: its share of raw files' gain, and zones that fell."""
-    found: dict[str, dict[str, Any]] = {}
+    found = {}
     for name in sorted({name for case in result["cases"] for name in case["paths"]}):
         cases = [case for case in result["cases"] if name in case["paths"]]
         own = [{"states": case["paths"][name]} for case in cases]
@@ -175,19 +159,29 @@ def number(value: float | None, digits: int = 0) -> str:
 
 # --- what is asked of the whole chain, each bar with its value and whether it holds ---
 
-COUNTS: Final = ("1", "2", "5")
-"""Numbers of photos that bars are of."""
 
-# What is asked (chosen): of 1, 2 and 5 photos, and of those in centre, mid and corner.
-_PSF: Final = ((0.12, 0.18, 0.38), (0.10, 0.15, 0.32), (0.08, 0.11, 0.27))
-_COLOURS: Final = (1.6, 1.4, 1.3)
-_KEPT: Final = ((0.75, 0.70, 0.55), (0.80, 0.75, 0.65), (0.85, 0.80, 0.70))
-_TOLD: Final = (0.75, 0.75, 0.8)
-_HIGHEST_MTF: Final = (1.10, 1.10, 1.08)
-_FORECAST_DB: Final = (0.6, 0.5, 0.4)
+class Asked(NamedTuple):
+    """What is asked (chosen) of a number of photos; where there are three limits, of the three zones."""
+
+    psf: tuple[float, float, float]  # relative L2 of green
+    colours: float  # that of red and of blue over green's
+    kept: tuple[float, float, float]  # share of the true PSF's gain
+    told: float
+    highest_mtf: float
+    forecast_db: float
+
+
+ASKED: Final = {  # by numbers of photos
+    "1": Asked((0.12, 0.18, 0.38), 1.6, (0.75, 0.70, 0.55), 0.75, 1.10, 0.6),
+    "2": Asked((0.10, 0.15, 0.32), 1.4, (0.80, 0.75, 0.65), 0.75, 1.10, 0.5),
+    "5": Asked((0.08, 0.11, 0.27), 1.3, (0.85, 0.80, 0.70), 0.8, 1.08, 0.4),
+}
+
 _SOFT: Final = (0.30, 0.35, 0.50)
 _MORE_HARMS: Final = 0.02
 _PATHS: Final = {"tiff": 0.5, "jpeg": 1.0 / 3.0}
+_GREEN: Final = "relative L2 of the PSF, green"
+_FALLS: Final = "zones where PSNR falls by more than 0.05 dB"
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,83 +219,72 @@ def bars(result: Mapping[str, Any]) -> list[Bar]:
     usual = [case for case in result["cases"] if case["settings"]["seed"] != SOFT_SEED]
     found: list[Bar] = []
     for family, group in groups({**result, "cases": usual}).items():
-        made = summary(group)
-        parts = (_psf(made), _photos(made), _more(group, made), _paths(group))
-        found += [replace(bar, family=family) for part in parts for bar in part]
+        found += [replace(bar, family=family) for bar in _of_family(group)]
     if soft:
         made = summary({**result, "cases": soft})
-        for zone, limit in zip(ZONES, _SOFT, strict=True):
-            value = get(made, "psf", learned(1), "g", zone)
-            found.append(
-                Bar("relative L2 of the PSF, green", zone, value, high=limit, family="soft fast lens")
-            )
-        worse = made["worse"].get("1", {})
-        found.append(Bar(_FALLS, _zones(worse), worse.get("clearly_worse"), high=0, family="soft fast lens"))
+        of_soft = [
+            *_zoned(_GREEN, get(made, "psf", learned(1), "g"), _SOFT),
+            _counted(_FALLS, made["worse"].get("1")),
+        ]
+        found += [replace(bar, family="soft fast lens") for bar in of_soft]
     return found
 
 
-_FALLS: Final = "zones where PSNR falls by more than 0.05 dB"
-
-
-def _zones(counts: Mapping[str, int]) -> str:
-    return f"of {counts['zones']} zones" if counts else "zones"
-
-
-def _psf(made: Mapping[str, Any]) -> Iterator[Bar]:
-    for i, n in enumerate(COUNTS):
-        errors = {c: [get(made, "psf", learned(n), c, zone) for zone in ZONES] for c in CHANNELS}
-        for zone, green, limit in zip(ZONES, errors["g"], _PSF[i], strict=True):
-            yield Bar("relative L2 of the PSF, green", zone, green, high=limit, n=n)
-        for word, others in (("red", errors["r"]), ("blue", errors["b"])):
-            for zone, other, green in zip(ZONES, others, errors["g"], strict=True):
-                ratio = None if None in (other, green) else other / green
-                yield Bar(f"relative L2 of the PSF, {word} over green", zone, ratio, high=_COLOURS[i], n=n)
-        told = made["predicted_right"].get(n)
-        yield Bar("share of PSF errors told right within a factor of 1.5", "field", told, low=_TOLD[i], n=n)
-
-
-def _photos(made: Mapping[str, Any]) -> Iterator[Bar]:
-    for i, n in enumerate(COUNTS):
-        for zone, limit in zip(ZONES, _KEPT[i], strict=True):
-            value = get(made, "psnr_kept", n, zone)
-            yield Bar("share of the true-PSF gain in PSNR", zone, value, low=limit, n=n)
-        for zone in ZONES:
-            value = get(made, "highest_mtf", n, zone)
-            yield Bar("highest corrected MTF of any lens", zone, value, high=_HIGHEST_MTF[i], n=n)
-        worse = made["worse"].get(n, {})
-        yield Bar(_FALLS, _zones(worse), worse.get("clearly_worse"), high=0, n=n)
-        off = made["forecast_off"].get(n)
+def _of_family(group: Result) -> Iterator[Bar]:
+    made = summary(group)
+    for n, asked in ASKED.items():
+        errors = get(made, "psf", learned(n)) or {}
+        told, off = (made[name].get(n) for name in ("predicted_right", "forecast_off"))
+        yield from _zoned(_GREEN, errors.get("g"), asked.psf, n=n)
+        for word, channel in (("red", "r"), ("blue", "b")):
+            ratios = {zone: _over(get(errors, channel, zone), get(errors, "g", zone)) for zone in ZONES}
+            yield from _zoned(f"relative L2 of the PSF, {word} over green", ratios, [asked.colours] * 3, n=n)
+        yield Bar("share of PSF errors told right within a factor of 1.5", "field", told, low=asked.told, n=n)
+        kept_, highest = (made[name].get(n) for name in ("psnr_kept", "highest_mtf"))
+        yield from _zoned("share of the true-PSF gain in PSNR", kept_, asked.kept, least=True, n=n)
+        yield from _zoned("highest corrected MTF of any lens", highest, [asked.highest_mtf] * 3, n=n)
+        yield _counted(_FALLS, made["worse"].get(n), n=n)
         words = "what the forecast of the gain by zone is off by, dB"
-        yield Bar(words, "all zones", off, high=_FORECAST_DB[i], n=n)
-
-
-def _more(group: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[Bar]:
-    for zone in ZONES:
-        pair = [get(made, "psf", learned(n), "g", zone) for n in (FEWER, MORE)]
-        more = None if None in pair else pair[1] - pair[0]
-        yield Bar("relative L2 of green above that of two photos", zone, more, high=_MORE_HARMS, n=MORE)
-    compared = more_photos(group["cases"])
-    value = compared["clearly_worse"] if compared["zones"] else None
+        yield Bar(words, "all zones", off, high=asked.forecast_db, n=n)
+    two, five = (get(made, "psf", learned(n), "g") for n in (FEWER, MORE))
+    more = {zone: None if two is None or five is None else five[zone] - two[zone] for zone in ZONES}
+    yield from _zoned("relative L2 of green above that of two photos", more, [_MORE_HARMS] * 3, n=MORE)
     words = "zones where five photos give a PSNR below that of two by more than 0.05 dB"
-    yield Bar(words, _zones(compared) if compared["zones"] else "zones", value, high=0, n=MORE)
-
-
-def _paths(group: Mapping[str, Any]) -> Iterator[Bar]:
+    yield _counted(words, more_photos(group["cases"]), n=MORE)
     for name, row in paths(group).items():
-        for zone in ZONES:
-            share = row["share"][zone]
-            yield Bar(f"{name.upper()}: gain in PSNR over that of raw", zone, share, low=_PATHS[name])
-        counts = row["counts"]
-        yield Bar(f"{name.upper()}: {_FALLS}", _zones(counts), counts["clearly_worse"], high=0)
+        words = f"{name.upper()}: gain in PSNR over that of raw"
+        yield from _zoned(words, row["share"], [_PATHS[name]] * 3, least=True)
+        yield _counted(f"{name.upper()}: {_FALLS}", row["counts"])
+
+
+def _zoned(
+    name: str,
+    row: Mapping[Any, float | None] | None,
+    limits: Sequence[float],
+    *,
+    least: bool = False,
+    n: str = "1",
+) -> Iterator[Bar]:
+    """A bar for each zone, with the least or the most that it may be."""
+    for zone, limit in zip(ZONES, limits, strict=True):
+        yield Bar(name, zone, get(row or {}, zone), limit if least else None, None if least else limit, n)
+
+
+def _counted(name: str, counts: Mapping[str, int] | None, *, n: str = "1") -> Bar:
+    """No zone may fall; where none is known, nothing is told."""
+    if not counts or not counts["zones"]:
+        return Bar(name, "zones", None, high=0, n=n)
+    return Bar(name, f"of {counts['zones']} zones", counts["clearly_worse"], high=0, n=n)
+
+
+def _over(value: float | None, other: float | None) -> float | None:
+    return None if value is None or other is None else value / other
 
 
 def held(found: Sequence[Bar]) -> dict[str, int]:
     """Count bars: `held`, `missed`, `unknown`."""
-    return {
-        "held": sum(bar.met is True for bar in found),
-        "missed": sum(bar.met is False for bar in found),
-        "unknown": sum(bar.met is None for bar in found),
-    }
+    verdicts = {"held": True, "missed": False, "unknown": None}
+    return {name: sum(bar.met is verdict for bar in found) for name, verdict in verdicts.items()}
 
 
 def missed(result: Mapping[str, Any]) -> list[str]:

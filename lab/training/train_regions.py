@@ -3,10 +3,8 @@
     python -m lab.training.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lab.training.train_regions fit TABLE.jsonl MODEL.npz
 
-`collect` blurs photographs by simulated lenses, estimates the kernel in some windows of each and
-writes one line a window: its features and how wrong the kernel was. It goes on where it stopped.
-`fit` learns from the development half of the photos and reports on the test half; lenses of the
-two halves differ as well.
+`collect` blurs photographs by simulated lenses and writes a line for some windows of each: its features, and
+how wrong a kernel estimated in it was. It goes on where it stopped. `fit` learns from the development half.
 """
 
 from __future__ import annotations
@@ -70,10 +68,8 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
         return
     drawn = np.sort(rng.choice(usable, WINDOWS_A_GROUP, replace=False))
     part = windows.take(drawn)
-    patches = [
-        np.ascontiguousarray(plane[r : r + SIZE, c : c + SIZE])
-        for r, c in zip(part.rows, part.cols, strict=True)
-    ]
+    corners = zip(part.rows, part.cols, strict=True)
+    patches = [np.ascontiguousarray(plane[r : r + SIZE, c : c + SIZE]) for r, c in corners]
     looked = details_of(plane, part, 1.0)
     features, r_map = features_of(part, looked), RMapSelector().score(part, looked)
     for own, score, patch in zip(features, r_map, patches, strict=True):
@@ -81,16 +77,11 @@ def label_group(photo: Path, number: int, estimator: BlindMethod) -> Iterator[La
             found = np.asarray(estimator.estimate([patch], [noise], size=31).kernel)
         except NotEnoughEvidenceError:
             found = psf.delta(3)
-        yield Labelled(
-            group=f"{photo.stem}/{number}",
-            half=half,
-            features=tuple(round(float(v), 5) for v in own),
-            r_map_score=float(score),
-            ncc=kernels.distance(found, kernel).ncc,
-        )
+        rounded, ncc = tuple(round(float(v), 5) for v in own), kernels.distance(found, kernel).ncc
+        yield Labelled(f"{photo.stem}/{number}", half, rounded, float(score), ncc)
 
 
-def collect(photos: Path | None, table: Path, groups: int, method: str = "default") -> None:
+def collect(photos: Path, table: Path, groups: int, method: str = "default") -> None:
     """Append labelled windows of `groups` photo-lens pairs to the table, skipping those it has."""
     estimator = compared.create(method)
     found = list_photos(photos)
@@ -121,15 +112,9 @@ def fit(table: Path, model: Path, seed: int = 0) -> dict[str, float]:
     if not learn or not held:
         raise InvalidInputError(f"{table} needs windows of both halves, has {len(learn)} and {len(held)}")
     trees = GradientBoostingRegressor(
-        n_estimators=150,
-        learning_rate=0.04,
-        max_depth=3,
-        min_samples_leaf=8,
-        subsample=0.6,
-        max_features=0.3,
-        loss="huber",
-        random_state=seed,
-    ).fit(_features(learn), np.log([max(1.0 - row.ncc, 1e-4) for row in learn]))
+        n_estimators=150, learning_rate=0.04, max_depth=3, min_samples_leaf=8, subsample=0.6,
+        max_features=0.3, loss="huber", random_state=seed,
+    ).fit(_features(learn), np.log([max(1.0 - row.ncc, 1e-4) for row in learn]))  # fmt: skip
     ensemble = _arrays(trees)
     model.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(model, **{name: getattr(ensemble, name) for name in ensemble.__slots__})
@@ -141,7 +126,7 @@ def fit(table: Path, model: Path, seed: int = 0) -> dict[str, float]:
 def _features(rows: Sequence[Labelled]) -> NDArray[np.float64]:
     values = np.array([row.features for row in rows])
     if values.shape[1] != FEATURES:
-        raise InvalidInputError(f"the table has {values.shape[1]} features, not {FEATURES}; collect anew")
+        raise InvalidInputError(f"the table has {values.shape[1]} features, not {FEATURES}")
     return values
 
 
@@ -158,9 +143,8 @@ def _arrays(model: object) -> TreeEnsemble:
         # scikit-learn asks x <= t with x in single and t in double precision; with t rounded down
         # to single precision the answer is the same.
         single = tree.threshold.astype(np.float32)
-        threshold[i, :count] = np.where(
-            single > tree.threshold, np.nextafter(single, np.float32(-np.inf)), single
-        )
+        down = np.nextafter(single, np.float32(-np.inf))
+        threshold[i, :count] = np.where(single > tree.threshold, down, single)
         left[i, :count] = np.where(leaf, np.arange(count), tree.children_left)
         right[i, :count] = np.where(leaf, np.arange(count), tree.children_right)
         value[i, :count] = model.learning_rate * tree.value[:, 0, 0]  # type: ignore[attr-defined]  # as above
@@ -171,19 +155,15 @@ def _arrays(model: object) -> TreeEnsemble:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `collect` or `fit` from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    taken, learned = verbs.add_parser("collect"), verbs.add_parser("fit")
-    for name in ("photos", "table"):
-        taken.add_argument(name, type=Path)
-    taken.add_argument("groups", type=int, nargs="?", default=240)
-    taken.add_argument("method", nargs="?", default="default")
-    for name in ("table", "model"):
-        learned.add_argument(name, type=Path)
+    parser.add_argument("verb", choices=["collect", "fit"])
+    parser.add_argument("files", type=Path, nargs=2)
+    parser.add_argument("groups", type=int, nargs="?", default=240)
+    parser.add_argument("method", nargs="?", default="default")
     asked = parser.parse_args(arguments)
     if asked.verb == "collect":
-        collect(asked.photos, asked.table, asked.groups, asked.method)
+        collect(asked.files[0], asked.files[1], asked.groups, asked.method)
     else:
-        print(json.dumps(fit(asked.table, asked.model), indent=1))
+        print(json.dumps(fit(asked.files[0], asked.files[1]), indent=1))
 
 
 if __name__ == "__main__":

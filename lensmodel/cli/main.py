@@ -51,12 +51,12 @@ COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
             "lensmodel.cli.report",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
         ),
-        "demo": ("lab.demo.command", "Run the whole process on a simulated lens whose true blur is known."),
+        "demo": ("lab.demo", "Run the whole process on a simulated lens whose true blur is known."),
         "reproduce": (
-            "lab.commands.reproduce",
+            "lab.commands",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
         ),
-        "bench": ("lab.commands.benchmarks", "Measure quality and speed."),
+        "bench": ("lab.commands", "Measure quality and speed."),
     },
     "Administration": {
         "api": ("app.commands.service", "Run only the API process, for installations on many machines."),

@@ -19,7 +19,7 @@ from app.schemas import JobOut
 from app.store import Store
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
-from lab.demo.run import own_service
+from lab.demo import own_service
 from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
 from lensmodel.model import LensModel

@@ -5,10 +5,7 @@ motion blur of many pixels: edges are restored by a shock filter, kept where the
 kernel is what takes them to the observed derivatives. A mildly blurred edge is already as steep as
 the shock filter makes any edge, so that there is little to learn from lens blur.
 
-Departures from the paper:
-
-1. Patches of one position share the kernel step; the paper has one image.
-2. Predicted edges within half a kernel of the border are left out: the paper's wrap leaks into k.
+Departure: predicted edges within half a kernel of the border are left out, as the paper's wrap leaks into k.
 """
 
 from __future__ import annotations
@@ -27,13 +24,13 @@ from lab.blind.steps.gradients import (
     across,
     bilateral,
     down,
-    estimate_by_edges,
     inside,
     oriented_threshold,
     pruned,
     shock_filtered,
 )
-from lab.blind.steps.pyramid import Image, Latents, Level
+from lab.blind.steps.kernel_step import unsure
+from lab.blind.steps.pyramid import Image, Level, View, coarse_to_fine
 from lensmodel.blind import PsfEstimate
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
@@ -57,40 +54,27 @@ class ChoLee:
     def estimate(
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share; see `BlindMethod`."""
-        return estimate_by_edges(_Rounds(self), patches, noise, size)
+        """Estimate the kernel of a patch; see `BlindMethod`."""
+        return unsure(coarse_to_fine(View.of_one(patches, noise, size), self._rounds, size), size)
 
-
-@dataclass(slots=True)
-class _Rounds:
-    """Prediction, kernel, deconvolution."""
-
-    settings: ChoLee
-
-    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
-        images = [_Quick.of(view.y, level.side) for view in level.views]
+    def _rounds(self, level: Level, kernel: Kernel, latent: Image) -> tuple[Kernel, Image]:
+        """Prediction, kernel, deconvolution."""
+        y, side = level.view.y, level.side
+        image = _Quick.of(y, side)
         if level.number == level.count - 1:
-            latents = tuple(image.deconvolved(kernel) for image in images)
-        thresholds: list[float] = []
-        for i in range(self.settings.iterations):
-            fade = 0.9**i
-            edges = [_predicted(x, fade) for x in latents]
-            if i == 0:
-                least = round(self.settings.edges * level.side)
-                thresholds = [
-                    oriented_threshold(*e, least, inside(e[0].shape, level.side // 2 + 1)) for e in edges
-                ]
-            pairs: list[DerivativePair] = []
-            for edge, view, least_slope in zip(edges, level.views, thresholds, strict=True):
-                pairs += _pairs(edge, view.y, fade * least_slope)
-            kernel = pruned(self._solved(KernelEquations.of(pairs, level.side)), self.settings.threshold)
-            latents = tuple(image.deconvolved(kernel) for image in images)
-        return kernel, latents
-
-    def _solved(self, equations: KernelEquations) -> NDArray[np.float64]:
-        side = equations.side
+            latent = image.deconvolved(kernel)
         uniform = np.full((side, side), 1.0 / side**2)
-        return equations.conjugate_gradients(_BETA, uniform, steps=self.settings.steps)
+        for i in range(self.iterations):
+            fade = 0.9**i
+            edge = _predicted(latent, fade)
+            if i == 0:
+                allowed = inside(y.shape, side // 2 + 1)
+                threshold = oriented_threshold(*edge, round(self.edges * side), allowed)
+            equations = KernelEquations.of(_pairs(edge, y, fade * threshold), side)
+            solved = equations.conjugate_gradients(_BETA, uniform, steps=self.steps)
+            kernel = pruned(solved, self.threshold)
+            latent = image.deconvolved(kernel)
+        return kernel, latent
 
 
 def _predicted(latent: Image, fade: float) -> tuple[Image, Image]:

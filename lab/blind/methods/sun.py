@@ -35,17 +35,15 @@ from lab.blind.steps.kernel_step import (
     least_squares_kernel,
     unsure,
 )
-from lab.blind.steps.pyramid import Image, Latents, Level, View, coarse_to_fine
+from lab.blind.steps.pyramid import Image, Level, View, coarse_to_fine
 from lab.cases import DATA
-from lensmodel.blind.estimator import PsfEstimate, usable
+from lensmodel.blind import PsfEstimate
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 SIDE = 5  # pixels of a window, as in the paper
-EDGE_SHARE = 0.03
-"""So many of the pixels lie on the mask, the strongest first."""
-
+EDGE_SHARE = 0.03  # so many of the pixels lie on the mask, the strongest first
 _ORIENTATIONS = 8  # of the filters: 22.5 degrees apart (chosen)
 _REACH = 4  # pixels of a filter: two standard deviations along the edge
 _ALONG_PX, _ACROSS_PX = 2.0, 1.0  # standard deviations of a filter (chosen): longer than wide
@@ -82,7 +80,7 @@ class EdgePatchPrior:
 default_prior = cache(EdgePatchPrior.load)
 
 
-def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
+def edge_mask(x: Image) -> NDArray[np.bool_]:
     """Mark thin edges: strongest responses to elongated derivative filters, local maxima across."""
     responses = np.stack([np.abs(ndimage.correlate(x, f, mode="nearest")) for f in _bank()])
     strength, way = responses.max(axis=0), responses.argmax(axis=0)
@@ -98,7 +96,7 @@ def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
     inside = np.zeros(x.shape, dtype=bool)
     inside[rim:-rim, rim:-rim] = True
     crest &= inside & (strength > 1e-9)
-    count = max(int(share * x.size), 1)
+    count = max(int(EDGE_SHARE * x.size), 1)
     if int(crest.sum()) > count:
         crest &= strength >= np.partition(strength[crest], -count)[-count]
     label, _ = ndimage.label(crest, np.ones((3, 3), dtype=np.int_))
@@ -116,10 +114,8 @@ def steepness_of(x: Image) -> Image:
 
 def local_range(x: Image) -> Image:
     """Largest less smallest value within 5 px in each direction."""
-    return np.asarray(
-        ndimage.maximum_filter(x, _AROUND, mode="nearest")
-        - ndimage.minimum_filter(x, _AROUND, mode="nearest")
-    )
+    high, low = (f(x, _AROUND, mode="nearest") for f in (ndimage.maximum_filter, ndimage.minimum_filter))
+    return np.asarray(high - low)
 
 
 def target(x: Image, mask: NDArray[np.bool_], prior: EdgePatchPrior) -> tuple[Image, Image]:
@@ -183,33 +179,22 @@ class Sun:
     def estimate(
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share; see `BlindMethod`."""
-        views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-        found = coarse_to_fine(views, _Alternation(self, default_prior()), size)
+        """Estimate the kernel of a patch; see `BlindMethod`."""
+        found = coarse_to_fine(View.of_one(patches, noise, size), self._alternation, size)
         return unsure(cleaned(found, self.threshold, self.least_mass), size)
 
-
-@dataclass(slots=True)
-class _Alternation:
-    """The alternation on one level."""
-
-    method: Sun
-    prior: EdgePatchPrior
-
-    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
-        kernel, now = centred(kernel), list(latents)
-        for _ in range(self.method.iterations):
-            terms: list[Term] = []
-            for i, view in enumerate(level.views):
-                for beta in self.method.betas:
-                    mask = edge_mask(now[i])
-                    q, count = target(now[i], mask, self.prior)
-                    now[i] = image_step(view.y, kernel, q, count, beta, self.method.smoothness)
-                terms.extend(edge_terms(now[i], view, level.side, self.method.ridge))
+    def _alternation(self, level: Level, kernel: Kernel, latent: Image) -> tuple[Kernel, Image]:
+        """The alternation on one level."""
+        kernel = centred(kernel)
+        for _ in range(self.iterations):
+            for beta in self.betas:
+                q, count = target(latent, edge_mask(latent), default_prior())
+                latent = image_step(level.view.y, kernel, q, count, beta, self.smoothness)
+            terms = edge_terms(latent, level.view, level.side, self.ridge)
             if sum(np.count_nonzero(term.x) for term in terms) < _LEAST_EDGE_PX:
-                raise NotEnoughEvidenceError("the patches hold no edge; choose parts with edges")
+                raise NotEnoughEvidenceError("the patch holds no edge; choose a part with edges")
             kernel = centred(cleaned(least_squares_kernel(terms, kernel), 0.0))
-        return kernel, tuple(now)
+        return kernel, latent
 
 
 def edge_terms(x: Image, view: View, side: int, ridge: float) -> tuple[Term, Term]:
@@ -252,13 +237,10 @@ def image_step(
     def applied(x: NDArray[np.float32]) -> NDArray[np.float32]:
         return fft.irfft2(diagonal * fft.rfft2(x), shape) + pull * x
 
-    x = conjugate_gradients(
-        applied,
-        right - applied(wanted),
-        wanted,
-        steps,
-        inverse=lambda residual: fft.irfft2(inverse * fft.rfft2(residual), shape),
-    )
+    def roughly(residual: NDArray[np.float32]) -> NDArray[np.float32]:
+        return fft.irfft2(inverse * fft.rfft2(residual), shape)
+
+    x = conjugate_gradients(applied, right - applied(wanted), wanted, steps, inverse=roughly)
     return x[inside].astype(np.float64)
 
 

@@ -5,11 +5,8 @@ finds a coarse kernel from edges that are long enough to tell of the blur: fine 
 the kernel, misleads. Phase two refines it by iterative support detection: values that stand out
 keep their size, only those outside the support are drawn to zero. Made for wide motion blur.
 
-Departures from the paper:
-
-1. Patches of one position share the kernel steps; the paper has one image.
-2. Selected edges within half a kernel of the border are left out: the paper's wrap leaks into k.
-3. The final TV-l1 deconvolution is left out: the kernel is what is asked for.
+Departures: selected edges within half a kernel of the border are left out, as the paper's wrap leaks into k;
+so is the final TV-l1 deconvolution, as the kernel is what is asked for.
 """
 
 from __future__ import annotations
@@ -29,13 +26,13 @@ from lab.blind.steps.gradients import (
     PeriodicPlane,
     across,
     down,
-    estimate_by_edges,
     inside,
     oriented_threshold,
     pruned,
     shock_filtered,
 )
-from lab.blind.steps.pyramid import Image, Latents, Level, View
+from lab.blind.steps.kernel_step import unsure
+from lab.blind.steps.pyramid import Image, Level, View, coarse_to_fine
 from lensmodel.blind import PsfEstimate
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
@@ -65,44 +62,36 @@ class XuJia:
     def estimate(
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share; see `BlindMethod`."""
-        return estimate_by_edges(_Phases(self), patches, noise, size)
+        """Estimate the kernel of a patch; see `BlindMethod`."""
+        return unsure(coarse_to_fine(View.of_one(patches, noise, size), self._phases, size), size)
 
-
-@dataclass(slots=True)
-class _Phases:
-    """Phase one on every level, phase two at the end of the finest."""
-
-    settings: XuJia
-
-    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
-        patches = [_PatchLevel.of(view, level.side) for view in level.views]
+    def _phases(self, level: Level, kernel: Kernel, latent: Image) -> tuple[Kernel, Image]:
+        """Phase one on every level, phase two at the end of the finest."""
+        patch = _PatchLevel.of(level.view, level.side)
         if level.number == level.count - 1:
-            edges = [(down(x), across(x)) for x in latents]
-            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
-        for i in range(self.settings.iterations):
-            edges = [s.selected(x, _FADE**-i) for s, x in zip(patches, latents, strict=True)]
-            pairs = [p for s, e in zip(patches, edges, strict=True) for p in s.pairs(e)]
-            equations = KernelEquations.of(pairs, level.side)
-            kernel = pruned(equations.divided(_GAMMA), self.settings.threshold)
-            if level.number == 0 and i == self.settings.iterations - 1:
+            latent = patch.deconvolved(kernel, (down(latent), across(latent)))
+        for i in range(self.iterations):
+            edge = patch.selected(latent, _FADE**-i)
+            equations = KernelEquations.of(patch.pairs(edge), level.side)
+            kernel = pruned(equations.divided(_GAMMA), self.threshold)
+            if level.number == 0 and i == self.iterations - 1:
                 kernel = self._refined(equations, kernel)
-            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
-        return kernel, latents
+            latent = patch.deconvolved(kernel, edge)
+        return kernel, latent
 
     def _refined(self, equations: KernelEquations, coarse: Kernel) -> Kernel:
         """Phase two: detect the support, solve with |k| outside it penalised, repeat until it rests."""
         kernel: NDArray[np.float64] = np.array(coarse)
-        for i in range(1, self.settings.detections + 1):
+        for i in range(1, self.detections + 1):
             outside = ~support(kernel, i)
             before = kernel
             for _ in range(_REWEIGHTINGS):
-                gamma = outside * self.settings.sparsity / np.maximum(np.abs(kernel), _LEAST_VALUE)
+                gamma = outside * self.sparsity / np.maximum(np.abs(kernel), _LEAST_VALUE)
                 kernel = equations.conjugate_gradients(gamma, kernel, steps=30)
             kernel = np.maximum(kernel, 0.0)
             if np.linalg.norm(kernel - before) < 1e-3 * np.linalg.norm(before):
                 break
-        return pruned(kernel, self.settings.threshold)
+        return pruned(kernel, self.threshold)
 
 
 def support(kernel: NDArray[np.float64], turn: int) -> Mask:

@@ -23,8 +23,7 @@ k is divided and x multiplied by the same number.
 
 Departures from the paper:
 
-1. The paper has several blurs of one scene; here several scenes share one blur. The kernel step
-   pools them, and each keeps its own x, γ and λ.
+1. The paper has several blurs of one scene; here the gradients down and across of a scene share one blur.
 2. The first kernel is a small Gaussian, not two pixels, so that results turn with the patch.
 3. The floor of λ is the paper's plus the noise that is known of the camera. Alone, λ falls below the
    noise on linear light with its low contrast, x follows the noise, and the kernel becomes a delta.
@@ -48,9 +47,9 @@ from lab.blind.steps.kernel_step import (
     least_squares_kernel,
     unsure,
 )
-from lab.blind.steps.pyramid import RATIO, Latents, Level, View, coarse_to_fine, kernel_sides
+from lab.blind.steps.pyramid import RATIO, Image, Level, View, coarse_to_fine, kernel_sides
 from lab.kernels import gaussian
-from lensmodel.blind.estimator import PsfEstimate, usable
+from lensmodel.blind import PsfEstimate
 from lensmodel.core.psf import centred
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
@@ -76,33 +75,24 @@ class Zhang:
     def estimate(
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share; see `BlindMethod`."""
-        views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-        levels = len(kernel_sides(size, min(min(view.y.shape) for view in views)))
-        coarse = _FIRST_SIGMA_PX / RATIO ** (levels - 1)
+        """Estimate the kernel of a patch; see `BlindMethod`."""
+        view = View.of_one(patches, noise, size)
+        coarse = _FIRST_SIGMA_PX / RATIO ** (len(kernel_sides(size, min(view.y.shape))) - 1)
         start = gaussian(size, coarse**2 * np.eye(2))
-        return unsure(cleaned(coarse_to_fine(views, _Sweeps(self), size, start=start), self.threshold), size)
+        return unsure(cleaned(coarse_to_fine(view, self._sweeps, size, start=start), self.threshold), size)
 
-
-@dataclass(slots=True)
-class _Sweeps:
-    """The alternation on one level."""
-
-    method: Zhang
-
-    def __call__(self, level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
+    def _sweeps(self, level: Level, kernel: Kernel, latent: Image) -> tuple[Kernel, Image]:
+        """The alternation on one level."""
         kernel = centred(kernel)  # or it drifts, level by level, until the support cuts it
         # λ and γ start anew on each level: what was learned on the coarser one is too sure of itself.
-        scenes = [
-            PatchPosterior.of(view.y, level.side, kernel, self.method.floor + 2.0 * view.noise**2)
-            for view in level.views
-        ]
-        for _ in range(self.method.iterations):
-            scenes = [scene.improved(kernel, self.method.steps) for scene in scenes]
-            raw = pooled_kernel([part for scene in scenes for part in scene.weighted()], kernel)
-            kernel, total = cleaned(raw, 0.0), float(raw.sum())
-            scenes = [scene.scaled(total).with_noise(kernel) for scene in scenes]
-        return kernel, latents
+        floor = self.floor + 2.0 * level.view.noise**2
+        scene = PatchPosterior.of(level.view.y, level.side, kernel, floor)
+        for _ in range(self.iterations):
+            scene = scene.improved(kernel, self.steps)
+            raw = scene.kernel_step(kernel)
+            kernel = cleaned(raw, 0.0)
+            scene = scene.scaled(float(raw.sum())).with_noise(kernel)
+        return kernel, latent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,15 +179,7 @@ class PatchPosterior:
         misfit = sum(part.misfit(kernel) for part in self.parts)
         return replace(self, noise=misfit / sum(part.y.size for part in self.parts) + self.floor)
 
-    def weighted(self) -> list[tuple[GradientPosterior, float]]:
-        """Both posteriors with their weight 1 / λ in the kernel step."""
-        return [(part, 1.0 / self.noise) for part in self.parts]
-
-
-def pooled_kernel(posteriors: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:
-    """Update k >= 0 to the minimum of the summed free energies of posteriors with their weights 1 / λ.
-
-    min over k >= 0 of  sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ_l
-    """
-    terms = [Term(b.grid, b.y, b.x, weight, b.grid.sums_of(b.variance)) for b, weight in posteriors]
-    return least_squares_kernel(terms, kernel)
+    def kernel_step(self, kernel: Kernelish) -> Kernelish:
+        """Update k >= 0 to the minimum of sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ."""
+        terms = [Term(b.grid, b.y, b.x, 1.0 / self.noise, b.grid.sums_of(b.variance)) for b in self.parts]
+        return least_squares_kernel(terms, kernel)

@@ -1,9 +1,7 @@
 """Pieces that the methods by predicted edges share: prediction, selection, kernel step, borders.
 
-Cho and Lee, and Xu and Jia guess the gradients of the sharp image at strong
-edges and solve for the kernel that takes them to the observed ones. Derivatives are forward
-differences. All steps are shift-invariant; borders are continued smoothly to a periodic canvas for
-image steps, and no edge within half a kernel of the border counts in kernel steps.
+Derivatives are forward differences. Borders are continued smoothly to a periodic canvas for image steps, and
+no edge within half a kernel of the border counts in kernel steps.
 """
 
 from __future__ import annotations
@@ -17,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lab.blind.steps.kernel_step import cleaned, conjugate_gradients, unsure
-from lab.blind.steps.pyramid import Image, LevelSolver, View, coarse_to_fine
-from lensmodel.blind.estimator import PsfEstimate, usable
+from lab.blind.steps.kernel_step import cleaned, conjugate_gradients
+from lab.blind.steps.pyramid import Image
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centroid, otf
-from lensmodel.core.types import Kernel, NoiseModel, Plane
+from lensmodel.core.types import Kernel
 
 _ORIENTATIONS = 4  # as in Cho and Lee
 _TINY = 1e-12  # keeps divisions finite: far below any gradient
@@ -69,9 +66,8 @@ def bilateral(image: Image, *, reach: int, sigma_space: float, sigma_range: floa
     for row in range(-reach, reach + 1):
         for col in range(-reach, reach + 1):
             near = math.exp(-0.5 * (row * row + col * col) / sigma_space**2)
-            other = wide[
-                reach + row : reach + row + image.shape[0], reach + col : reach + col + image.shape[1]
-            ]
+            top, left = reach + row, reach + col
+            other = wide[top : top + image.shape[0], left : left + image.shape[1]]
             weight = near * np.exp(-0.5 * np.square((other - image) / sigma_range))
             total += weight * other
             weights += weight
@@ -164,25 +160,15 @@ def _fast_pad(length: int, least: int) -> int:
 @lru_cache(maxsize=64)
 def _closing(length: int, pad: int) -> Image:
     """Matrix `(length + 2 pad, length)` of `PeriodicPlane.filled` along one axis."""
-    total = length + 2 * pad
-    matrix = np.zeros((total, length))
-    for i in range(total):
-        place = i - pad
-        if 0 <= place < length:
-            matrix[i, place] = 1.0
-            continue
-        beyond = place - length if place >= length else place + total - length  # 0 .. 2 pad - 1
-        fade = (beyond + 0.5) / (2 * pad)
-        fade = 0.5 - 0.5 * math.cos(math.pi * fade)
-        matrix[i, _mirrored(length + beyond, length)] += 1.0 - fade
-        matrix[i, _mirrored(beyond - 2 * pad, length)] += fade
+    matrix = np.eye(length + 2 * pad, length, -pad)
+    beyond = np.arange(2 * pad)  # places from the end on, around to before the beginning
+    fade = 0.5 - 0.5 * np.cos(np.pi * (beyond + 0.5) / (2 * pad))
+    rows = (beyond + length + pad) % len(matrix)
+    mirrored = np.pad(np.arange(length), 2 * pad, mode="symmetric")
+    np.add.at(matrix, (rows, mirrored[beyond + length + 2 * pad]), 1.0 - fade)
+    np.add.at(matrix, (rows, mirrored[beyond]), fade)
     matrix.setflags(write=False)
     return matrix
-
-
-def _mirrored(place: int, length: int) -> int:
-    folded = place % (2 * length)
-    return folded if folded < length else 2 * length - 1 - folded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,15 +207,10 @@ class KernelEquations:
 
     def divided(self, gamma: float) -> NDArray[np.float64]:
         """Kernel by division of spectra, cross / (power + gamma), cut to its side."""
-        plane = fft.irfft2(self.cross / (self.power + gamma), self.grid)
-        return self._middle(plane)
+        return self._middle(fft.irfft2(self.cross / (self.power + gamma), self.grid))
 
     def conjugate_gradients(
-        self,
-        gamma: float | NDArray[np.float64],
-        start: NDArray[np.float64],
-        *,
-        steps: int,
+        self, gamma: float | NDArray[np.float64], start: NDArray[np.float64], *, steps: int
     ) -> NDArray[np.float64]:
         """Minimise sum w |s * k - b|² + gamma |k|² over kernels of this side, unconstrained."""
         n = int(fft.next_fast_len(2 * self.side, real=True))
@@ -259,11 +240,3 @@ def pruned(kernel: NDArray[np.float64], threshold: float) -> Kernel:
     if (row, col) != (0, 0):
         kept = ndimage.shift(kept, (-row, -col), order=0, mode="constant")
     return as_kernel(kept)
-
-
-def estimate_by_edges(
-    solver: LevelSolver, patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
-) -> PsfEstimate:
-    """Run a method coarse to fine."""
-    views = [View.of(patch, model) for patch, model in usable(patches, noise, size)]
-    return unsure(coarse_to_fine(views, solver, size), size)

@@ -1,7 +1,6 @@
 """The kernel step: least squares over valid convolutions, k >= 0, pooled over any number of images.
 
-Valid means that only pixels count where every pixel of the kernel meets data; nothing wraps. And a solved
-kernel without its specks, and the estimate that it is.
+Valid means that only pixels count where every pixel of the kernel meets data; nothing wraps.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Coarse to fine: the driver that the classic blind methods share.
 
-A wide kernel is a small one on a small copy of the patch. The methods start there, where few pixels
-decide, and hand kernel and latent image up to the next finer level. A method brings one function, its
-alternation on one level; the driver makes the levels and resamples. Everything here commutes with turns by 90
-degrees and mirroring.
+A wide kernel is a small one on a small copy of the patch, where few pixels decide. A method brings its
+alternation on one level. Everything here commutes with turns by 90 degrees and mirroring.
 """
 
 from __future__ import annotations
@@ -17,14 +15,13 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.blind.estimator import usable
 from lensmodel.core.psf import as_kernel, delta, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 Image: TypeAlias = NDArray[np.float64]
 
-RATIO: Final = math.sqrt(0.5)
-"""Size of a level over that of the next finer one, as in the public codes of these methods."""
-
+RATIO: Final = math.sqrt(0.5)  # size of a level over that of the next finer one, as in public codes
 _COARSEST: Final = 5  # pixels: kernels of the coarsest level are not smaller than this (chosen)
 _SMALLEST_IMAGE: Final = 24  # shorter side of the coarsest level in pixels (chosen)
 _REACH: Final = 2  # of the cubic, in pixels of the coarser grid
@@ -46,6 +43,12 @@ class View:
         mean = float(values.mean())
         return cls((values - mean) / span, model.sigma_at(mean) / span)
 
+    @classmethod
+    def of_one(cls, patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int) -> View:
+        """Check and scale the one patch that these methods take."""
+        ((patch, model),) = usable(patches, noise, size)
+        return cls.of(patch, model)
+
     def at(self, shape: tuple[int, ...]) -> View:
         """Return the same patch on another grid; averaging makes its noise smaller."""
         if shape == self.y.shape:
@@ -60,14 +63,11 @@ class Level:
     number: int  # 0 is the finest
     count: int  # how many levels there are
     side: int  # odd side of the kernel on this level
-    views: tuple[View, ...]  # the patches, all of which share the kernel
+    view: View
 
 
-Latents: TypeAlias = tuple[Image, ...]
-"""One latent image for each patch, each of the shape of its view."""
-
-LevelSolver: TypeAlias = Callable[[Level, Kernel, Latents], tuple[Kernel, Latents]]
-"""What a method does on one level, from the kernel `(side, side)` and the images of the coarser one."""
+# what a method does on one level, from the kernel `(side, side)` and the latent image of the coarser one
+LevelSolver: TypeAlias = Callable[[Level, Kernel, Image], tuple[Kernel, Image]]
 
 
 def kernel_sides(side: int, image_side: int) -> tuple[int, ...]:
@@ -81,22 +81,19 @@ def kernel_sides(side: int, image_side: int) -> tuple[int, ...]:
         found.append(smaller)
 
 
-def coarse_to_fine(
-    views: Sequence[View], solve: LevelSolver, side: int, *, start: Kernel | None = None
-) -> Kernel:
+def coarse_to_fine(view: View, solve: LevelSolver, side: int, *, start: Kernel | None = None) -> Kernel:
     """Run a method on every level, coarsest first, up to a kernel of odd `side`; from a point by default."""
-    sides = kernel_sides(side, min(min(view.y.shape) for view in views))
-    count = len(sides)
-    kernel = delta(sides[-1]) if start is None else rescaled(start, RATIO ** (count - 1), sides[-1])
-    latents: Latents = ()
-    for number in reversed(range(count)):
-        small = tuple(view.at(level_shape(view.y.shape, RATIO**number)) for view in views)
-        if number == count - 1:
-            latents = tuple(view.y for view in small)
+    sides = kernel_sides(side, min(view.y.shape))
+    last = len(sides) - 1
+    for number in reversed(range(len(sides))):
+        small = view.at(level_shape(view.y.shape, RATIO**number))
+        if number == last:
+            latent = small.y
+            kernel = delta(sides[-1]) if start is None else rescaled(start, RATIO**last, sides[-1])
         else:
+            latent = resample(latent, small.y.shape)
             kernel = rescaled(kernel, 1.0 / RATIO, sides[number])
-            latents = tuple(resample(x, v.y.shape) for x, v in zip(latents, small, strict=True))
-        kernel, latents = solve(Level(number, count, sides[number], small), kernel, latents)
+        kernel, latent = solve(Level(number, len(sides), sides[number], small), kernel, latent)
         kernel = resized(kernel, sides[number])
     return kernel
 

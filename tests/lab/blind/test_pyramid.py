@@ -7,7 +7,6 @@ from scipy import signal
 from lab.blind.steps.pyramid import (
     RATIO,
     Image,
-    Latents,
     Level,
     View,
     coarse_to_fine,
@@ -91,15 +90,14 @@ def test_levels_go_down_to_the_coarsest_side_or_the_smallest_image() -> None:
 def test_every_level_gets_shapes_that_fit_together() -> None:
     levels: list[Level] = []
 
-    def look(level: Level, kernel: Kernel, latents: Latents) -> tuple[Kernel, Latents]:
+    def look(level: Level, kernel: Kernel, latent: Image) -> tuple[Kernel, Image]:
         assert kernel.shape == (level.side, level.side)
-        assert [x.shape for x in latents] == [v.y.shape for v in level.views]
+        assert latent.shape == level.view.y.shape
         levels.append(level)
-        return kernel, latents
+        return kernel, latent
 
-    views = [View(picture(96, 80), 0.01), View(picture(64, 64), 0.02)]
-    found = coarse_to_fine(views, look, 15, start=gaussian(15, np.eye(2)))
+    found = coarse_to_fine(View(picture(96, 80), 0.01), look, 15, start=gaussian(15, np.eye(2)))
 
     assert [level.number for level in levels] == list(reversed(range(len(levels))))
     assert found.shape == (15, 15)
-    assert all(level.views[0].noise <= 0.01 for level in levels)
+    assert all(level.view.noise <= 0.01 for level in levels)

@@ -6,7 +6,7 @@ from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.zhang import PatchPosterior, pooled_kernel
+from lab.blind.methods.zhang import PatchPosterior
 from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lab.kernels import distance, gaussian
 from lensmodel.core.psf import as_kernel, delta
@@ -56,7 +56,7 @@ def test_every_update_lowers_the_free_energy() -> None:
     for _ in range(6):
         found = found.improved(kernel, 8)
         after_image = free_energy(found, kernel)
-        raw = pooled_kernel(found.weighted(), kernel)
+        raw = found.kernel_step(kernel)
         kernel = as_kernel(raw)
         found = found.scaled(float(raw.sum()))
         after_kernel = free_energy(found, kernel)

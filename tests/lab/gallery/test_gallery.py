@@ -23,8 +23,7 @@ from lab.gallery.figures import (
     overshoots,
     percentile_of_edges,
 )
-from lab.gallery.measure import TILE, bars, measured
-from lab.gallery.page import ZOOM, entries_of, places, sheet, text, write_page
+from lab.gallery.page import TILE, ZOOM, bars, entries_of, measured, places, sheet, text, write_page
 from lab.gallery.pictures import FRAMES, Picture, chosen, real_pictures, rendered, take
 from lab.images import gains
 from lab.kernels import gaussian

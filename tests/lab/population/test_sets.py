@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from lab.population import library, scenes
-from lab.population.grids import grid_of
 from lab.population.photos import Processing, Scenes, bayer, demosaic
 from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
-from lab.population.traced import draw
+from lab.population.traced import draw, grid_of
 from lensmodel.core.psf import KINDS
 from lensmodel.neural.features import FAR_M, relation_features
 from lensmodel.neural.network import SIDE

@@ -472,7 +472,7 @@ REFUSED = {
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
     "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
     "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
-    "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
+    "unknown half": (["bench", "blind", "--half", "x"], 2, "--half must be dev, test or all, got 'x'"),
     "report there": (["report", PROFILE, "-o", "reported"], 2, "report.csv is there already; --force"),
     "export format": (
         ["export", PROFILE, "-o", "new.bmp", "--format", "bmp"],
@@ -573,7 +573,7 @@ def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         (output / "report.md").write_text(f"run {len(runs)}", encoding="utf-8")
         return True
 
-    monkeypatch.setattr("lab.demo.run.run", run)
+    monkeypatch.setattr("lab.demo.run", run)
     return runs
 
 

@@ -9,8 +9,8 @@ from lab.model_benchmark import run_model_benchmark
 
 @pytest.mark.slow
 def test_true_kernels_are_predicted_between_and_beyond_the_patches() -> None:
-    result = run_model_benchmark(seeds=range(2000, 2016), photos=(1, 2, 5), methods=["mode-default"])
-    errors = {row["photos"]: row["errors"] for row in result["rows"]}
+    rows = run_model_benchmark(seeds=range(2000, 2016), photos=(1, 2, 5), methods=["mode-default"])
+    errors = {row["photos"]: row["errors"] for row in rows}
 
     assert errors[1]["corner"] <= 0.25
     assert errors[1]["center"] <= 0.15

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.charts import by_zone, measure_edges
+from lab.images import by_zone, measure_edges
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel
 from lensmodel.quality import find_edges

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage, optimize, special
 
-from lab.charts import by_zone, measure_edges
+from lab.images import by_zone, measure_edges
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame

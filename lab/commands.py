@@ -1,4 +1,4 @@
-"""`lensmodel bench`: accuracy and speed, on the library's material or one's own.
+"""The laboratory's commands, `lensmodel bench` and `lensmodel reproduce`, which exist in the source tree.
 
 The benchmarks are imported where they are run: they need half of SciPy, which no other command should
 wait for.
@@ -6,19 +6,27 @@ wait for.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.files import as_usage, refuse_existing
-from lensmodel.cli.options import Force
+from lensmodel.cli.options import Force, choice
 from lensmodel.core.types import StepHook
+
+PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")  # beside pictures and stored results
+Size = Literal["quick", "default"]
+Half = Literal["dev", "test", "all"]
+DATA = "LENSMODEL_TEST_DATA"
+Output = Annotated[Path, typer.Option("--output", "-o", help="Where to write: a folder.")]
+BENCHMARK = Path("bench-output")  # where `lensmodel bench blind` leaves what Fig. 1 is drawn from
 
 bench = typer.Typer(
     help="""Measure quality and speed.
@@ -37,28 +45,15 @@ bench = typer.Typer(
 def gallery(
     context: typer.Context,
     data: Annotated[
-        Path | None,
-        typer.Option(
-            envvar="LENSMODEL_TEST_DATA",
-            metavar="FOLDER",
-            help="Test data with real photos; without it only simulated frames.",
-        ),
+        Path | None, typer.Option(envvar=DATA, help="Folder of test data with real photos.")
     ] = None,
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", help="Where to write: a folder for page, crops and stored results."),
-    ] = Path("gallery-output"),
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Only pictures whose name contains this; may be repeated."),
-    ] = None,
+    output: Output = Path("gallery-output"),
+    only: Annotated[list[str] | None, typer.Option(help="Only pictures with this in their names.")] = None,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes and threads.")] = 2,
 ) -> None:
     """A page to look at: each picture calibrated from itself and corrected, beside its original.
 
-    Real photos of the test data and simulated frames, with crops at 3:1 and figures. Results are kept by the
-    content of the photo and the version of the code: the same command again goes on where it was, and writes
-    the page of the pictures it was asked for.
+    Results are kept by the content of the photo and the version of the code: the same command again goes on.
 
     Examples:
 
@@ -93,21 +88,17 @@ def told(shown: Display, began: float) -> Callable[[str, int, int], None]:
 def blind(
     context: typer.Context,
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
-    psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = "0.01,0.003",
     methods: Annotated[
         str, typer.Option(help="Estimators, comma separated; also cho-lee, sun, xu-jia and zhang.")
     ] = "default,michaeli-irani",
     cases: Annotated[int | None, typer.Option(help="Largest number of cases.")] = None,
     scenes: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of windows, from the photographs in turn. Default: one of each."),
+        int | None, typer.Option(min=1, help="Windows, from the photographs in turn; default: one of each.")
     ] = None,
-    half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
+    half: Annotated[Half, choice("--half", get_args(Half), "Of photographs and PSFs.")] = "test",
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Where to write: a folder for tables and curves.")
-    ] = Path("bench-output"),
+    output: Output = BENCHMARK,
     force: Force = False,
 ) -> None:
     """Blind PSF estimators on blurred patches with known truth (paper, section 5.1).
@@ -119,7 +110,7 @@ def blind(
 
         lensmodel bench blind --cases 12
 
-        lensmodel bench blind --photos sharp --psfs mine.npz --noise 0.01 --methods default -o mine
+        lensmodel bench blind --photos sharp --noise 0.01 --methods default -o mine
 
         lensmodel bench blind --photos sharp --scenes 80 --half all --cases 200
 
@@ -130,14 +121,10 @@ def blind(
     shown = Display.of(context)
     refuse_existing(*(output / name for name in benchmark.FILES), force=force)
     levels = tuple(_parts("--noise must be numbers such as 0.01,0.003", noise, float))
-    with as_usage():
-        settings = benchmark.BlindBenchmark(
-            photos, psfs, levels, _names(methods), half, cases, scenes=scenes,  # type: ignore[arg-type]  # of half: checked there
-        )  # fmt: skip
     with _bar(shown, "cases") as on_step:
-        report = benchmark.run_blind_benchmark(
-            settings, workers=workers, cache=output / "cache", on_step=on_step
-        )
+        settings = benchmark.BlindBenchmark(photos, levels, _names(methods), half, cases, scenes=scenes)
+        cache = output / "cache"
+        report = benchmark.run_blind_benchmark(settings, workers=workers, cache=cache, on_step=on_step)
     written = benchmark.write_report(report, output)
     shown.result(benchmark.markdown_table(report))
     shown.note("written: " + ", ".join(str(path) for path in written))
@@ -146,9 +133,7 @@ def blind(
 @bench.command()
 def model(
     context: typer.Context,
-    seeds: Annotated[
-        str, typer.Option(metavar="FIRST:LAST", help="Simulated lenses, the last excluded.")
-    ] = "1000:1004",
+    seeds: Annotated[str, typer.Option(help="Of lenses, first:last, the last excluded.")] = "1000:1004",
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
 ) -> None:
@@ -165,10 +150,9 @@ def model(
     shown, words = Display.of(context), "give --seeds like 1000:1004 and --photos like 1,5"
     lenses, counts = range(*_parts(words, seeds, int, ":", 2)), _parts(words, photos, int)
     with _bar(shown, "fits") as on_step:
-        result = run_model_benchmark(
-            seeds=lenses, photos=counts, methods=None if methods is None else _names(methods), on_step=on_step
-        )
-    shown.result(table(result))
+        named = None if methods is None else _names(methods)
+        rows = run_model_benchmark(seeds=lenses, photos=counts, methods=named, on_step=on_step)
+    shown.result(table(rows))
 
 
 @bench.command()
@@ -180,15 +164,9 @@ def correct(
     methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
     repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Runs; the median counts.")] = 1,
-    peers: Annotated[
-        bool, typer.Option("--peers", help="Time G'MIC, RawTherapee and darktable too, where installed.")
-    ] = False,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="Make a RAW photo of a picture: each pixel keeps one colour.")
-    ] = False,
-    roi: Annotated[
-        str | None, typer.Option(metavar="T,L,H,W", help="Only this part, in the cells of the whole photo.")
-    ] = None,
+    peers: Annotated[bool, typer.Option("--peers", help="Time G'MIC, RawTherapee, darktable too.")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Each pixel of a picture keeps one colour.")] = False,
+    roi: Annotated[str | None, typer.Option(metavar="T,L,H,W", help="Only this part.")] = None,
 ) -> None:
     """Time and memory of correcting a photo, and of the Richardson-Lucy step against its peers.
 
@@ -202,10 +180,7 @@ def correct(
 
     Exit status: 0 measured, 1 something failed, 2 wrong usage.
     """
-    from lab.correction.correction_benchmark import (  # noqa: PLC0415 - see the top of the module
-        correct_table,
-        run_correct_benchmark,
-    )
+    from lab.correction import correction_benchmark as timing  # noqa: PLC0415 - see the top of the module
     from lab.peers import PEERS, as_raw  # noqa: PLC0415 - same
     from lensmodel.photo import develop  # noqa: PLC0415 - same
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
@@ -213,24 +188,66 @@ def correct(
     shown = Display.of(context)
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")
-    window = (
-        roi if roi is None else tuple(_parts("--roi must be four whole numbers T,L,H,W", roi, int, length=4))
-    )
+    words = "--roi must be four whole numbers T,L,H,W"
+    window: Any = None if roi is None else tuple(_parts(words, roi, int, length=4))
     developed = develop(photo or demo_data_path("lake.jpg"))
     if raw and developed.cfa is None:
         developed = as_raw(developed.planes)
     with _bar(shown, "methods") as on_step:
-        result = run_correct_benchmark(
-            developed.planes,
-            cfa=developed.cfa,
-            methods=_names(methods),
-            workers=workers,
-            repeats=repeats,
-            peers=PEERS if peers else (),
-            roi=window,
-            on_step=on_step,
-        )
-    shown.result(correct_table(result))
+        result = timing.run_correct_benchmark(
+            developed.planes, cfa=developed.cfa, methods=_names(methods), workers=workers, repeats=repeats,
+            peers=PEERS if peers else (), roi=window, on_step=on_step,
+        )  # fmt: skip
+    shown.result(timing.correct_table(result))
+
+
+def reproduce(
+    context: typer.Context,
+    output: Output = Path("reproduction"),
+    size: Annotated[
+        Size, choice("--size", get_args(Size), "Four lenses on small photos, or ten on 5 megapixels.")
+    ] = "default",
+    lens: Annotated[
+        list[str] | None,
+        typer.Option(help="Seed, or a file of `python -m lab.population grid`; again for more lenses."),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Also the paper's own way, a rival, a target: hours.")
+    ] = False,
+    assert_bars: Annotated[bool, typer.Option("--assert-bars", help="Fail where a bar is missed.")] = False,
+    force: Force = False,
+) -> None:
+    """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
+
+    Finished results are kept: a run that was stopped goes on, and a change of code or settings computes anew.
+    A finished page is replaced only with --force.
+
+    Examples:
+
+        lensmodel reproduce --size quick -o reproduction
+
+        lensmodel reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses
+
+    Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 wrong usage.
+    """
+    shown = Display.of(context)
+    refuse_existing(*(output / name for name in PAGE), force=force)
+    from lab.reproduce.cases import planned  # noqa: PLC0415 - see the top of the module
+    from lab.reproduce.job import run_reproduction  # noqa: PLC0415 - same
+    from lab.reproduce.page import collected, write_json, write_page  # noqa: PLC0415 - same
+    from lab.reproduce.tables import missed  # noqa: PLC0415 - same
+
+    sharp = Path(os.environ.get(DATA, "nowhere")) / "sharp"
+    scenes = sharp if sharp.is_dir() else None
+    plan = planned(size, scenes=scenes, lenses=lens or (), compare=compare)
+    on_work = told(shown, time.monotonic())
+    result = run_reproduction(plan, output, on_work=on_work, workers=os.cpu_count() or 1)
+    result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
+    written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
+    shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
+    if assert_bars and (lines := missed(result)):
+        shown.error("\n".join(["these bars are missed:", *lines]))
+        raise typer.Exit(1)
 
 
 @contextmanager

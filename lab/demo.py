@@ -1,7 +1,4 @@
-"""The demo from start to end, over HTTP as any other user of the service, measured against the truth.
-
-Photos are taken by a simulated lens whose true blur no service saw.
-"""
+"""`lensmodel demo`: from start to end over HTTP, as any other user, measured against the truth."""
 
 from __future__ import annotations
 
@@ -17,53 +14,85 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import httpx2
 import numpy as np
 import tifffile
+import typer
 from PIL import Image
 
 from app.client import Client
 from app.schemas import CorrectionOut, JobOut, PhotoOut
-from lab.charts import ZoneSharpness, by_zone, measure_edges
-from lab.images import Picture, as_shown, fidelity, side_by_side
+from lab.images import ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, strip
 from lab.kernels import distance
 from lab.scenes import photograph_of
-from lensmodel.cli.console import mtf50_words
+from lensmodel.cli.console import Display, mtf50_words
+from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone
 from lensmodel.photo import develop
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
 
-LENS: Final = draw_lens(2024, "soft-fast")
-"""The lens of the demo (seed chosen: any number); nothing in the project was tuned on it."""
-
-CAMERA: Final = SimulatedCamera(height=896, width=1456)
-"""1.3 megapixels, base ISO; every scene covers its frame."""
-
-SETTINGS: Final = LensSettings(aperture=LENS.at_focal().f_number, focal_mm=LENS.focal_mm[0])
-"""Of all its photos: wide open."""
+FILES: Final = frozenset(
+    {"before-after.png", "corrected.tif", "report.md", "service.log"}
+)  # what a demo leaves in its folder
+LENS: Final = draw_lens(2024, "soft-fast")  # seed chosen: any number; nothing was tuned on it
+CAMERA: Final = SimulatedCamera(height=896, width=1456)  # every scene covers its frame
+SETTINGS: Final = LensSettings(aperture=LENS.at_focal().f_number, focal_mm=LENS.focal_mm[0])  # wide open
 
 LEARN_FROM: Final = ("city", "lake", "tea-gardens")
 HELD_OUT, CHART = "colosseum", "chart"
 
 _START_SECONDS = 90.0
-_STOP_SECONDS = 40.0
-"""Longest waits for the service to start and to stop (chosen): it kills its members after 15 s."""
-
-PATIENCE_SECONDS = 900.0
-"""Longest wait for one job (chosen): far longer than one takes, on a slow machine too."""
-
-Say = Callable[[str], None]
-"""Takes one line of progress."""
-
+_STOP_SECONDS = 40.0  # longest wait for it to stop (chosen): it kills its members after 15 s
+PATIENCE_SECONDS = 900.0  # longest wait for one job (chosen): far longer than one takes
+Say = Callable[[str], None]  # takes one line of progress
 _MARGIN: Final = 18  # pixels by which every photograph exceeds the frame
 _CHART: Final = edge_chart(CAMERA.frame)
 _SIDE: Final = 180  # pixels of a crop (chosen)
 
-Zones = Mapping[Zone, float]
+
+def demo(
+    context: typer.Context,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Where to write: a folder for the pictures and the report."
+        ),
+    ] = Path("demo-output"),
+    force: Annotated[bool, typer.Option("--force", help="Use a folder that holds other files too.")] = False,
+) -> None:
+    """Run the whole process on a simulated lens whose true blur is known.
+
+    Starts a service of its own, uploads photos, calibrates their lens, corrects a photo, measures,
+    and stops the service: some minutes on two cores. What an earlier demo left in the folder
+    is renewed; a folder with anything else in it is refused without --force.
+
+    Example:
+
+        lensmodel demo --output demo-output
+
+    Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 wrong usage.
+    """
+    shown = Display.of(context)
+    _refuse_what_others_wrote(output, force=force)
+    began = time.monotonic()
+    improved = run(output, lambda text: shown.progress_line(text, time.monotonic() - began))
+    shown.result((output / "report.md").read_text(encoding="utf-8"))
+    if not improved:
+        shown.error("the corrected photo did not become better; see the report")
+        raise typer.Exit(1)
+
+
+def _refuse_what_others_wrote(folder: Path, *, force: bool) -> None:
+    """Make sure that the folder holds nothing but what a demo leaves there."""
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file; give a folder to -o")
+    for path in sorted(folder.glob("*")):
+        if not force and path.name not in FILES:
+            raise UsageError(f"{path} is not of a demo; give a new folder to -o, or --force")
 
 
 def run(output: Path, say: Say) -> bool:
@@ -73,20 +102,15 @@ def run(output: Path, say: Say) -> bool:
     with tempfile.TemporaryDirectory(prefix="lensmodel-demo-") as folder:
         work = Path(folder)
         say(f"Photographing 5 scenes through the simulated lens {LENS.model} ...")
-        sharp = {
-            name: _taken(name, work, number) for number, name in enumerate((*LEARN_FROM, HELD_OUT, CHART))
-        }
+        names = enumerate((*LEARN_FROM, HELD_OUT, CHART))
+        sharp = {name: _taken(name, work, number) for number, name in names}
         say("Starting the service ...")
         with own_service(work / "data", output / "service.log") as client:
             improved, tables = _learned(client, work, sharp[HELD_OUT], output, say)
             say("Stopping the service ...")
-    text = _REPORT.format(
-        lens=LENS.model,
-        aperture=f"{SETTINGS.aperture:g}",
-        verdict="better" if improved else "NOT better",
-        seconds=f"{time.monotonic() - began:.0f}",
-        **tables,
-    )
+    tables |= {"verdict": "better" if improved else "NOT better", "lens": LENS.model}
+    tables |= {"seconds": f"{time.monotonic() - began:.0f}", "aperture": f"{SETTINGS.aperture:g}"}
+    text = _REPORT.format(**tables)
     (output / "report.md").write_text(text, encoding="utf-8")
     say(f"Report: {output / 'report.md'}")
     return improved
@@ -129,7 +153,9 @@ def _learned(
     say(f"Correcting {HELD_OUT} as a picture to look at")
     shutil.copy(_corrected(client, held_out, work, say), output / "corrected.tif")
     seen, shown = (as_shown(planes, CAMERA.white_balance) for planes in (before, after))
-    _draw(seen, shown, output / "before-after.png")
+    between = np.full_like(strip(seen, _SIDE)[:6], 255)
+    rows_shown = np.concatenate([strip(seen, _SIDE), between, strip(shown, _SIDE)])
+    Image.fromarray(rows_shown).save(output / "before-after.png", optimize=True)
     improved = last["center"] > first["center"] and last["corner"] > first["corner"]
     return improved, {"learned": "\n".join(rows), "edges": _edge_rows(*edges)}
 
@@ -147,7 +173,7 @@ def _planes(path: Path) -> Planes:
     return np.ascontiguousarray(pixels, dtype=np.float32) / np.float32(65535.0)
 
 
-def _psf_error(client: Client, lens_id: str, version: int) -> Zones:
+def _psf_error(client: Client, lens_id: str, version: int) -> Mapping[Zone, float]:
     """Median relative L2 error of the served green PSFs in each zone, after sub-pixel alignment."""
     errors: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
     for r, count in ((0.05, 1), (0.2, 3), (0.45, 4), (0.6, 4), (0.85, 4)):  # not where patches lie
@@ -159,7 +185,7 @@ def _psf_error(client: Client, lens_id: str, version: int) -> Zones:
     return {zone: float(np.median(values)) for zone, values in errors.items()}
 
 
-def _psnr(planes: Planes, truth: Planes) -> Zones:
+def _psnr(planes: Planes, truth: Planes) -> Mapping[Zone, float]:
     gains = np.asarray(CAMERA.white_balance, dtype=np.float32)[:, None, None]
     return fidelity(planes * gains, truth * gains, CAMERA.frame)
 
@@ -168,7 +194,7 @@ def _sharpness(planes: Planes) -> dict[Zone, ZoneSharpness]:
     return by_zone(measure_edges(planes[1], [edge.box for edge in _CHART.edges]))
 
 
-def _cells(values: Zones) -> str:
+def _cells(values: Mapping[Zone, float]) -> str:
     return " / ".join(f"{values[zone]:.2f}" for zone in ZONES)
 
 
@@ -181,35 +207,6 @@ def _edge_rows(before: Mapping[Zone, ZoneSharpness], after: Mapping[Zone, ZoneSh
     )
 
 
-def _draw(before: Picture, after: Picture, path: Path) -> None:
-    """Write crops of both pictures where the second has most detail, enlarged twice."""
-    places = _detailed(after)
-    above, below = (
-        side_by_side([p[r : r + _SIDE, c : c + _SIDE].repeat(2, 0).repeat(2, 1) for r, c in places])
-        for p in (before, after)
-    )
-    between = np.full_like(above[:6], 255)
-    Image.fromarray(np.concatenate([above, between, below])).save(path, optimize=True)
-
-
-def _detailed(picture: Picture, count: int = 3) -> list[tuple[int, int]]:
-    """Top left corners of the windows with the steepest steps that do not overlap, from left to right."""
-    grey = picture.mean(axis=2)
-    steep = np.abs(np.diff(grey, axis=0))[:, :-1] + np.abs(np.diff(grey, axis=1))[:-1]
-    sums = np.pad(steep.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    inside = sums[_SIDE:, _SIDE:] - sums[:-_SIDE, _SIDE:] - sums[_SIDE:, :-_SIDE] + sums[:-_SIDE, :-_SIDE]
-    found = []
-    for _ in range(count):
-        row, col = (int(place) for place in np.unravel_index(inside.argmax(), inside.shape))
-        inside[max(row - _SIDE, 0) : row + _SIDE, max(col - _SIDE, 0) : col + _SIDE] = -1.0
-        found.append((row, col))
-    return sorted(found, key=lambda place: place[1])
-
-
-class ServiceDidNotStartError(LensModelError):
-    """The service ended, or was not ready in time; the text says where its log is."""
-
-
 @contextmanager
 def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None = None) -> Iterator[Client]:
     """Start the real service on a free loopback port, wait until it is ready, and stop it at the end."""
@@ -217,12 +214,8 @@ def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None =
     environment |= settings or {}
     data.mkdir(parents=True, exist_ok=True)
     with log_file.open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "lensmodel", "serve", "--port", "0", "--data", str(data)],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env=environment,
-        )
+        words = [sys.executable, "-m", "lensmodel", "serve", "--port", "0", "--data", str(data)]
+        process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, env=environment)
     try:
         with Client(_ready(process, data, log_file), key="") as client:  # nobody is asked here
             yield client
@@ -246,7 +239,7 @@ def _ready(process: subprocess.Popen[bytes], data: Path, log_file: Path) -> str:
         time.sleep(0.2)
     status = process.poll()
     became = f"was not ready within {_START_SECONDS:g} s" if status is None else f"ended with status {status}"
-    raise ServiceDidNotStartError(f"the service {became}; {log_file} says why")
+    raise LensModelError(f"the service {became}; {log_file} says why")
 
 
 def follow(client: Client, work: PhotoOut | CorrectionOut, say: Say) -> JobOut:
@@ -272,9 +265,7 @@ calibrated with became **{verdict}** in centre and corner.
 {learned}
 
 PSF error: relative L2 distance to the true green PSF after sub-pixel alignment, median of the zone; 0 is
-perfect. PSNR: sRGB-encoded picture against the sharp scene, each block of 128 pixels at its best shift,
-before and after alike: a PSF's centre of mass may lie beside its core, which displaces the picture smoothly
-but does not blur it.
+perfect. PSNR: sRGB-encoded picture against the sharp scene, each block of 128 pixels at its best shift.
 
 | slanted edges of a chart | MTF50 before | MTF50 after | highest MTF after | overshoot after |
 | --- | --- | --- | --- | --- |

@@ -239,9 +239,6 @@ def _gain(old: float, new: float) -> float:
     return 10.0 * math.log10(max(old, _LEAST_ERROR) / max(new, _LEAST_ERROR))
 
 
-# --- sharpness of a photographed chart, edge by edge and zone by zone ---------------------------
-
-
 class EdgeMeasurement(NamedTuple):
     """One measured edge of a chart."""
 

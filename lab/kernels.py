@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +17,15 @@ def gaussian(size: int, covariance: npt.ArrayLike) -> Kernel:
     """Gaussian kernel of a covariance in px², axes (row, col), integrated over the pixel: 5 x 5 samples."""
     over = 5
     cov = np.asarray(covariance, dtype=np.float64) + np.eye(2) * 1e-4
-    half = (size * over) // 2
-    t = np.arange(-half, half + 1) / over
+    t = (np.arange(size * over) - size * over // 2) / over
     inverse = np.linalg.inv(cov)
     rows, cols = t[:, None], t[None, :]
-    fine = np.exp(
-        -0.5 * (inverse[0, 0] * rows**2 + 2 * inverse[0, 1] * rows * cols + inverse[1, 1] * cols**2)
-    )
+    power = inverse[0, 0] * rows**2 + 2 * inverse[0, 1] * rows * cols + inverse[1, 1] * cols**2
+    fine = np.exp(-0.5 * power)
     return as_kernel(fine.reshape(size, over, size, over).sum(axis=(1, 3)))
 
 
-@dataclass(frozen=True, slots=True)
-class KernelDistance:
+class KernelDistance(NamedTuple):
     """How far one kernel is from another after the best sub-pixel shift."""
 
     ncc: float  # normalised cross-correlation; 1 for equal shapes
@@ -38,11 +35,9 @@ class KernelDistance:
 
 
 def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDistance:
-    """Compare kernel `a` with the reference `b`, both normalised, sub-pixel aligned.
+    """Compare kernel `a` with the reference `b` by the peak c of their correlation, both normalised.
 
-    By Parseval the peak c of their correlation yields both figures at once::
-
-        ncc = c / (|a| |b|)        rel_l2² = (|a|² + |b|² - 2 c) / |b|²
+    By Parseval, ncc = c / (|a| |b|) and rel_l2² = (|a|² + |b|² - 2 c) / |b|².
     """
     a, b = a / a.sum(), b / b.sum()
     n = int(scipy.fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
@@ -52,13 +47,9 @@ def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDi
     aa, bb = float((a * a).sum()), float((b * b).sum())
     freq = scipy.fft.fftfreq(n)
     inside = np.hypot(freq[:, None], freq[None, :]) <= 0.5
-    difference = (np.abs(fa) - np.abs(fb))[inside]
-    return KernelDistance(
-        ncc=c / math.sqrt(aa * bb),
-        rel_l2=math.sqrt(max(aa + bb - 2 * c, 0.0) / bb),
-        mtf_rmse=float(np.sqrt(np.mean(difference**2))),
-        shift=(-peak[0], -peak[1]),
-    )
+    mtf_rmse = float(np.sqrt(np.mean((np.abs(fa) - np.abs(fb))[inside] ** 2)))
+    rel_l2 = math.sqrt(max(aa + bb - 2 * c, 0.0) / bb)
+    return KernelDistance(c / math.sqrt(aa * bb), rel_l2, mtf_rmse, (-peak[0], -peak[1]))
 
 
 def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.complex128]:

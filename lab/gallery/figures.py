@@ -1,7 +1,6 @@
 """What can be seen of a corrected picture beside its original, with no truth and none of the product's code.
 
-Everything is measured on pictures as shown: sRGB-encoded, because a fault counts by how it looks.
-Nothing here imports the library: what judges it must not share its errors.
+Pictures are as shown, sRGB-encoded, because a fault counts by how it looks. Nothing here imports the library.
 """
 
 from __future__ import annotations
@@ -17,11 +16,9 @@ STANDS_OUT: Final = 0.06  # fifteen of 255: chosen as what one sees at a glance 
 COLOURED: Final = 0.12  # distance of chromaticity (chosen): a cast that one names without comparison
 HUE_REACH: Final = 3  # pixels around a place whose colours it may take: as far as lateral colour moves them
 
+# least curvature that a point of contrast 1 leaves when it is blurred, after a Gaussian of one pixel: behind
+# one of s pixels it is 1 / (2 pi (1 + s^2)^2): .072 at s = .7, .027 at 1.2, .0064 at 2
 TRACE: Final = 0.006
-"""Least curvature that a point of contrast 1 leaves when it is blurred, after a Gaussian of one pixel.
-
-Behind a Gaussian of s pixels it is 1 / (2 pi (1 + s^2)^2): .072 at s = .7, .027 at 1.2, .0064 at 2.
-"""
 
 BANDS: Final = {"coarse": (0.06, 0.15), "middle": (0.15, 0.3), "fine": (0.3, 0.5)}  # cycles per pixel
 _FAR: Final = 2.0  # ranges beyond the range of a dot (chosen): with 1.5 correct twigs and letters had dots
@@ -29,8 +26,8 @@ _HINT: Final = 0.1  # share of a colour that the original must have there for it
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 _BLOCK: Final = 32  # pixels of a square whose grain is taken: holds two periods of `BANDS` (chosen)
+# power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20
 _SPECTRUM_OF_GRAIN: Final = 8.0
-"""Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
 _FLAT_SHARE: Final = 0.1  # of the squares, the flattest; so many at least (chosen: medians of fewer jump)
 _FLAT_BLOCKS: Final = 8
 _LEAST_GRAIN: Final = 1e-3  # standard deviation below which a place holds rounding to eight bits

@@ -212,8 +212,6 @@ def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
     return page.write(output / "index.md", "Gallery")[1]
 
 
-# --- the figures of one picture, tile by tile, and which bars they keep ---
-
 TILE: Final = 1024  # side of a tile: a multiple of the squares of the figures; bounds the memory
 
 OVERSHOOT_PERCENT: Final = 12.0

@@ -181,8 +181,6 @@ def chosen(pictures: Sequence[Picture], only: Sequence[str]) -> list[Picture]:
     return [p for p in pictures if not only or any(text in p.name for text in only)]
 
 
-# --- calibrated from themselves and corrected by default, unless that is stored ---
-
 BEFORE, AFTER = "before.npy", "after.npy"  # pictures as stored, rendered
 ANY_APERTURE: Final = 5.6  # of photos that do not say theirs (chosen): of no effect where one photo is all
 

@@ -24,16 +24,8 @@ from torch.nn import functional
 from lab.images import zone_masks
 from lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.core.files import write_atomically
-from lensmodel.neural import FieldNetwork
-from lensmodel.neural.features import (
-    CONDITION,
-    DISTANCES,
-    PLACE,
-    RELATION,
-    condition_features,
-    place_features,
-    relation_features,
-)
+from lensmodel.neural import FieldNetwork, features
+from lensmodel.neural.features import CONDITION, DISTANCES, PLACE, RELATION
 from lensmodel.neural.network import BLOCK, COARSE, FINE, RINGS, outer_cells
 from lensmodel.neural.statistics import LENGTH
 
@@ -218,12 +210,12 @@ def collate(sets: list[Set]) -> dict[str, Tensor]:
     apart = (photo[:, :, None] != photo[:, None]) | missing[:, None]
     out = {
         "statistics": padded([s.statistics for s in sets]),
-        "place": place_features(xy),
-        "condition": condition_features(settings),
-        "among": relation_features(xy, settings, xy, settings),
-        "query_place": place_features(query_xy),
-        "query_condition": condition_features(query_settings),
-        "relation": relation_features(query_xy, query_settings, xy, settings),
+        "place": features.place_features(xy),
+        "condition": features.condition_features(settings),
+        "among": features.relation_features(xy, settings, xy, settings),
+        "query_place": features.place_features(query_xy),
+        "query_condition": features.condition_features(query_settings),
+        "relation": features.relation_features(query_xy, query_settings, xy, settings),
         "truth": np.stack([s.truth for s in sets]).astype(np.float32),
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in out.items()}

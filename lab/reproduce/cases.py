@@ -211,7 +211,6 @@ def _lens(text: str) -> tuple[int, Path | None]:
     return _TRACED_FROM + int(hashlib.sha256(design.encode()).hexdigest(), 16) % _TRACED, Path(text)
 
 
-# --- frames composed of sharp photographs -------------------------------------------------------
 # The photographs of the held-out photo serve in no other. Where there are few of them, those that the lens is
 # learned from serve again, mirrored and in another place of the frame.
 
@@ -284,8 +283,6 @@ def _part(path: Path, layout: Layout, use: int) -> Planes:
         scene = np.rot90(scene, axes=(1, 2))
     return middle(scene, *layout.tile)[:, :: -1 if use & 2 else 1, :: -1 if use & 1 else 1]
 
-
-# --- photos: kept, and taken again only if lens, frame or photographs change ---
 
 Container: TypeAlias = Literal["dng", "tiff", "jpeg"]
 

@@ -40,7 +40,6 @@ def draw(plan: Reproduction, photos: Path, folder: Path, name: str, *, workers: 
     }
 
 
-# --- Fig. 2: what efficient filter flow applies between its PSFs, beside regressions, fed with true PSFs ---
 # The flow's PSFs stand on a regular grid of 4 x 6 windows with half overlap and Bartlett-Hann slopes, as the
 # paper has it; the regressions see as many, one at a random place of each window.
 

@@ -20,19 +20,7 @@ from PIL import Image
 from lab.cases import photo_half
 from lab.images import as_shown, strip
 from lab.reproduce import cases, figures, measure
-from lab.reproduce.cases import (
-    BEFORE,
-    MEASURED,
-    RIVAL,
-    TRUE,
-    Case,
-    Container,
-    Reproduction,
-    Shots,
-    in_container,
-    learned,
-    take,
-)
+from lab.reproduce.cases import BEFORE, Case, Container, Reproduction, Shots, learned, take
 from lab.reproduce.fields import general_field, general_words, measured_field
 from lab.reproduce.measure import Place, Roi
 from lab.schuler import Schuler
@@ -157,17 +145,17 @@ class CaseJob:
         before = measure.state(chart, photo, shots, self.case)
         before["light"] = measure.light(photo, shots, self.case)
         pictures = {"before": self._picture("before", photo), "scene": self._picture("scene", shots.truth())}
-        true = self._corrected(self.case.truth(), TRUE, "true")
+        true = self._corrected(self.case.truth(), cases.TRUE, "true")
         return {"states": {BEFORE: before, **true["states"]}, "pictures": pictures | true["pictures"]}
 
     def _path(self, container: Container) -> Unit:
         """What becomes of the first and the held-out photo as files of another kind, learned from the one."""
-        first, asked = (in_container(p, container) for p in (self.shots.learn[0], self.shots.held_out))
+        first, asked = (cases.in_container(p, container) for p in (self.shots.learn[0], self.shots.held_out))
         photo, learner = develop(asked), Learner(PRESETS["default"], self.workers)
         refused = learner.learn([first])
         true = corrected_with(photo, self.case.truth(), self._parts, workers=self.workers)
         after = photo.planes if refused else learner.corrected(asked, self._parts)[0]
-        states = {BEFORE: photo.planes, TRUE: true, "after": after}
+        states = {BEFORE: photo.planes, cases.TRUE: true, "after": after}
         made = {name: measure.state(None, v, self.shots, self.case, raw=False) for name, v in states.items()}
         picture = self._picture(container, after, raw=False)
         return {"paths": {container: made}, "pictures": {container: picture}}
@@ -178,8 +166,8 @@ class CaseJob:
         try:
             field = measured_field(self.case, self.shots.held_out.with_name("target.dng"))
         except LensModelError as error:  # frames too small for a page: the row is left out
-            return {"refused": {MEASURED: [str(error)]}}
-        return self._by_field(field, time.monotonic() - began, MEASURED, "measured")
+            return {"refused": {cases.MEASURED: [str(error)]}}
+        return self._by_field(field, time.monotonic() - began, cases.MEASURED, "measured")
 
     def _rival(self) -> Unit:
         """What the rival makes of the first photo, corrected by our method."""
@@ -187,8 +175,8 @@ class CaseJob:
         try:
             field = Schuler().field(develop(self.shots.learn[0]))
         except LensModelError as error:
-            return {"states": {RIVAL: self._before}, "refused": {RIVAL: [str(error)]}}
-        return self._by_field(field, time.monotonic() - began, RIVAL, "schuler")
+            return {"states": {cases.RIVAL: self._before}, "refused": {cases.RIVAL: [str(error)]}}
+        return self._by_field(field, time.monotonic() - began, cases.RIVAL, "schuler")
 
     def _by_field(self, field: PsfField, seconds: float, name: str, label: str) -> Unit:
         """Errors of a PSF field, and what corrections with it come to."""
@@ -241,9 +229,6 @@ class CaseJob:
         crops = strip(as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name
-
-
-# --- what is under test: from photo files to a lens model and to corrected photos, as a user goes ---
 
 
 def paper_way(case: Case) -> Config:

@@ -157,9 +157,6 @@ def number(value: float | None, digits: int = 0) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-# --- what is asked of the whole chain, each bar with its value and whether it holds ---
-
-
 class Asked(NamedTuple):
     """What is asked (chosen) of a number of photos; where there are three limits, of the three zones."""
 

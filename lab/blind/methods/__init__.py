@@ -1,7 +1,4 @@
-"""The blind methods of others that the paper compares with: for benchmarks, not for users.
-
-`compared` knows them beside those of the product; `lensmodel bench blind --methods zhang,sun` runs them.
-"""
+"""The blind methods of others that the paper compares with: for benchmarks, not for users."""
 
 from collections.abc import Sequence
 from typing import Final, Protocol

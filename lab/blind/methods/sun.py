@@ -4,9 +4,6 @@ The latent image is drawn towards sharp edge patterns where there are edges, and
 the kernel comes from its gradients on the edges. Source: L. Sun, S. Cho, J. Wang and J. Hays,
 "Edge-based blur kernel estimation using patch priors", ICCP 2013, with the synthetic prior.
 
-On mild blur the prior's own sharpness decides the width of the kernel: it is as sharp as a pixel
-allows, which few photographs are.
-
 A window of 5 px on an edge is q = σ z + μ: its own mean μ, a pattern z of zero mean and unit norm, and a
 contrast σ. The patterns are ideal steps, bars and corners; the contrasts follow the distribution that
 edges of sharp scenes have. The paper matches σ itself, in display values; linear light has no such common

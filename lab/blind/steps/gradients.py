@@ -41,8 +41,7 @@ def across(image: Image) -> Image:
 def shock_filtered(image: Image, dt: float, steps: int = 1) -> Image:
     """Sharpen edges to steps, I <- I - sign(laplacian I) |grad I| dt; stable for dt <= .7.
 
-    Source: S. Osher and L. I. Rudin, "Feature-oriented image enhancement using shock filters", SIAM J. Numer.
-    Anal. 27, 1990, eq. (2.19).
+    Source: S. Osher and L. I. Rudin, SIAM J. Numer. Anal. 27, 1990, eq. (2.19).
     """
     sharp = image
     for _ in range(steps):

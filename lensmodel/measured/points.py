@@ -6,14 +6,15 @@ field turns all its points, each at its own phase, into the pixels that were mea
     y_i(p) = f_i sum_u k(u) sinc(p - u - c_i) + b_i
 
 So points at many phases are stacked without interpolating a photo, and pixels of a mosaic that saw another
-colour are left out. Places c_i and fluxes f_i are refined between two solutions for k. A point with one
-saturated pixel is refused whole: its neighbours hold what ran over. Each pixel is weighted by its own noise,
-from the sky and the light that the previous kernel predicts there: most pixels of a point are dark, so that
-the mean noise is right for none of them.
+colour are left out. Places c_i and fluxes f_i are refined as long as that explains more of the light; what is
+left of it joins the expected error. A point with one saturated pixel is refused whole: its neighbours hold
+what ran over. Each pixel is weighted by its own noise, from the sky and the light that the previous kernel
+predicts there: most pixels of a point are dark, so that the mean noise is right for none of them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -141,11 +142,15 @@ def _cell_psf(
     if len(stamps) < _FEWEST:
         raise NotEnoughEvidenceError("fewer lights than a cell must have are seen in this colour")
     solved = _stacked(stamps, size, None)
+    left = _unexplained(stamps, solved)
     for _ in range(_ROUNDS - 1):
-        kernel = np.asarray(solved.kernel)
-        stamps = [_refined(stamp, kernel) for stamp in stamps]
-        solved = _stacked(stamps, size, kernel)
-    error = float(np.hypot(solved.error, FLOOR))
+        # sharper than pixels, lights are no sums of sincs, and the centres that suit sincs best are wrong
+        moved = [_refined(stamp, solved.kernel) for stamp in stamps]
+        again = _stacked(moved, size, solved.kernel)
+        if (rest := _unexplained(moved, again)) >= left:
+            break
+        stamps, solved, left = moved, again, rest
+    error = math.hypot(solved.error, FLOOR, left)
     weights = np.array([stamp.flux for stamp in stamps])
     middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=weights)
     return psf_at(photo, channel, centred(solved.kernel), middle, size, error, _SURE)
@@ -176,6 +181,17 @@ def _stacked(stamps: Sequence[_Stamp], size: int, kernel: NDArray[np.float64] | 
         light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
         variance[rows] = stamp.window.shot * (stamp.sky + np.maximum(light, 0.0)) + stamp.window.read
     return solve(observed, latent, measured, variance, size, even=True)
+
+
+def _unexplained(stamps: Sequence[_Stamp], solved: Solved) -> float:
+    """Return what a kernel leaves of the lights beyond their noise, as a relative L2."""
+    rest, power = 0.0, 0.0
+    for stamp in stamps:
+        good, light = stamp.window.measured, stamp.blurred(solved.kernel * solved.light)
+        noise = stamp.window.shot * (stamp.sky + np.maximum(light, 0.0)) + stamp.window.read
+        rest += float((np.square(stamp.observed - light) - noise)[good].sum())
+        power += float(np.square(stamp.observed[good]).sum())
+    return math.sqrt(max(rest, 0.0) / power)
 
 
 def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from scipy import ndimage, signal
+from scipy import ndimage, signal, stats
 
 from lab import targets
 from lab.kernels import distance, gaussian
@@ -346,6 +346,23 @@ def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
     bright = photo_of(40.0 * scene, lopsided())
     with pytest.raises(NotEnoughEvidenceError, match="expose less"):
         Points().measure([bright], size=21)
+
+
+def test_points_sharper_than_pixels_state_what_their_kernel_does_not_explain() -> None:
+    def seen_by_pixels(off: float) -> NDArray[np.float64]:  # a Gaussian of .3 pixels, gathered by each pixel
+        return np.diff(stats.norm.cdf(np.arange(-10.5, 11.0) - off, scale=0.3))
+
+    rng = np.random.default_rng(0)
+    scene = np.full([n + 2 * targets.MARGIN for n in SHAPE], 0.003)
+    for row in range(targets.MARGIN + 30, SHAPE[0], 56):
+        for col in range(targets.MARGIN + 30, SHAPE[1], 56):
+            light = np.outer(seen_by_pixels(rng.uniform(-0.5, 0.5)), seen_by_pixels(rng.uniform(-0.5, 0.5)))
+            scene[row - 10 : row + 11, col - 10 : col + 11] += 0.5 * light
+    found = Points(across=2, down=1).measure([photo_of(scene, np.ones((1, 1)))], size=21, channels=("g",))
+    truth = np.outer(seen_by_pixels(0.0), seen_by_pixels(0.0))
+    for one in found:
+        seen = distance(one.kernel, truth).rel_l2
+        assert 0.5 < one.error / seen < 2.0
 
 
 @pytest.mark.parametrize("across", [7, 1])

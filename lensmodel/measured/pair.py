@@ -33,7 +33,7 @@ from scipy import fft, ndimage
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import block_means
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require
 from lensmodel.measured.registration import Warp, match, matched
 from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
@@ -94,7 +94,9 @@ class AperturePair:
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
         return at_each(
             corners, channels,
-            lambda corner, channel: self._window(opened, closed, warp, corner, size, channel), on_step,
+            lambda corner, channel: self._window(
+                closed, warp, Window.of(opened, channel, corner, self.side), size
+            ), on_step,
             none="no part of the pair determines a PSF; photograph a scene with fine detail everywhere, "
             "flat and in focus",
         )  # fmt: skip
@@ -129,18 +131,10 @@ class AperturePair:
             )  # fmt: skip
         return warp
 
-    def _window(
-        self,
-        opened: LinearPhoto,
-        closed: LinearPhoto,
-        warp: Warp,
-        corner: tuple[int, int],
-        size: int,
-        channel: Channel,
-    ) -> MeasuredPsf:
+    def _window(self, closed: LinearPhoto, warp: Warp, window: Window, size: int) -> MeasuredPsf:
         """PSF of one window."""
-        around, window = size // 2, Window.of(opened, channel, corner, self.side)
-        scene = _Scene(closed, warp, corner, self.side, around, channel)
+        around = size // 2
+        scene = _Scene(closed, warp, window, around)
         light = _falloff(window, scene, around)
 
         def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
@@ -150,8 +144,7 @@ class AperturePair:
 
         noise = scene.noise(size) - scene.alias(latent((0.0, 0.0), 0), size)
         kernel, solved, _ = window_psf(window, latent, size, latent_noise=noise)
-        middle, error = np.add(corner, (self.side - 1) / 2.0), float(np.hypot(solved.error, FLOOR))
-        return psf_at(opened, channel, kernel, middle, self.side, error, _SURE)
+        return window.psf(kernel, solved.error, FLOOR, _SURE)
 
 
 def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
@@ -175,23 +168,15 @@ class _Scene:
     function that is real and even.
     """
 
-    def __init__(
-        self,
-        closed: LinearPhoto,
-        warp: Warp,
-        corner: tuple[int, int],
-        side: int,
-        around: int,
-        channel: Channel,
-    ) -> None:
-        self._warp = warp
-        self._rows = corner[0] - around + np.arange(side + 2 * around)
-        self._cols = corner[1] - around + np.arange(side + 2 * around)
+    def __init__(self, closed: LinearPhoto, warp: Warp, window: Window, around: int) -> None:
+        self._warp, self._channel = warp, window.channel
+        pixels = np.arange(-around, len(window.light) + around)
+        self._rows, self._cols = (at + pixels for at in window.corner)
         known = closed.info.metadata
         self._f_number = known.aperture or USUAL_F_NUMBER
-        self._pitch_um, self._channel = known.pixel_pitch_um or _USUAL_PITCH_UM, channel
+        self._pitch_um = known.pixel_pitch_um or _USUAL_PITCH_UM
         self._mosaic = closed.cfa is not None
-        index = CHANNELS.index(channel)
+        index = CHANNELS.index(window.channel)
         rows, cols = self._places((0.0, 0.0))
         top, left = (max(int(at.min()) - _SPARE, 0) for at in (rows, cols))
         bottom, right = int(rows.max()) + _SPARE + 1, int(cols.max()) + _SPARE + 1

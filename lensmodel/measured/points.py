@@ -179,7 +179,8 @@ def _stacked(stamps: Sequence[_Stamp], size: int, kernel: NDArray[np.float64] | 
         rows = slice(number * (2 * size - 1), number * (2 * size - 1) + size)
         observed[rows], measured[rows] = stamp.observed, stamp.window.measured
         light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
-        variance[rows] = stamp.window.shot * (stamp.sky + np.maximum(light, 0.0)) + stamp.window.read
+        noise = stamp.window.noise
+        variance[rows] = noise.shot * (stamp.sky + np.maximum(light, 0.0)) + noise.read
     return solve(observed, latent, measured, variance, size, even=True)
 
 

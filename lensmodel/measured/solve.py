@@ -49,7 +49,8 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.least_squares import fista, nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, centroid
-from lensmodel.core.types import CHANNELS, Channel, Kernel
+from lensmodel.core.types import CHANNELS, Channel, Kernel, NoiseModel
+from lensmodel.measured.measurer import MeasuredPsf, psf_at
 from lensmodel.photo import LinearPhoto
 
 
@@ -377,11 +378,11 @@ _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 class Window:
     """A square window of one colour of a photo."""
 
+    photo: LinearPhoto
+    channel: Channel
     corner: tuple[int, int]  # top left pixel, (row, col)
     light: NDArray[np.float64]  # (side, side)
     measured: NDArray[np.bool_]  # which pixels the sensor measured in this colour, unclipped
-    shot: float  # of the noise of these pixels
-    read: float
 
     @classmethod
     def of(cls, photo: LinearPhoto, channel: Channel, corner: tuple[int, int], side: int) -> Window:
@@ -392,8 +393,12 @@ class Window:
         if photo.cfa is not None:
             rows, cols = (row + np.arange(side)) % 2, (col + np.arange(side)) % 2
             measured &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
-        noise = (photo.sensor_noise or photo.noise)[index]
-        return cls(corner, light, measured, noise.shot, noise.read)
+        return cls(photo, channel, corner, light, measured)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Noise of the pixels that were measured."""
+        return (self.photo.sensor_noise or self.photo.noise)[CHANNELS.index(self.channel)]
 
     @property
     def variance(self) -> NDArray[np.float64]:
@@ -401,8 +406,14 @@ class Window:
 
         By its own level a pixel that is dark by chance would count more than others.
         """
-        own = self.shot * np.maximum(self.light, 0.0) + self.read
+        own = self.noise.shot * np.maximum(self.light, 0.0) + self.noise.read
         return np.full(own.shape, float(own[self.measured].mean()) if self.measured.any() else 1.0)
+
+    def psf(self, kernel: Kernel, error: float, floor: float, most: float) -> MeasuredPsf:
+        """Say that a kernel was measured here, with an error of its own and one that no window shows."""
+        side = len(self.light)
+        middle, whole = np.add(self.corner, (side - 1) / 2.0), float(np.hypot(error, floor))
+        return psf_at(self.photo, self.channel, kernel, middle, side, whole, most)
 
 
 def window_psf(

@@ -32,7 +32,7 @@ from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.measured.measurer import MeasuredPsf, at_each, require
 from lensmodel.measured.page import DETAILS, MEAN, TargetPage
 from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
@@ -107,14 +107,15 @@ class Target:
         placed = replace(placed, tones=tones)
         return at_each(
             corners, channels,
-            lambda corner, channel: self._window(photo, placed, corner, size, channel), on_step,
+            lambda corner, channel: self._window(placed, Window.of(photo, channel, corner, self.side), size),
+            on_step,
             none="no window of the page determines a PSF; is the photo in focus?",
         )  # fmt: skip
 
     def find(self, photo: LinearPhoto, on_step: StepHook = ignore_step) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
         plane, side = np.asarray(photo.planes[1]), self.side
-        placed = _identified(photo, plane, find_marks(plane), self.details, on_step)
+        placed = _identified(photo, self.details, on_step)
         corners = [at for at in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*at, side, 0)]
         warp = placed.warp
         for degree in (1, 3, 5, 5):
@@ -124,21 +125,17 @@ class Target:
             )  # fmt: skip
         return replace(placed, warp=warp)
 
-    def _window(
-        self, photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], size: int, channel: Channel
-    ) -> MeasuredPsf:
+    def _window(self, placed: PlacedPage, window: Window, size: int) -> MeasuredPsf:
         """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
-        best = solve_window(Window.of(photo, channel, corner, self.side), placed, size)
+        best = solve_window(window, placed, size)
         for part in _SMALLER:
             side = round(self.side * part)
-            few = _pixels(photo, channel, side) < _LEAST_PIXELS * size * size
+            few = _pixels(window.photo, window.channel, side) < _LEAST_PIXELS * size * size
             if best.solved.misfit <= EXPLAINED or few:
                 break
-            inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
-            best = solve_window(Window.of(photo, channel, inner, side), placed, size)
-        side, error = len(best.window.light), float(np.hypot(best.solved.error, FLOOR))
-        middle = np.add(best.window.corner, (side - 1) / 2.0)
-        return psf_at(photo, channel, best.kernel, middle, side, error, _SURE)
+            row, col = (at + (self.side - side) // 2 for at in window.corner)
+            best = solve_window(Window.of(window.photo, window.channel, (row, col), side), placed, size)
+        return best.window.psf(best.kernel, best.solved.error, FLOOR, _SURE)
 
 
 def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
@@ -149,16 +146,12 @@ def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
     return side * side * sites / 4.0
 
 
-def _identified(
-    photo: LinearPhoto,
-    plane: NDArray[np.floating],
-    marks: NDArray[np.float64],
-    details: Sequence[int],
-    on_step: StepHook,
-) -> PlacedPage:
+def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -> PlacedPage:
     """Say which page it is and which way up, by the noise near the middle of the page."""
     best: tuple[float, PlacedPage] | None = None
-    middle, side = marks.mean(axis=0), _SIDE
+    plane, side = photo.planes[1], _SIDE
+    marks = find_marks(plane)
+    middle = marks.mean(axis=0)
     row, col = np.rint(middle - side / 2).astype(int)
     if min(row, col) < 0 or row + side > plane.shape[0] or col + side > plane.shape[1]:
         raise NotEnoughEvidenceError(_TOO_SMALL)

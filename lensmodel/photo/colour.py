@@ -275,10 +275,6 @@ class ColourSpace:
         return _undated(imagecodecs.cms_profile("rgb", whitepoint=white, primaries=primaries, **chosen))
 
 
-def _bt709(codes: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(codes < 0.081, codes / 4.5, ((codes + 0.099) / 1.099) ** (1.0 / 0.45))
-
-
 _D65: Final = (0.3127, 0.329)
 BT709: Final = ColourSpace(_D65, (0.64, 0.33, 0.30, 0.60, 0.15, 0.06))
 _PRIMARIES: Final[Mapping[int, ColourSpace]] = {
@@ -286,7 +282,8 @@ _PRIMARIES: Final[Mapping[int, ColourSpace]] = {
     9: ColourSpace(_D65, (0.708, 0.292, 0.170, 0.797, 0.131, 0.046)),  # BT.2020
     12: ColourSpace(_D65, (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)),  # Display P3
 }
-_TELEVISION: Final = _bt709(np.linspace(0.0, 1.0, 4096))
+_CODES: Final = np.linspace(0.0, 1.0, _CURVE_POINTS)
+_TELEVISION: Final = np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1.0 / 0.45))
 _CURVES: Final[Mapping[int, DeclaredCurve]] = {
     **dict.fromkeys((1, 6, 14, 15), _TELEVISION),
     4: 2.2,

@@ -26,9 +26,7 @@ _BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
 
 _MANY: Final = 3.0  # where so many times more are sure than likely, the likely ones are defects too (chosen)
 _MOST: Final = 2e-3  # share of the pixels above which they are a picture, such as a sky of stars (chosen)
-_ALIKE: Final = (
-    0.9  # correlation of small pictures from which on they show one scene (chosen): a burst has 0.99
-)
+_ALIKE: Final = 0.9  # correlation of small pictures from which on they show one scene (a burst: 0.99; chosen)
 _NEIGHBOURS: Final = 8  # of the same colour
 _FILLED_FROM: Final = 4  # of them, the nearest (chosen): more lie across edges
 _REACH: Final = 4  # pixels to the farthest of them, in any mosaic that is read

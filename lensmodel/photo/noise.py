@@ -43,7 +43,7 @@ def estimate_noise(
     Source: A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise modeling
     and fitting for single-image raw-data", IEEE TIP 17, 2008.
     """
-    levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip)
+    levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip).T
     if codes is not None and len(levels):
         variances = np.maximum(variances, np.interp(levels, codes, np.gradient(codes) ** 2 / 12.0))
     model = _fit(levels, variances, counts)
@@ -100,25 +100,20 @@ def _sampled(plane: Plane) -> Plane:
     return np.concatenate(bands) if bands else plane
 
 
-def _levels(
-    plane: Plane, clip: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mean, variance and number of pixels of each level that was seen flat."""
-    nothing = np.zeros(0), np.zeros(0), np.zeros(0)
+def _levels(plane: Plane, clip: float) -> NDArray[np.float64]:
+    """Mean, variance and number of pixels of each level that was seen flat, shape (n, 3)."""
     if min(plane.shape) < 3 * BLOCK:
-        return nothing
+        return np.zeros((0, 3))
     high = ndimage.convolve(plane, _HIGH_PASS.astype(np.float32), mode="nearest")
     low = ndimage.gaussian_filter(plane, 2.0, mode="nearest", truncate=3.0)
     blocks = _blocks(plane)
-    mean = blocks.mean(axis=1, dtype=np.float64)
-    low_blocks = _blocks(low)
-    texture = low_blocks.std(axis=1, dtype=np.float64)
+    mean, texture = blocks.mean(axis=1, dtype=np.float64), _blocks(low).std(axis=1, dtype=np.float64)
     usable = (blocks.max(axis=1) < 0.98 * clip) & ((blocks <= 0).mean(axis=1) < 0.02)
     high_blocks = _blocks(high)
     # Areas without any change, painted or clipped by a program, tell nothing about the sensor.
     usable &= np.ptp(high_blocks, axis=1) > 0
     if usable.sum() < _MIN_BLOCKS:
-        return nothing
+        return np.zeros((0, 3))
     mean, texture, high_blocks = mean[usable], texture[usable], high_blocks[usable]
     order = np.argsort(mean)
     rows = []
@@ -129,8 +124,7 @@ def _levels(
         sigma = _scale(values)
         if sigma > 0:  # else most differences are exactly 0: rounding or compression ate the noise
             rows.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
-    table = np.array(rows).reshape(-1, 3)
-    return table[:, 0], table[:, 1], table[:, 2]
+    return np.array(rows).reshape(-1, 3)
 
 
 def _scale(values: NDArray[np.float32]) -> float:

@@ -129,11 +129,8 @@ def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFo
             name,
             ", ".join(steps),
         )
-    if (
-        encoding.bit_depth == 32
-        and output not in {"tiff32", "dng"}
-        and (beyond := float((planes > 1.0).mean()))
-    ):
+    clipped = encoding.bit_depth == 32 and output not in {"tiff32", "dng"}
+    if clipped and (beyond := float((planes > 1.0).mean())):
         remarks_log.warning(
             "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
             name,

@@ -125,9 +125,8 @@ def _third_moment(sample: PsfSample) -> _Array:
     """<|x|^2 x> / w^3 as (right, up), about the centre of mass, wings below a hundredth cut."""
     kernel = np.where(sample.kernel > _WING * sample.kernel.max(), sample.kernel, 0.0)
     kernel = kernel / kernel.sum()
-    t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
-    up, right = -t[:, None] + 0.0 * t[None, :], t[None, :] + 0.0 * t[:, None]
-    up, right = up - (kernel * up).sum(), right - (kernel * right).sum()
+    down, right = np.indices(kernel.shape) - kernel.shape[0] // 2
+    up, right = (kernel * down).sum() - down, right - (kernel * right).sum()
     squared = up**2 + right**2
     width = math.sqrt(max(float((kernel * squared).sum()) / 2.0, 1e-6))
     return np.array([(kernel * squared * right).sum(), (kernel * squared * up).sum()]) / width**3

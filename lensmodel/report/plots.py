@@ -297,10 +297,9 @@ def _maps(place: Place, found: ApertureReport, factor: float) -> None:
 def _sharpness_map(
     ax: Axes, found: ApertureReport, values: Sequence[float], factor: float = 1.0
 ) -> AxesImage:
-    """MTF50 at each place; where too little is known it is hatched."""
+    """MTF50 at each place."""
     words = [(">" if v >= NYQUIST else "") + _number(min(v, NYQUIST), factor) for v in values]
-    hatched = [spot.unknown for spot in found.map]
-    return _map(ax, found, np.clip(values, 0.0, NYQUIST), words, _SHARPNESS, (0.0, NYQUIST), hatched)
+    return _map(ax, found, np.clip(values, 0.0, NYQUIST), words, _SHARPNESS, (0.0, NYQUIST))
 
 
 def _error_map(ax: Axes, found: ApertureReport) -> None:
@@ -308,8 +307,7 @@ def _error_map(ax: Axes, found: ApertureReport) -> None:
     shares = np.array([spot.give_or_take for spot in found.map])
     shown = [min(spot.tangential, spot.sagittal) < NYQUIST for spot in found.map]
     words = [f"{100.0 * share:.0f}" if told else "" for share, told in zip(shares, shown, strict=True)]
-    hatched = [spot.unknown for spot in found.map]
-    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0), hatched)
+    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0))
 
 
 def _difference(ax: Axes, comparison: Comparison) -> None:
@@ -317,7 +315,8 @@ def _difference(ax: Axes, comparison: Comparison) -> None:
     one, two = ([spot.mean for spot in one.tested[0].map] for one in (comparison.first, comparison.second))
     values = np.subtract(two, one)
     top = max(0.02, float(np.abs(values).max()))
-    _map(ax, comparison.first.tested[0], values, [f"{v:+.2f}" for v in values], _CHANGES, (-top, top))
+    words = [f"{v:+.2f}" for v in values]
+    _map(ax, comparison.first.tested[0], values, words, _CHANGES, (-top, top), hatched=False)
     ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
 
 
@@ -328,9 +327,10 @@ def _map(
     words: Sequence[str],
     colours: LinearSegmentedColormap | str,
     ends: tuple[float, float],
-    hatched: Sequence[bool] | None = None,
+    *,
+    hatched: bool = True,
 ) -> AxesImage:
-    """Draw a value at each place of a report as a cell with its figure."""
+    """Draw a value at each place of a report as a cell with its figure; hatched where too little is known."""
     ax.grid(visible=False)
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
@@ -339,10 +339,10 @@ def _map(
         extent=(0.0, found.aspect, 0.0, 1.0),
     )  # fmt: skip
     wide, high = found.aspect / found.cols, 1.0 / found.rows
-    for i, (word, value) in enumerate(zip(words, values, strict=True)):
+    for i, (word, value, spot) in enumerate(zip(words, values, found.map, strict=True)):
         row, col = divmod(i, found.cols)
         left, low, pale = col * wide, 1.0 - (row + 1) * high, True
-        if hatched is not None and hatched[i]:
+        if hatched and spot.unknown:
             ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
         else:
             pale = np.dot(image.to_rgba(value)[:3], _LUMA) > _PALE

@@ -128,6 +128,11 @@ class _Stamp:
         """What the pixels of the window see of it behind a kernel."""
         return np.asarray(scipy.signal.fftconvolve(self.latent(len(kernel)), kernel, mode="valid"))
 
+    def variance(self, light: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance of the noise of its pixels where they have so much light above the sky."""
+        noise = self.window.noise
+        return noise.shot * (self.sky + np.maximum(light, 0.0)) + noise.read
+
 
 def _cell_psf(
     photo: LinearPhoto,
@@ -179,8 +184,7 @@ def _stacked(stamps: Sequence[_Stamp], size: int, kernel: NDArray[np.float64] | 
         rows = slice(number * (2 * size - 1), number * (2 * size - 1) + size)
         observed[rows], measured[rows] = stamp.observed, stamp.window.measured
         light = np.full((size, size), stamp.flux / size**2) if kernel is None else stamp.blurred(kernel)
-        noise = stamp.window.noise
-        variance[rows] = noise.shot * (stamp.sky + np.maximum(light, 0.0)) + noise.read
+        variance[rows] = stamp.variance(light)
     return solve(observed, latent, measured, variance, size, even=True)
 
 
@@ -189,8 +193,7 @@ def _unexplained(stamps: Sequence[_Stamp], solved: Solved) -> float:
     rest, power = 0.0, 0.0
     for stamp in stamps:
         good, light = stamp.window.measured, stamp.blurred(solved.kernel * solved.light)
-        noise = stamp.window.shot * (stamp.sky + np.maximum(light, 0.0)) + stamp.window.read
-        rest += float((np.square(stamp.observed - light) - noise)[good].sum())
+        rest += float((np.square(stamp.observed - light) - stamp.variance(light))[good].sum())
         power += float(np.square(stamp.observed[good]).sum())
     return math.sqrt(max(rest, 0.0) / power)
 

@@ -410,9 +410,7 @@ def _side_softer(ax: Axes, found: ApertureReport) -> None:
     x, y = (scale * softer.amount * f(softer.direction) for f in (math.cos, math.sin))
     ax.add_patch(Circle((x, y), 2.0 * scale * softer.error, color=_INKS[0], alpha=0.2))
     ax.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": _INKS[1], "lw": 2.0})
-    ax.set_xlabel(
-        "arrow: to the softer side; circle: two standard errors; certain where the cross lies outside it"
-    )
+    ax.set_xlabel("arrow: to the softer side; circle: two standard errors")
 
 
 def _table(ax: Axes, report: LensReport, found: ApertureReport) -> None:

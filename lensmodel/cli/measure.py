@@ -129,7 +129,7 @@ def measure(
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
-            bar.show(completed=number + 1)
+            bar.show(description=f"{group[0].name}: {result['state']}", completed=number + 1)
     shown.document({"profile": str(target) if target.exists() else None, "results": results})
     for result in results:
         if result["state"] == "measured":

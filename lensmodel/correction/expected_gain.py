@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
-from lensmodel.core.types import ZONES, Planes, Zone
+from lensmodel.core.types import ZONES, Plane, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
 from lensmodel.correction.scene_power import (
     frequency_counts,
+    noise_power,
     ring_power,
     scene_law,
     scene_power,
@@ -37,9 +38,9 @@ _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1], 
 """Shares of a kernel to try; finer steps change the expected error by less than a hundredth."""
 
 _GRID: Final = GRID
-_SHARPER: Final = 4.0
-"""Standard deviations z by which the true kernel may be sharper where all is out of focus (chosen: with 2, a
-photo out of focus loses .4 dB in a corner by a lens known from two photos; others are not touched)."""
+_SHARPER: Final = 3.0
+"""Standard deviations z by which the true kernel may be narrower where a scene is out of focus (chosen: with
+2, twice as many blocks of a photo out of focus lose by a lens that is known from one such photo)."""
 
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
@@ -127,6 +128,37 @@ class Plan:
     softness: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """One colour of a cell: transfer functions of its kernel and of a point, noise, and the scene's power."""
+
+    K: NDArray[np.complex64]
+    point: NDArray[np.complex64]
+    D: NDArray[np.float32]
+    noise: float
+    level: float
+    slope: float
+
+    @classmethod
+    def of(
+        cls,
+        channel: int,
+        plane: Plane,
+        rings: NDArray[np.float64],
+        posterior: PsfPosterior,
+        offset: tuple[float, float],
+        sensor: Sensor,
+    ) -> _Scene:
+        """Fit the law of the scene to the power of a plane in each ring."""
+        point = UniformBlur(delta(1), offset).spectrum(_GRID)
+        known = posterior.kernel.shape[0] <= WIDEST
+        K = UniformBlur(posterior.kernel, offset).spectrum(_GRID) if known else point
+        noise = float(sensor.variance(plane[::_EVERY, ::_EVERY].mean()))
+        seen = noise_power(noise, channel, mosaic=sensor.measured is not None)
+        law = scene_law(rings, K.real**2 + K.imag**2 + posterior.variance, seen)
+        return cls(K, point, posterior.variance, noise, *law)
+
+
 def plan(
     cell: Cell,
     tile: Planes,
@@ -145,9 +177,12 @@ def plan(
         before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
 
     Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
-    gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
-    that would do harm if the true kernel were sharper by z standard deviations, H = K + z D^(1/2) K / |K|,
-    and t is 0: nothing fine is there but grain, of which the solution has enough.
+    gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken,
+    and the cell left as it is, that would do harm if the true kernel were narrower by z standard deviations
+    of its width, short of a point, less noise counting as no gain; nothing fine is there but grain, so t
+    fills up what W leaves of it::
+
+        H = K |K|^-min( z D^(1/2) / |K ln |K||, 1 ),    t ( 1 - min( |W|², 1 ) )
 
     Parameters
     ----------
@@ -156,31 +191,27 @@ def plan(
     returned : float
         t.
     """
+    rings = ring_power(tile).mean(axis=1)
+    scenes = [
+        _Scene.of(c, tile[c], rings[c], posteriors[c], offsets[c], sensors[c]) for c in range(len(tile))
+    ]
+    soft = softness(float(np.median([scene.slope for scene in scenes])))
+    z = np.float32(_SHARPER * soft)
     before = after = 0.0
     shares: list[float] = []
-    softs: list[float] = []
-    times = frequency_counts(_GRID)
-    measured = ring_power(tile).mean(axis=1)
-    for c, (posterior, offset, sensor) in enumerate(zip(posteriors, offsets, sensors, strict=True)):
-        point = UniformBlur(delta(1), offset).spectrum(_GRID)
-        K = (
-            point
-            if posterior.kernel.shape[0] > WIDEST
-            else UniformBlur(posterior.kernel, offset).spectrum(_GRID)
-        )
-        D, n = posterior.variance, float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
-        level, slope = scene_law(measured[c], K.real**2 + K.imag**2 + D, n)
-        softs.append(softness(slope))
-        S, z = scene_power(level, slope), np.float32(_SHARPER * softs[c])
-        back = np.float32(returned * (1.0 - softs[c]))
-        remaining, harm = np.empty((2, _SHARES.size))
-        before += _remaining(K, point, S, D, times, np.float32(n), _SHARES, back, z, remaining, harm)
-        best = int(np.argmin(np.where(harm > 0.0, np.inf, remaining)))
-        shares.append(float(_SHARES[best]))
-        after += float(remaining[best])
+    for scene in scenes:
+        left, harm = np.empty((2, _SHARES.size))
+        S, t = scene_power(scene.level, scene.slope), np.float32(returned)
+        given = (scene.K, scene.point, S, scene.D, frequency_counts(_GRID), np.float32(scene.noise))
+        unchanged = _remaining(*given, _SHARES, t, np.float32(soft), z, left, harm)
+        left[harm > 0.0] = np.inf
+        best = int(np.argmin(left))
+        shares.append(float(_SHARES[best]) if left[best] < unchanged else 0.0)
+        before += unchanged
+        after += min(float(left[best]), unchanged)
     error = float(np.mean([posterior.error for posterior in posteriors]))
     forecast = CellForecast(zone_of(cell.position.r), before, after, error)
-    return Plan(tuple(shares), forecast, float(np.mean(softs)))
+    return Plan(tuple(shares), forecast, soft)
 
 
 @jit
@@ -193,13 +224,14 @@ def _remaining(
     noise: np.float32,
     shares: NDArray[np.float32],
     returned: np.float32,
+    soft: np.float32,
     z: np.float32,
     out: NDArray[np.float64],
     harm: NDArray[np.float64],
 ) -> float:
     """Expected squared error that each share of a kernel leaves, and, returned, of the photo; see `plan`.
 
-    `harm` receives by how much the error rises if the kernel is sharper by z standard deviations.
+    `harm` receives by how much the error rises if the kernel is narrower by z standard deviations.
     """
     one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
     for i in range(K.shape[0]):
@@ -218,17 +250,19 @@ def _remaining(
                 q = share * b + (one - share) * point[i, j].imag
                 power = p * p + q * q
                 weight = s / max(s * power + noise, least)
-                re, im = p * weight + returned * (one - power * weight), -q * weight
+                back = returned * (one - soft * min(power * weight * weight, one))
+                re, im = p * weight + back * (one - power * weight), -q * weight
                 missed, turned = one - re * a + im * b, re * b + im * a
                 kept = re * re + im * im
                 error = s * (missed * missed + turned * turned + kept * D[i, j]) + kept * noise
                 part += times[i, j] * error
-                size = np.sqrt(a * a + b * b)
-                sharper = min(size + z * np.sqrt(D[i, j]), max(one, size)) / max(size, least)
+                size = max(np.sqrt(a * a + b * b), np.float32(1e-6))
+                width = -np.log(min(size, np.float32(0.9999)))
+                sharper = np.exp(width * min(z * np.sqrt(D[i, j]) / (size * width), one))
                 u, v = sharper * a, sharper * b
                 missed, turned = one - re * u + im * v, re * v + im * u
                 change = missed * missed + turned * turned - (one - u) * (one - u) - v * v
-                more += times[i, j] * (s * change + (kept - one) * noise)
+                more += times[i, j] * (s * change + max(kept - one, np.float32(0.0)) * noise)
             total += part
             rise += more
         out[number] = total

@@ -31,6 +31,10 @@ _SLOPES: Final = (2.0, 5.0)
 _SOFT: Final = (3.0, 4.0)
 """Slopes between which a scene counts more and more as out of focus (chosen: detail in focus lies below)."""
 
+_MOSAIC_NOISE: Final = np.array([[4.8, 4.0, 3.0, 2.0], [2.35, 2.2, 2.05, 1.75], [4.5, 3.7, 2.8, 1.9]])
+"""Noise power of a developed mosaic's colours in each ring, over its variance (measured on an even area):
+demosaicing spreads what few pixels saw, and would pass for detail in focus if it counted as white."""
+
 _BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 
 
@@ -44,8 +48,13 @@ def softness(slope: float) -> float:
     return min(max((slope - _SOFT[0]) / (_SOFT[1] - _SOFT[0]), 0.0), 1.0)
 
 
+def noise_power(variance: float, channel: int, *, mosaic: bool) -> NDArray[np.float64]:
+    """Mean power of noise in each ring, of a colour of a developed mosaic or of full planes."""
+    return variance * (_MOSAIC_NOISE[channel] if mosaic else np.ones(len(_MIDDLES)))
+
+
 def scene_law(
-    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: float
+    measured: NDArray[np.float64], transferred: NDArray[np.floating], noise: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Power of the scene behind a blur, S = c |f|^-a, as c and a.
 
@@ -59,8 +68,8 @@ def scene_law(
         Mean power of a part of the photo in each ring, of `ring_power`.
     transferred : ndarray, shape (64, 33)
         Expected |H|² of its blur.
-    noise : float
-        Variance of its noise.
+    noise : ndarray, shape (rings,)
+        Mean power of its noise there, of `noise_power`.
     """
     transmitted = _rings() @ transferred.ravel().astype(np.float64)
     power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)

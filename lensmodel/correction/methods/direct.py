@@ -27,7 +27,7 @@ from lensmodel.correction.compiled.common import (
 from lensmodel.correction.compiled.tile import fill
 from lensmodel.correction.deconvolver import Restored, Sensor, Solution
 from lensmodel.correction.posterior import GRID
-from lensmodel.correction.scene_power import frequency_squared, ring_power, scene_law
+from lensmodel.correction.scene_power import frequency_squared, noise_power, ring_power, scene_law
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
 
@@ -111,8 +111,12 @@ class DirectFilter:
         usual = np.exp(np.log(np.maximum(ring_power(blurred), 1e-12)).mean(axis=1))
         laws = np.array(
             [
-                scene_law(power, np.abs(blur.spectrum(GRID)) ** 2, n)
-                for power, blur, n in zip(usual, blurs, noise, strict=True)
+                scene_law(
+                    usual[c],
+                    np.abs(blurs[c].spectrum(GRID)) ** 2,
+                    noise_power(noise[c], c, mosaic=sensors[c].measured is not None),
+                )
+                for c in range(len(blurs))
             ]
         )
         slope = round(2.0 * laws[:, 1].mean()) / 2.0  # few enough to keep their powers

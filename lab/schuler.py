@@ -20,6 +20,7 @@ Departures from the paper:
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -292,6 +293,7 @@ _STOPS: Final = (1.0, math.sqrt(2.0))  # factors on the f-number (chosen): wide 
 
 def main() -> None:
     """Draw the lenses, take their kernels in the local frame, and store the principal components."""
+    argparse.ArgumentParser(description=__doc__).parse_args()  # so that --help writes nothing
     fields = []
     for seed in SEEDS:
         lens = draw_lens(seed)

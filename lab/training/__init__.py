@@ -1,1 +1,1 @@
-"""What made the data files that the library ships."""
+"""What made the patch selector that the library ships, and the data of the laboratory."""

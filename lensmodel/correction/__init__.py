@@ -1,4 +1,4 @@
-"""Non-blind deconvolution, from one tile to a whole photo."""
+"""Step 3, non-blind deconvolution: plan, solve, limit and audit, from one cell to a whole photo."""
 
 from __future__ import annotations
 

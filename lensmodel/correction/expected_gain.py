@@ -1,4 +1,4 @@
-"""What a correction is expected to gain, zone by zone, and what was held back of it."""
+"""Plan of a correction: which share of each kernel gains most in a cell, and how much, zone by zone."""
 
 from __future__ import annotations
 

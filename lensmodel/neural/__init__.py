@@ -2,7 +2,7 @@
 
 Attention over a set of samples is Nadaraya-Watson regression [1]_ whose kernel, the weight of each sample in
 the answer, is learned, as is what each sample says. `statistics` turns a patch into numbers, `network`
-encodes the patches of a photo and answers at a place; `symmetry` makes both the same in all eight octants of
+encodes the patches of a photo and answers at a place; `features` makes both the same in all eight octants of
 the field.
 
 References

@@ -1,8 +1,9 @@
-"""Find the regions of a photo that are informative about the PSF."""
+"""Step 1, where: the regions of a photo that are informative about the PSF."""
 
 from lensmodel.patches.checks import LEAST_PARTS, LEAST_PATCHES, require_enough
+from lensmodel.patches.rmap import r_map
 from lensmodel.patches.select import Selector, select, selectors
-from lensmodel.patches.windows import Patch, Reason, Selection, r_map
+from lensmodel.patches.windows import Patch, Reason, Selection
 
 __all__ = [
     "LEAST_PARTS",

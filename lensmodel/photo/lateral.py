@@ -1,4 +1,4 @@
-"""Lateral colour: how far red and blue images lie from the green one, from the photo itself."""
+"""Lateral colour: how far red and blue images lie from the green one, from the photo itself; its removal."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The inner loops, compiled."""
+"""Compiled loops that several modules share, or that are as long as a method."""

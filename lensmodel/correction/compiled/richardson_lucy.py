@@ -1,4 +1,4 @@
-"""Richardson-Lucy steps, compiled, and the bare transforms that they are compared with."""
+"""The steps of `methods.richardson_lucy`, compiled: Whyte's saturation, Biggs and Andrews' acceleration."""
 
 from __future__ import annotations
 

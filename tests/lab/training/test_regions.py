@@ -9,7 +9,7 @@ import pytest
 
 from lab.training.train_regions import Labelled, _arrays, fit
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.patches.select import FEATURES
+from lensmodel.patches.good_regions import FEATURES
 
 pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
 
@@ -19,7 +19,7 @@ def labelled(count: int, half: str, seed: int) -> list[Labelled]:
     rng = np.random.default_rng(seed)
     rows = []
     for i in range(count):
-        features = rng.normal(size=len(FEATURES))
+        features = rng.normal(size=FEATURES)
         unlike = float(np.exp(-2.0 + features[0] + 0.1 * rng.normal()))
         rows.append(
             Labelled(

@@ -32,8 +32,11 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print the line of a record."""
-        for_people = record.name in {REMARKS, COMPILING}
-        typer.echo(f"lensmodel: {record.getMessage()}" if for_people else self.format(record), err=True)
+        try:
+            for_people = record.name in {REMARKS, COMPILING}
+            typer.echo(f"lensmodel: {record.getMessage()}" if for_people else self.format(record), err=True)
+        except Exception:  # noqa: BLE001 - as the handlers of the library do it
+            self.handleError(record)
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,6 +164,15 @@ def test_that_loops_are_compiled_is_said_in_words_above_the_bar(
     assert capsys.readouterr().err == ""
 
 
+def test_a_record_that_cannot_be_printed_ends_no_work(capsys: pytest.CaptureFixture[str]) -> None:
+    Display().configure()
+    logging.getLogger("other").warning("%d photos", "no number")
+    logging.getLogger(console.REMARKS).warning("the next one")
+    said = capsys.readouterr().err
+    assert "Logging error" in said
+    assert said.endswith("lensmodel: the next one\n")
+
+
 def test_quick_work_says_nothing() -> None:
     said: list[str] = []
     with PacedProgress("a", 1, say=said.append, disable=True) as bar:

@@ -98,8 +98,9 @@ def read_ahead(context: JobContext, photo: PhotoRow) -> None:
         _Steps(context, photo).inspect()
     except NotWantedError:
         pass
-    except JobFailedError as error:
-        context.store.photos.fail(photo.public_id, photo.epoch, error.code, error.detail)
+    except JobFailedError as error:  # work that has begun since finds its own errors
+        why = {"error_code": error.code, "error_detail": error.detail}
+        context.store.photos.set_state(photo.public_id, (photo.state,), "failed", epoch=photo.epoch, **why)
 
 
 class _Steps:

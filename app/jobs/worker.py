@@ -156,7 +156,7 @@ class Worker:
     def _read_ahead(self) -> None:
         """Read photos while others are worked on, rather than when their turn comes."""
         while (photo := self._store.photos.unread()) is not None:
-            read_ahead(self._context, photo)
+            insist(partial(read_ahead, self._context, photo), TIDY_S)  # then perhaps another
 
     def _keep_lease(self) -> None:
         """Renew the lease; stop at once if this worker was declared dead."""

@@ -163,6 +163,22 @@ def test_a_bug_ends_the_job_after_three_tries(store: Store, steps: Any) -> None:
     assert (steps.fresh(photo).error_code, job.runs) == ("internal_error", 3)
 
 
+def test_reading_ahead_pauses_in_an_outage_but_keeps_to_no_photo_for_ever(
+    worker: Worker, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses, photo, read = list[float](), steps.receive(), Away(OSError(errno.EIO, "a bad block"), 10**6)
+    monkeypatch.setattr("app.jobs.queue.monotonic", lambda: sum(pauses))
+    monkeypatch.setattr("app.jobs.queue.sleep", pauses.append)
+    monkeypatch.setattr("app.jobs.worker.read_ahead", read)
+    monkeypatch.setattr(worker._store.photos, "unread", lambda: photo)
+
+    with pytest.raises(OSError, match="a bad block"):
+        worker._read_ahead()
+
+    assert read.runs == len(pauses) + 1
+    assert 60.0 < sum(pauses) < 180.0
+
+
 def test_a_worker_keeps_its_lease_while_its_engine_starts(
     worker: Worker, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -241,6 +241,23 @@ def test_a_photo_whose_turn_comes_while_it_is_read_is_not_held_up(
     assert steps.fresh(photo).state == "inspecting"
 
 
+def test_a_reading_before_its_turn_ends_no_work_that_has_begun(
+    work: Handler, context: JobContext, sandbox: Scripted, steps: Any
+) -> None:
+    photo = received(context, steps)
+
+    def turn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert context.store.photos.start(photo.public_id, 1)  # by another worker
+        return Outcome("error", code="time_limit", detail="stopped")
+
+    sandbox.answers["inspect"] = [turn, ok(INFO)]
+    read_ahead(context, photo)
+
+    assert steps.fresh(photo).state == "inspecting"
+    work(photo.public_id, 1)
+    assert steps.fresh(photo).state == "counted"
+
+
 def test_only_photos_that_wait_and_were_not_read_are_read_before_their_turn(
     context: JobContext, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -394,6 +394,17 @@ def test_zones_expect_more_where_there_are_no_samples() -> None:
     assert errors["center"] < errors["mid"] < errors["corner"] <= 1.0
 
 
+def test_beyond_the_outermost_samples_the_error_grows_with_the_way_outward() -> None:
+    model = LensModel.fit([s for s in photos(3, noise=0.1) if s.position.r < 0.8])
+    outermost = max(s.position.r for s in model.samples)
+    inside, rim = (
+        model.query(FieldPosition(r, 0.3), GREEN, SIZE).predicted_error for r in (0.7, outermost + 0.15)
+    )
+
+    assert rim**2 > inside**2 + 0.35**2
+    assert rim < 0.7
+
+
 @pytest.mark.parametrize(
     ("r", "aperture", "beyond"), [(0.3, 2.0, ()), (1.0, 2.0, ("place",)), (0.3, 8.0, ("aperture_stops",))]
 )

@@ -156,7 +156,7 @@ def psf_at(
     most: float = math.inf,
 ) -> MeasuredPsf:
     """Say where a kernel was measured; refuse one whose expected error is as large as that of a blind one."""
-    if error >= most:
+    if not error < most:  # nor one that is not known
         raise NotEnoughEvidenceError(f"the kernel is expected to be wrong by {error:.0%}")
     row, col = map(float, pixel)
     return MeasuredPsf(kernel, photo.frame.position(row, col), channel, error, (row, col), side)

@@ -22,8 +22,9 @@ from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, resized
-from lensmodel.core.types import Kernel, LensSettings, NoiseModel, StepHook
+from lensmodel.core.types import Channel, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
+from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at
 from lensmodel.measured.page import PAPERS, TargetPage
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.photos import samples_of_developed
@@ -289,6 +290,17 @@ def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> N
     plane = np.random.default_rng(0).standard_normal((128, 128))
     seen, _ = match(np.roll(plane, shift, (0, 1)), plane)
     assert seen == pytest.approx(shift, abs=0.1)
+
+
+def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> None:
+    photo = photo_of(np.full((128, 128), 0.3), gaussian(5, np.eye(2)))
+
+    def measured_at(error: float, channel: Channel) -> MeasuredPsf:
+        return psf_at(photo, channel, gaussian(9, np.eye(2)), np.array([30.0, 30.0]), 9, error, 0.5)
+
+    found = at_each([math.nan, 0.1, 0.6], ["g"], measured_at, ignore_step, none="nowhere")
+
+    assert [psf.error for psf in found] == [0.1]
 
 
 # --- the ways -----------------------------------------------------------------------------------

@@ -35,9 +35,8 @@ from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings,
 from lensmodel.photo import develop
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
 
-FILES: Final = frozenset(
-    {"before-after.png", "corrected.tif", "report.md", "service.log"}
-)  # what a demo leaves in its folder
+# what a demo leaves in its folder
+FILES: Final = frozenset({"before-after.png", "corrected.tif", "report.md", "service.log"})
 LENS: Final = draw_lens(2024, "soft-fast")  # seed chosen: any number; nothing was tuned on it
 CAMERA: Final = SimulatedCamera(height=896, width=1456)  # every scene covers its frame
 SETTINGS: Final = LensSettings(aperture=LENS.at_focal().f_number, focal_mm=LENS.focal_mm[0])  # wide open

@@ -238,10 +238,8 @@ def _run_job(case: BlindCase, true: Kernel, methods: Mapping[str, BlindMethod | 
         if estimate is not None:
             restored = deconvolved(seen.patch, kernel, sigma, found.shift)
             ratio = squared_error(restored, seen.sharp) / floor
-        widths, declined = (
-            (psf.rms_width(kernel), psf.rms_width(true)),
-            method is not None and estimate is None,
-        )
+        widths = psf.rms_width(kernel), psf.rms_width(true)
+        declined = method is not None and estimate is None
         distances = (found.ncc, found.rel_l2, found.mtf_rmse)
         results.append(
             CaseResult(case.name, name, sigma, ratio, untouched, *distances, *widths, declined, seconds)

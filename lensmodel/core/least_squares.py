@@ -70,9 +70,8 @@ def fista(
 
 def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, float]:
     """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that."""
-    if (
-        len(a) > _FEW
-    ):  # all eigenvalues take ten times as long as a Cholesky factor, which tells of small ones
+    # all eigenvalues take ten times as long as a Cholesky factor, which tells of small ones
+    if len(a) > _FEW:
         start = np.ones(len(a))
         largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
         least = _LEAST * largest

@@ -18,7 +18,7 @@ class BlindMethod(Protocol):
     def estimate(
         self, patches: Sequence[Plane], noise: Sequence[NoiseModel], *, size: int = 31
     ) -> PsfEstimate:
-        """Estimate the kernel of odd side `size` that all patches share."""
+        """Estimate the kernel of odd side `size` that all patches share; those here take one patch."""
 
 
 compared: Final[Registry[BlindMethod]] = Registry(

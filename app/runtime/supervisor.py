@@ -70,7 +70,9 @@ def serve(settings: Settings) -> int:
                 worker.wait(STOP_S)
             worker.kill()
             worker.wait()
-            file.unlink(missing_ok=True)
+            # gone, or of another service, where the folder was deleted meanwhile
+            if file.exists() and json.loads(file.read_bytes())["pid"] == os.getpid():
+                file.unlink()
     return 1
 
 

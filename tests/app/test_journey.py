@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -29,6 +30,7 @@ from running import (
     SHAPE,
     SMALL,
     Service,
+    running,
     write_photo,
 )
 
@@ -275,6 +277,21 @@ def test_a_second_service_on_the_same_data_is_refused_and_the_first_runs_on(serv
     assert "or give another folder by --data" in second.stderr
     assert (service.info(), alive(pids)) == (info, pids)
     assert service.get("/readyz")["status"] == "ready"
+
+
+def test_a_service_whose_data_were_deleted_takes_nothing_from_the_next_one(tmp_path: Path) -> None:
+    with contextlib.closing(Service(tmp_path / "data")) as first:
+        first.start()
+        assert first.process is not None
+        first.process.send_signal(signal.SIGSTOP)  # so that it ends last
+        os.kill(first.info()["worker_pid"], signal.SIGKILL)
+        shutil.rmtree(first.data)
+        with running(first.data) as second:
+            info = second.info()
+            first.process.send_signal(signal.SIGCONT)
+
+            assert first.process.wait(stretched(PATIENCE_S)) == 1
+            assert second.info() == info
 
 
 @pytest.mark.slow

@@ -34,8 +34,8 @@ WORTH_DB: Final = 0.1
 _UNKNOWN: Final = 1.0
 """Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""
 
-_SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1], dtype=np.float32)
-"""Shares of a kernel to try; finer steps change the expected error by less than a hundredth."""
+_SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1, 0.0], dtype=np.float32)
+"""Shares of a kernel to try, the last if all others may harm; finer steps change the error by a hundredth."""
 
 _GRID: Final = GRID
 _SHARPER: Final = 3.0
@@ -204,11 +204,12 @@ def plan(
         S, t = scene_power(scene.level, scene.slope), np.float32(returned)
         given = (scene.K, scene.point, S, scene.D, frequency_counts(_GRID), np.float32(scene.noise))
         unchanged = _remaining(*given, _SHARES, t, np.float32(soft), z, left, harm)
-        left[harm > 0.0] = np.inf
-        best = int(np.argmin(left))
-        shares.append(float(_SHARES[best]) if left[best] < unchanged else 0.0)
+        harmless = harm <= 0.0
+        harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
+        best = int(np.argmin(np.where(harmless, left, np.inf)))
+        shares.append(float(_SHARES[best]))
         before += unchanged
-        after += min(float(left[best]), unchanged)
+        after += float(left[best])
     error = float(np.mean([posterior.error for posterior in posteriors]))
     forecast = CellForecast(zone_of(cell.position.r), before, after, error)
     return Plan(tuple(shares), forecast, soft)

@@ -177,10 +177,10 @@ def plan(
         before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
 
     Detail in focus gains at many frequencies, at which a kernel errs this way and that. What is out of focus
-    gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken,
-    and the cell left as it is, that would do harm if the true kernel were narrower by z standard deviations
-    of its width, short of a point, less noise counting as no gain; nothing fine is there but grain, so t
-    fills up what W leaves of it::
+    gains at a few low ones, and is lost there altogether if the kernel is too wide. There no share is taken
+    that would do harm if the true kernel were narrower by z standard deviations of its width, short of a
+    point, less noise counting as no gain; if all would, s is 0. Nothing fine is there but grain, so t fills
+    up what W leaves of it::
 
         H = K |K|^-min( z D^(1/2) / |K ln |K||, 1 ),    t ( 1 - min( |W|², 1 ) )
 

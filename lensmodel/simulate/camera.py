@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes
-from lensmodel.photo.dng import XYZ_TO_SRGB, write_bayer_dng
+from lensmodel.photo.dng import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
@@ -42,6 +42,20 @@ class SimulatedCamera:
     maker: str = "Simulated Camera"  # as written into the metadata of its photos
     model: str = "SC-1"
     serial: str = "SC1-0001"
+
+    def __post_init__(self) -> None:
+        for name, right, wanted in (
+            ("height", self.height >= 16 and self.height % 2 == 0, "even and at least 16"),
+            ("width", self.width >= 16 and self.width % 2 == 0, "even and at least 16"),
+            ("pattern", self.pattern in BAYER_PATTERNS, f"one of {', '.join(BAYER_PATTERNS)}"),
+            ("black", 0 <= self.black < self.white < 2**16, "below white, and both within 16 bits"),
+            ("full_well_electrons", self.full_well_electrons > 0, "positive"),
+            ("read_noise", self.read_noise >= 0, "at least 0"),
+            ("pitch_um", 0.5 <= self.pitch_um <= 50.0, "in 0.5..50"),
+            ("white_balance", min(self.white_balance) >= 1.0, "at least 1 in each colour"),
+        ):
+            if not right:
+                raise InvalidInputError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
 
     @property
     def frame(self) -> Frame:
@@ -102,6 +116,8 @@ def photograph(
     options: BlurOptions | None = None,
 ) -> SimulatedPhoto:
     """Take a photo: blur (`blurred`), exposure, colour response, noise, clipping, mosaic."""
+    if not (math.isfinite(exposure) and exposure > 0.0):
+        raise InvalidInputError(f"exposure must be positive, got {exposure}")
     options = replace(options or BlurOptions(), pitch_um=camera.pitch_um)
     frame = camera.frame
     clean = blurred(scene, lens, settings, frame, options)
@@ -128,6 +144,10 @@ class BlurOptions:
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
     size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
     step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.step <= 0.5:
+            raise InvalidInputError(f"step must lie in 0.01..0.5 half diagonals, got {self.step}")
 
 
 def blurred(
@@ -187,6 +207,8 @@ def _with_margin(scene: Planes, frame: Frame, margin: int) -> Planes:
             f"the scene {scene.shape[1:]} must exceed the frame ({frame.height}, {frame.width}) by an even "
             "number of rows and columns, or equal it; crop or enlarge it first"
         )
+    if not np.isfinite(scene).all() or float(scene.min()) < 0.0:
+        raise InvalidInputError("scene values must be finite and not negative linear light")
     cut = [max(s // 2 - margin, 0) for s in spare]
     inner = scene[:, cut[0] : scene.shape[1] - cut[0], cut[1] : scene.shape[2] - cut[1]]
     missing = [max(margin - s // 2, 0) for s in spare]

@@ -207,6 +207,38 @@ def test_photo_knows_the_truth_and_repeats_by_seed() -> None:
     assert (first.lens, first.camera) == (PERFECT, camera)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"height": 15},
+        {"width": 8},
+        {"pattern": "RGBG"},
+        {"black": 20000},
+        {"white_balance": (0.5, 1.0, 1.0)},
+        {"full_well_electrons": 0.0},
+        {"read_noise": math.nan},
+        {"pitch_um": 0.0},
+    ],
+)
+def test_impossible_cameras_are_refused_by_name(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
+        SimulatedCamera(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"exposure": 0.0}, {"scene": -1.0}, {"scene": math.nan}])
+def test_impossible_light_is_refused(wrong: dict[str, float]) -> None:
+    camera, lens = SimulatedCamera(64, 96), draw_lens(1)
+    scene = np.full((3, 64, 96), wrong.get("scene", 0.5), dtype=np.float32)
+    settings = LensSettings(aperture=lens.widest())
+    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
+        photograph(scene, lens, settings, camera, None, exposure=wrong.get("exposure", 1.0))
+
+
+def test_no_step_between_exact_kernels_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="step"):
+        BlurOptions(step=0.0)
+
+
 def test_written_photo_opens_in_libraw_with_its_lens_and_its_colours(tmp_path: Path) -> None:
     camera = SimulatedCamera(64, 96, pattern="GBRG")
     scene = np.empty((3, 64, 96), dtype=np.float32)

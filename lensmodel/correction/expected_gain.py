@@ -235,11 +235,16 @@ def _remaining(
     `harm` receives by how much the error rises if the kernel is narrower by z standard deviations.
     """
     one, least, before = np.float32(1.0), np.float32(_LEAST), np.float64(0.0)
+    sharper = np.ones_like(D)  # |H| / |K|
     for i in range(K.shape[0]):
         part = np.float32(0.0)
         for j in range(K.shape[1]):
             a, b = one - K[i, j].real, K[i, j].imag
             part += times[i, j] * (S[i, j] * (a * a + b * b + D[i, j]) + noise)
+            if z > np.float32(0.0):
+                size = max(np.abs(K[i, j]), np.float32(1e-6))
+                width = -np.log(min(size, np.float32(0.9999)))
+                sharper[i, j] = np.exp(width * min(z * np.sqrt(D[i, j]) / (size * width), one))
         before += part
     for number in range(shares.size):
         share, total, rise = shares[number], np.float64(0.0), np.float64(0.0)
@@ -257,10 +262,7 @@ def _remaining(
                 kept = re * re + im * im
                 error = s * (missed * missed + turned * turned + kept * D[i, j]) + kept * noise
                 part += times[i, j] * error
-                size = max(np.sqrt(a * a + b * b), np.float32(1e-6))
-                width = -np.log(min(size, np.float32(0.9999)))
-                sharper = np.exp(width * min(z * np.sqrt(D[i, j]) / (size * width), one))
-                u, v = sharper * a, sharper * b
+                u, v = sharper[i, j] * a, sharper[i, j] * b
                 missed, turned = one - re * u + im * v, re * v + im * u
                 change = missed * missed + turned * turned - (one - u) * (one - u) - v * v
                 more += times[i, j] * (s * change + max(kept - one, np.float32(0.0)) * noise)

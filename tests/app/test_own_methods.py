@@ -34,7 +34,7 @@ class Careful:
 
     def estimate(self, patches, noise, **options):
         found = lensmodel.estimators.create("default").estimate(patches, noise, **options)
-        return type(found)(found.kernel, found.confidence / 2, found.predicted_error, {})
+        return type(found)(found.kernel, found.confidence / 2, found.predicted_error)
 
 
 class Everywhere:

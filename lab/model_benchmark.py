@@ -129,17 +129,17 @@ def samples_of(truth: PsfField, seed: int, photos: int) -> list[PsfSample]:
 
 
 def compared(
-    truths: Mapping[int, PsfField],
+    truths: Sequence[tuple[int, PsfField]],
     fits: Mapping[str, Fit],
     photos: Sequence[int] = (1,),
     on_step: StepHook = ignore_step,
 ) -> list[dict[str, Any]]:
-    """Mean relative L2 by zone of each method and number of photos, over lenses by their seeds."""
+    """Mean relative L2 by zone of each method and number of photos, over lenses with seeds of patches."""
     collected: dict[tuple[str, int, str], list[float]] = defaultdict(list)
     seconds: dict[tuple[str, int], float] = defaultdict(float)
     done, total = 0, len(truths) * len(photos) * len(fits)
     on_step(done, total)
-    for seed, truth in truths.items():
+    for seed, truth in truths:
         samples = samples_of(truth, seed, max(photos))
         asked = [(place, truth.kernel_at(place, "g", SIZE)) for place in asked_places()]
         for count in photos:
@@ -176,7 +176,7 @@ def run_model_benchmark(
     if unknown:
         raise InvalidInputError(f"no method {unknown[0]!r}; known: {', '.join(sorted(FITS))}")
     fits = {name: FITS[name] for name in methods or FITS}
-    return compared({seed: draw_lens(seed).field() for seed in seeds}, fits, photos, on_step)
+    return compared([(seed, draw_lens(seed).field()) for seed in seeds], fits, photos, on_step)
 
 
 def _regression(chosen: ModelSettings) -> Fit:

@@ -88,7 +88,7 @@ def _fig2(cases: Sequence[Case], path: Path) -> dict[str, Any]:
     table = [
         {"family": family, "lenses": len(lenses), **row}
         for family, lenses in families.items()
-        for row in compared({one.seed: one.truth() for one in lenses}, WAYS)
+        for row in compared([(one.seed, one.truth()) for one in lenses], WAYS)
     ]
     return {"picture": path.name, "lens": worst.title, "table": table}
 

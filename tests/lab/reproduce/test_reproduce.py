@@ -6,7 +6,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -52,8 +52,8 @@ from lab.traced import read_grid
 from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.psf import as_kernel
-from lensmodel.core.types import CHANNELS, ZONES, FieldPosition
+from lensmodel.core.psf import PsfField, PsfSample, as_kernel
+from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Kernel
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
 
@@ -114,6 +114,22 @@ def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> N
     place = FieldPosition(0.7, 2.0)
     expected = grid.kernel_at(place, "b", 31)
     np.testing.assert_array_equal(one.truth().kernel_at(place, "b", 31), expected)
+
+
+def test_a_design_at_two_apertures_is_two_lenses_of_fig_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid, seen = read_grid(HELIAR), list[PsfField]()
+    replace(grid, facts={**grid.facts, "f_number": 5.6}).write(tmp_path / "stopped.npz")
+
+    def fit(truth: PsfField, _: Sequence[PsfSample]) -> Callable[[FieldPosition], Kernel]:
+        seen.append(truth)
+        return lambda place: truth.kernel_at(place, "g", 31)
+
+    monkeypatch.setattr(job.figures, "WAYS", {"itself": fit})
+    job.figures._fig2([traced(), traced(tmp_path / "stopped.npz")], tmp_path / "fig2.png")
+
+    assert len(seen) == 1 + 2  # for the picture, and for the table
 
 
 def test_key_of_a_traced_lens_follows_the_content_of_its_grid(tmp_path: Path) -> None:

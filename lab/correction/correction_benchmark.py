@@ -81,9 +81,7 @@ def run_correct_benchmark(
     total = len(methods) + 1 + len(peers)
     results: dict[str, dict[str, float]] = {}
 
-    def timed(
-        light: Planes, method: correction.Deconvolver, part: tuple[int, int, int, int] | None
-    ) -> list[float]:
+    def timed(light: Planes, method: correction.Deconvolver, part: Window) -> list[float]:
         wall, cpu = time.perf_counter(), time.process_time()
         correction.correct_planes(
             light, SoftCorners(), Frame(*light.shape[1:]), noise=noise, method=method, cfa=cfa,

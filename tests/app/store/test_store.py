@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
@@ -487,16 +487,20 @@ def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
         upgrade(store.database)
 
 
-@pytest.mark.tools
-def test_on_a_server_too_samples_are_of_the_version_that_comes_with_them(
-    settings: Settings, steps: Steps
-) -> None:
+@pytest.fixture
+def server(settings: Settings) -> Iterator[Store]:
+    """A store on a database server."""
     with (
-        postgres() as server,
-        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
+        postgres() as own,
+        closing(Store(settings.model_copy(update={"database_url": own.url("app")}))) as opened,
     ):
-        upgrade(on.database)
-        samples_are_of_their_version(on, type(steps)(on))
+        upgrade(opened.database)
+        yield opened
+
+
+@pytest.mark.tools
+def test_on_a_server_too_samples_are_of_the_version_that_comes_with_them(server: Store, steps: Steps) -> None:
+    samples_are_of_their_version(server, type(steps)(server))
 
 
 def test_the_samples_of_a_lens_are_of_the_version_that_comes_with_them(store: Store, steps: Steps) -> None:
@@ -544,47 +548,36 @@ def at_once(store: Store, first: Callable[[], Any], second: Callable[[], Any]) -
 
 @pytest.mark.tools
 def test_two_changes_at_once_wait_for_each_other_on_a_server_and_do_not_deadlock(
-    settings: Settings, steps: Steps
+    server: Store, steps: Steps
 ) -> None:
-    with (
-        postgres() as server,
-        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
-    ):
-        upgrade(on.database)
-        there = type(steps)(on)
-        photo, other = there.counted(), there.counted()
-        lens, ids = there.lens_id(photo), [photo.public_id, other.public_id]
+    there = type(steps)(server)
+    photo, other = there.counted(), there.counted()
+    lens, ids = there.lens_id(photo), [photo.public_id, other.public_id]
 
-        changed = partial(on.photos.change, ids, OWNER, {"aperture": 2.0})
-        backwards = partial(on.photos.change, ids[::-1], OWNER, {"aperture": 2.8})
-        assert at_once(on, changed, backwards) == (True, True)
-        merged = partial(on.lenses.merge, lens, there.named(LensName("Canon", "EF24mm", "7")), OWNER)
-        assert at_once(on, partial(on.photos.change, ids, OWNER, {"aperture": 4.0}), merged) == (True, True)
-        lens = there.lens_id(photo)
-        gone = partial(on.lenses.delete, lens, OWNER)
-        assert at_once(on, partial(on.photos.change, ids, OWNER, {"aperture": 8.0}), gone) == (True, True)
+    changed = partial(server.photos.change, ids, OWNER, {"aperture": 2.0})
+    backwards = partial(server.photos.change, ids[::-1], OWNER, {"aperture": 2.8})
+    assert at_once(server, changed, backwards) == (True, True)
+    merged = partial(server.lenses.merge, lens, there.named(LensName("Canon", "EF24mm", "7")), OWNER)
+    changed = partial(server.photos.change, ids, OWNER, {"aperture": 4.0})
+    assert at_once(server, changed, merged) == (True, True)
+    lens = there.lens_id(photo)
+    gone = partial(server.lenses.delete, lens, OWNER)
+    assert at_once(server, partial(server.photos.change, ids, OWNER, {"aperture": 8.0}), gone) == (True, True)
 
-        deleted = partial(on.photos.delete, photo.public_id, OWNER)
-        folder, again = at_once(on, deleted, partial(there.receive_again, photo))
-        assert folder == photo.folder
-        assert again.public_id != photo.public_id
+    deleted = partial(server.photos.delete, photo.public_id, OWNER)
+    folder, again = at_once(server, deleted, partial(there.receive_again, photo))
+    assert folder == photo.folder
+    assert again.public_id != photo.public_id
 
 
 @pytest.mark.tools
-def test_who_names_a_photo_of_another_owner_does_not_wait_for_that_one(
-    settings: Settings, steps: Steps
-) -> None:
-    with (
-        postgres() as server,
-        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
-    ):
-        upgrade(on.database)
-        theirs = type(steps)(on, "somebody").counted()
+def test_who_names_a_photo_of_another_owner_does_not_wait_for_that_one(server: Store, steps: Steps) -> None:
+    theirs = type(steps)(server, "somebody").counted()
 
-        with ThreadPoolExecutor() as others, on.database.writing() as session:
-            ensure_owner(session, "somebody")
-            deleted = others.submit(on.photos.delete, theirs.public_id, OWNER)
-            assert deleted.result(timeout=stretched(10.0)) is None
+    with ThreadPoolExecutor() as others, server.database.writing() as session:
+        ensure_owner(session, "somebody")
+        deleted = others.submit(server.photos.delete, theirs.public_id, OWNER)
+        assert deleted.result(timeout=stretched(10.0)) is None
 
 
 def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:

@@ -22,7 +22,7 @@ from typing import ClassVar, Final
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
@@ -265,8 +265,6 @@ def find_lights(plane: NDArray[np.floating]) -> NDArray[np.float64]:
 def isolated_lights(lights: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
     """Lights of `find_lights` that have no other beside them that would disturb, within `reach` pixels."""
     places, peaks = lights[:, :2], lights[:, 2]
-    alone = [
-        ((np.abs(places - place).max(axis=1) < reach) & (peaks > _NEIGHBOUR * peak)).sum() == 1
-        for place, peak in zip(places, peaks, strict=True)
-    ]
+    near = spatial.cKDTree(places).query_ball_point(places, reach, p=np.inf)
+    alone = [(peaks[own] > _NEIGHBOUR * peak).sum() == 1 for own, peak in zip(near, peaks, strict=True)]
     return lights[np.array(alone, dtype=bool)]

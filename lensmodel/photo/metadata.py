@@ -37,13 +37,10 @@ _NO_LENS: Final = re.compile(
 )
 """Focal lengths of zero, and the words in which cameras say that they know no lens."""
 
-# One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format
-_SENSOR_WIDTHS_MM: Final = (
-    *((12.8, 13.4), (17.2, 18.1), (22.0, 24.1)),
-    *((27.5, 29.0), (35.4, 36.4), (43.0, 54.1)),
-)
+# Widths of one inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format
+_SENSORS_MM: Final = ((12.8, 13.4), (17.2, 18.1), (22.0, 24.1), (27.5, 29.0), (35.4, 36.4), (43.0, 54.1))
 
-_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
+_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSORS_MM)
 _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm
 _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
 
@@ -238,7 +235,7 @@ class Said:
 
 
 def _is_width_of_sensor(width_mm: float) -> bool:
-    return any(low <= width_mm <= high for low, high in _SENSOR_WIDTHS_MM)
+    return any(low <= width_mm <= high for low, high in _SENSORS_MM)
 
 
 def _lines(text: str | None, separator: str = "\n") -> list[str]:

@@ -208,9 +208,7 @@ def turns_to_sensor(path: Path, header: Header, metadata: PhotoMetadata) -> int 
     small = [np.array(each.resize(size, Image.Resampling.BOX), np.float64).ravel() for each in lying]
     if min(float(each.std()) for each in small) == 0.0:
         return None
-    alike = {
-        k: float(np.corrcoef(turned, small[0])[0, 1]) for k, turned in zip((1, 3), small[1:], strict=True)
-    }
+    alike = dict(zip(ORIENTATION, np.asarray(np.corrcoef(small))[0, 1:], strict=True))
     best, other = sorted(alike, key=alike.__getitem__, reverse=True)
     return best if alike[best] > _ALIKE and alike[best] - alike[other] > _CLEARER else None
 

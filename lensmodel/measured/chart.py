@@ -65,11 +65,7 @@ def print_chart(path: str | Path, *, paper: str = "a3") -> None:
         pdf.pages.append(page)
         pdf.write_header()
         pdf.write_catalog()
-        pdf.write_page(
-            page,
-            MediaBox=[0, 0, round(width, 2), round(height, 2)],
-            Contents=drawing,
-            Resources={"Font": {"F": letters}},
-        )
+        box = [0, 0, round(width, 2), round(height, 2)]
+        pdf.write_page(page, MediaBox=box, Contents=drawing, Resources={"Font": {"F": letters}})
         pdf.write_obj(drawing, stream="\n".join([*shapes, words]).encode("ascii"))
         pdf.write_xref_and_trailer()

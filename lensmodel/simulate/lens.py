@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Final, Protocol, TypeAlias
 
@@ -112,6 +112,11 @@ class SimulatedLens:
     model: str = "Simulated 50mm f/2"
     serial: str = "SIM0000001"
 
+    def __post_init__(self) -> None:
+        ascending = [0.0, *self.focal_mm] == sorted({0.0, *self.focal_mm})
+        if not (ascending and 0 < len(self.optics) == len(self.focal_mm)):
+            raise InvalidInputError(f"give optics, one for each ascending focal length of {self.focal_mm}")
+
     def at_focal(self, focal_mm: float | None = None) -> Aberrations:
         """Optics at a focal length; None means the shortest."""
         if focal_mm is None:
@@ -163,6 +168,8 @@ class SimulatedLens:
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> Kernel:
         """Kernel at field vector `h` (right, up), also outside the frame; see `CameraLens`."""
+        if not 0.5 <= pitch_um <= 50.0:
+            raise InvalidInputError(f"pixel pitch must lie in 0.5..50 um, got {pitch_um}")
         n = self.f_number(settings)
         pupil = Pupil.of(self.at_focal(settings.focal_mm), h, n)
         (col, row), spread = pupil.ray_spot(WAVELENGTH_NM[settings.channel] / 1000.0, n)
@@ -337,6 +344,10 @@ class Aberrations:
     # lateral colour against green: displacement outwards = c1 r + c3 r^3 in half diagonals
     lateral_red: tuple[float, float] = (0.0, 0.0)
     lateral_blue: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (0.7 <= self.f_number <= SMALLEST_F and np.isfinite(np.hstack(astuple(self))).all()):
+            raise InvalidInputError(f"terms must be finite, f_number in 0.7..{SMALLEST_F:g}, got {self}")
 
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
         """Optics between two focal lengths: every term linear in `share` of `other`."""

@@ -35,7 +35,7 @@ from lensmodel.photo import LinearPhoto
 # dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals
 FLOOR: Final = 0.1
 _FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
-# Least share of bright spots that stand alone (chosen): 30 ordinary photos have less than .04, stars .4
+# Least share of lone bright spots (chosen: 30 photos have less than .04, stars .4; no command repeats it)
 _ISOLATED: Final = 0.05
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
 # Of stacking at improved centres: each stack is sharper by those before it, and soon they rest (chosen)

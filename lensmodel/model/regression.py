@@ -41,8 +41,8 @@ _MANY: Final = 4096  # fewer samples are looked through as fast as a tree (chose
 _DRIFT: Final = 0.15
 """Relative L2 error for each unit of `Support` beyond the first to the nearest sample (chosen)."""
 _OUTWARD: Final = 0.5
-"""The same for each unit of place beyond the outermost sample, where none lies on the other side (chosen:
-kernels of drawn lenses wide open differ by .53 to .62, in the median, over a unit along the radius)."""
+"""The same for each unit of place beyond the outermost sample, where none lies on the other side (chosen: of
+drawn lenses wide open the median changes by .53 to .62 over a unit outwards; no command repeats it)."""
 _WIDEST: Final = 255
 """Pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory."""
 

@@ -283,7 +283,8 @@ def profile(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     samples = read.model.samples
     write_samples(folder, samples)
     cameras = sorted({camera_name(camera.maker, camera.model) for camera in read.cameras} - {""})
-    named = {"photos": read.photos, "lens": read.lens, "cameras": cameras}
+    # of the cameras the service asks only whether there is one
+    named = {"photos": read.photos, "lens": read.lens, "cameras": cameras[:2]}
     return {"mode": read.model.settings.mode, "samples": len(samples), **named}
 
 

@@ -363,7 +363,7 @@ def _read_profile(context: JobContext, file: PhotoRow) -> None:
             text = f"the profile seems to be of another lens: {why}; {OTHER_LENS_REMEDY}"
             raise JobFailedError("other_lens", text)
     names = {key: name for key, name in read["photos"].items() if name.isprintable()}
-    called = _called(read["lens"], read.get("cameras", []), own) if file.given.get("rename") else ""
+    called = _called(read["lens"], read["cameras"], own) if file.given.get("rename") else ""
     if not store.photos.take_in(file, samples, names, called if called.isprintable() else ""):
         raise NotWantedError
 

@@ -156,6 +156,7 @@ D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8
         ({"maker": "Canon", "model": "EF24mm f/1.4L"}, (D750,), "Canon EF24mm f/1.4L"),
         ({"serial": "77"}, (D750, replace(D750, serial="2")), "Nikon D750, 24 mm"),
         ({}, (D750, BODY), "file"),
+        ({}, tuple(Camera("Leica", f"M{k}") for k in range(101)), "file"),
         ({}, (), "file"),
         ({"label": "two\nlines"}, (), "file"),
     ],
@@ -168,8 +169,9 @@ def test_a_lens_made_of_a_profile_is_called_as_that_says_else_as_its_file(
     write_profile(sent, replace(known, lens=lens, cameras=cameras))
     made, kept = (client.post("/v1/lenses", json={"label": "file"}).json()["id"] for _ in range(2))
 
-    assert put_profile(client, made, sent.getvalue(), rename=True)[1]["label"] == name
-    assert put_profile(client, kept, sent.getvalue())[1]["label"] == "file"
+    for lens_id, rename, called in ((made, True, name), (kept, False, "file")):
+        job, shown = put_profile(client, lens_id, sent.getvalue(), rename=rename)
+        assert (job["state"], shown["label"]) == ("succeeded", called)
 
 
 def test_a_profile_is_not_read_beside_the_keys_of_the_database(

@@ -216,7 +216,7 @@ class PhotoOut(Model):
 
 
 class PatchOut(Model):
-    """One window of a photo, used or rejected."""
+    """A window of a photo, used or not: top left pixel and side; its middle in half diagonals and radians."""
 
     index: int = Field(validation_alias="idx")
     row: int

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final
@@ -21,10 +21,11 @@ import numpy as np
 import tifffile
 import typer
 from PIL import Image
+from scipy import ndimage
 
 from app.client import Client
 from app.schemas import CorrectionOut, JobOut, PhotoOut
-from lab.images import ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, strip
+from lab.images import Picture, ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, side_by_side
 from lab.kernels import distance
 from lab.scenes import photograph_of
 from lensmodel.cli.console import Display, mtf50_words
@@ -109,8 +110,7 @@ def run(output: Path, say: Say) -> bool:
             say("Stopping the service ...")
     tables |= {"verdict": "better" if improved else "NOT better", "lens": LENS.model}
     tables |= {"seconds": f"{time.monotonic() - began:.0f}", "aperture": f"{SETTINGS.aperture:g}"}
-    text = _REPORT.format(**tables)
-    (output / "report.md").write_text(text, encoding="utf-8")
+    (output / "report.md").write_text(_REPORT.format(**tables), encoding="utf-8")
     say(f"Report: {output / 'report.md'}")
     return improved
 
@@ -152,9 +152,7 @@ def _learned(
     say(f"Correcting {HELD_OUT} as a picture to look at")
     shutil.copy(_corrected(client, held_out, work, say), output / "corrected.tif")
     seen, shown = (as_shown(planes, CAMERA.white_balance) for planes in (before, after))
-    between = np.full_like(strip(seen, _SIDE)[:6], 255)
-    rows_shown = np.concatenate([strip(seen, _SIDE), between, strip(shown, _SIDE)])
-    Image.fromarray(rows_shown).save(output / "before-after.png", optimize=True)
+    Image.fromarray(_enlarged([seen, shown])).save(output / "before-after.png", optimize=True)
     improved = last["center"] > first["center"] and last["corner"] > first["corner"]
     return improved, {"learned": "\n".join(rows), "edges": _edge_rows(*edges)}
 
@@ -191,6 +189,17 @@ def _psnr(planes: Planes, truth: Planes) -> Mapping[Zone, float]:
 
 def _sharpness(planes: Planes) -> dict[Zone, ZoneSharpness]:
     return by_zone(measure_edges(planes[1], [edge.box for edge in _CHART.edges]))
+
+
+def _enlarged(pictures: Sequence[Picture]) -> Picture:
+    """Rows of crops, twice as large: the three tiles where the last picture has most detail."""
+    steep = ndimage.gaussian_gradient_magnitude(pictures[-1].mean(axis=2), 1.0)
+    rows, cols = (n // _SIDE for n in steep.shape)
+    detail = steep[: rows * _SIDE, : cols * _SIDE].reshape(rows, _SIDE, cols, _SIDE).sum(axis=(1, 3))
+    best = sorted(np.argsort(detail, axis=None)[-3:], key=lambda number: number % cols)
+    places = [(number // cols * _SIDE, number % cols * _SIDE) for number in best]
+    strips = [side_by_side([p[r : r + _SIDE, c : c + _SIDE] for r, c in places]) for p in pictures]
+    return np.concatenate(strips).repeat(2, axis=0).repeat(2, axis=1)
 
 
 def _cells(values: Mapping[Zone, float]) -> str:

@@ -29,8 +29,6 @@ from lensmodel.core import psf
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.simulate import draw_lens, load_scene
 
-# --- PSFs ---
-
 PSF_SIZE: Final = 55  # pixels of a kernel: the largest that the paper estimates
 FIRST_SEED: Final = 5000  # apart from the seeds of other commands (chosen)
 COPIES: Final = 24
@@ -80,8 +78,6 @@ def psf_of(wanted: Wanted) -> tuple[Kernel, str]:
     )
     return kernel, facts
 
-
-# --- edges ---
 
 COUNT: Final = 220  # windows of the prior (chosen)
 ANGLES: Final = 32  # of edges in a turn (chosen)
@@ -137,8 +133,6 @@ def steepness() -> NDArray[np.float64]:
         found.append(steepness_of(view.y)[edge_mask(view.y)])
     return np.quantile(np.concatenate(found), (np.arange(QUANTILES) + 0.5) / QUANTILES)
 
-
-# --- mixture ---
 
 WINDOW: Final = 8  # pixels of a window, as in the paper
 

@@ -18,31 +18,30 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import LEAST_CLIPPED, compact
 from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.devices import chosen
 
 Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-REACH: Final = 2
+_REACH: Final = 2
 """Radius in pixels of the window whose light bounds a pixel (chosen: within one pixel only the blur of a thin
 line is seen and not its surroundings; further away lies another object)."""
-LEVEL: Final = 0.1
+_LEVEL: Final = 0.1
 """Share of the range within which pixels belong to the level beside an edge (chosen: far more than noise)."""
-LINE_SHARE, EDGE_SHARE = 0.12, 0.25
+_LINE_SHARE, _EDGE_SHARE = 0.12, 0.25
 """Share of a window that lies at the level of a line, and of an edge (chosen: a line narrower than its blur
 is as bright as its middle over a tenth of a window, an edge over a quarter at least)."""
-HUE_REACH: Final = 2
+_HUE_REACH: Final = 2
 """Radius of the window whose colours a pixel may have (chosen: with 3, more blocks of foliage lose)."""
-PURER: Final = 0.01
+_PURER: Final = 0.01
 """By how much a colour's share of the light may leave the range nearby where the kernel is unsure (chosen:
 colours that blur has washed out get purer; with twice as much, a block more of foliage loses half a decibel,
 with none cars get dots). The surer, the more, as for lines: else a true kernel gains up to 1.2 dB less."""
-COLOURLESS: Final = 0.05
+_COLOURLESS: Final = 0.05
 """Share of the brightest light nearby that is added as grey to what lends its colour: what is far darker
 shows none beside it (chosen)."""
-OWN_COLOURLESS: Final = 0.02
+_OWN_COLOURLESS: Final = 0.02
 """The same for the pixel itself where the kernel is unsure (chosen: with more, black letters get green)."""
-TINY: Final = 1e-5  # light, as seen, below which there is none
+_TINY: Final = 1e-5  # light, as seen, below which there is none
 _MOST: Final = (
     12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
 )
@@ -176,18 +175,8 @@ def limited(
         _beside_lamps(photo, held, broad | white, kinds, white.astype(np.float32), glow, near)
     darkest = np.float32(_DARKEST * min(error / _SURE, 1.0) if halo is None else 0.0)
     most = np.empty(shape, dtype=np.float32)
-    device = chosen()
-    if device is not None and number.size == 0:
-        from lensmodel.correction.limit_on_device import held_on_device  # noqa: PLC0415 - needs the numbers above
-
-        colourless = _SIGMAS * dark + 1e-6
-        held = held_on_device(
-            device, photo, held, near, wide, (room, edge), float(darkest), colourless, known
-        )
-    else:
-        shares = (np.float32(room), np.float32(edge))
-        _hold_light(photo, held, near, wide, shares, darkest, most)
-        _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6), np.float32(known))
+    _hold_light(photo, held, near, wide, (np.float32(room), np.float32(edge)), darkest, most)
+    _hold_colour(photo, held, most, number, clip, np.float32(_SIGMAS * dark + 1e-6), np.float32(known))
     if halo is None:
         own = np.where(near, np.float32(1.0), np.float32(known))
         for plane, made, sensor in zip(photo, held, sensors, strict=True):
@@ -195,7 +184,7 @@ def limited(
     elif halo < _FREE:
         low, high = np.empty_like(photo), np.empty_like(photo)
         for c in range(len(photo)):
-            extremes(photo[c], photo[c], REACH, low[c], high[c])
+            extremes(photo[c], photo[c], _REACH, low[c], high[c])
         more = np.float32(halo) * (high - low)
         np.clip(held, low - more, high + more, out=held)
     return held
@@ -271,7 +260,7 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
     all_of_it = np.float32((2 * wide + 1) ** 2)
     for i in range(rows):
         for j in range(cols):
-            room = np.float32(LEVEL) * (top[i, j] - bottom[i, j])
+            room = np.float32(_LEVEL) * (top[i, j] - bottom[i, j])
             low[j], high[j] = bottom[i, j] + room, top[i, j] - room
         dark[:] = 0
         bright[:] = 0
@@ -282,8 +271,8 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
                     dark[j] += np.int32(value <= low[j])
                     bright[j] += np.int32(value >= high[j])
         scale, start = (
-            np.float32(1.0 / (EDGE_SHARE - LINE_SHARE)) / all_of_it,
-            np.float32(LINE_SHARE) * all_of_it,
+            np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it,
+            np.float32(_LINE_SHARE) * all_of_it,
         )
         for j in range(cols):
             below[i, j] = min(max((np.float32(dark[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
@@ -306,7 +295,7 @@ def _hold_light(
     """
     rows, cols = most.shape
     zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
-    tiny = np.float32(TINY)
+    tiny = np.float32(_TINY)
     room, edge = shares
     floor = np.sqrt(darkest)
     light, seen = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
@@ -315,7 +304,7 @@ def _hold_light(
             light[i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
             seen[i, j] = np.sqrt(max(light[i, j], zero))
     least = np.empty((rows, cols), np.float32)
-    extremes(seen, seen, REACH, least, most)
+    extremes(seen, seen, _REACH, least, most)
     blocks = ((rows + 1) // 2, (cols + 1) // 2)
     bottoms, tops = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
     belows, aboves = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
@@ -352,7 +341,7 @@ def _hold_own(y: Real, x: Real, room: Real, dark: Number) -> None:
     for i in range(rows):
         for j in range(cols):
             seen[i, j] = np.sqrt(max(y[i, j], zero) + dark)
-    extremes(seen, seen, REACH, low, high)
+    extremes(seen, seen, _REACH, low, high)
     for i in range(rows):
         for j in range(cols):
             more = room[i, j] * (high[i, j] - low[i, j])
@@ -411,12 +400,12 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
     `most` is the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
-    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(PURER) * known
-    grey_share = min(np.float32(OWN_COLOURLESS / COLOURLESS) * known, one)
+    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(_PURER) * known
+    grey_share = min(np.float32(_OWN_COLOURLESS / _COLOURLESS) * known, one)
     lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
-    reach, side = HUE_REACH, 2 * HUE_REACH + 1
+    reach, side = _HUE_REACH, 2 * _HUE_REACH + 1
     least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
-    extremes(most, most, reach - REACH, least, floors)
+    extremes(most, most, reach - _REACH, least, floors)
     own, made = np.empty((3, cols), np.float32), np.empty((3, cols), np.float32)
     here, there = np.empty((_AXES, cols), np.float32), np.empty((_AXES, cols), np.float32)
     # ranges along rows, of the rows that the next one needs: all rows at once do not fit into a cache
@@ -428,7 +417,7 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
         if ahead < rows:
             for j in range(cols):
                 floors[ahead, j] = max(
-                    dark, np.float32(3.0 * COLOURLESS) * floors[ahead, j] * floors[ahead, j]
+                    dark, np.float32(3.0 * _COLOURLESS) * floors[ahead, j] * floors[ahead, j]
                 )
             _axes(y, floors[ahead], ahead, own, here)
             for k in range(_AXES):
@@ -470,7 +459,7 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
 @jit
 def _along(line: Real, number: Real, i: int, padded: Real, low: Real, high: Real) -> None:
     """Range of a coordinate along a row; pixels of two clipped colours do not count."""
-    reach, cols = HUE_REACH, line.size
+    reach, cols = _HUE_REACH, line.size
     padded[0, reach : reach + cols] = line
     padded[1, reach : reach + cols] = line
     if number.size > 0:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,15 +84,8 @@ class Shrinkage:
 
     def __call__(self, v: NDArray[np.float32], scale: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Shrink `v`, any shape, with the scale s that broadcasts against it."""
-        return np.asarray(self.shrunk(np, v, scale), dtype=np.float32)
-
-    def shrunk(self, xp: Any, v: Any, scale: Any) -> Any:  # noqa: ANN401 - arrays of any library
-        """The same with arrays of the library whose array API `xp` is."""
-        size = xp.clip(xp.abs(v), 1e-20, None)
+        size = np.maximum(np.abs(v), 1e-20)
         below = scale / size
-        inverse = xp.clip(below, 1.0 / _REACH, self.edge)
-        subtracted = xp.zeros_like(inverse)
-        for term in self.terms:
-            subtracted = subtracted * inverse + float(term)
-        share = xp.clip((self.edge - below) * self.steepness, 0.0, 1.0)
-        return xp.sign(v) * (size - scale * subtracted) * share
+        subtracted = np.polyval(self.terms, np.clip(below, 1.0 / _REACH, self.edge))
+        share = np.clip((self.edge - below) * self.steepness, 0.0, 1.0)
+        return np.asarray(np.sign(v) * (size - scale * subtracted) * share, dtype=np.float32)

@@ -18,8 +18,6 @@ from lensmodel.correction.compiled.grain import spread_grain
 from lensmodel.correction.compiled.half_quadratic import half_quadratic
 from lensmodel.correction.compiled.tile import fill
 from lensmodel.correction.deconvolver import Restored, Sensor, Solution
-from lensmodel.correction.devices import chosen
-from lensmodel.correction.methods.half_quadratic_on_device import half_quadratic_on_device
 from lensmodel.correction.methods.shrinkage import Shrinkage
 from lensmodel.correction.scene_power import prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
@@ -313,9 +311,6 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
 
 def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
     """The planes on the canvas, and what they make of the data, blurred again."""
-    device = chosen()
-    if device is not None:
-        return half_quadratic_on_device(device, p)
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
     x, explained = np.empty_like(p.y), np.empty_like(p.y)
     half_quadratic(

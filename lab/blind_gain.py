@@ -104,13 +104,13 @@ def rows(lens: KnownLens, counts: Sequence[int], folder: Path, crop: float = 1.0
     for path in shots:
         config = sampling.configured("default", lens.settings)
         try:
-            samples.append(sampling.samples_of_photo(path, config, workers=1, siblings=shots))
+            samples.append(sampling.samples_of_photo(path, config, workers=1))
         except NotEnoughEvidenceError:
             samples.append([])
     truth = replace(lens, hot=0).shot(max(counts), folder / "clean.dng", crop)
     clean = photo.develop(folder / "clean.dng")
     lens.shot(max(counts), folder / "last.dng", crop)
-    developed = photo.develop(folder / "last.dng", siblings=shots)
+    developed = photo.develop(folder / "last.dng")
     for count in counts:
         known = [sample for own in samples[:count] for sample in own]
         if not known:

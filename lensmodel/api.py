@@ -190,7 +190,6 @@ def correct(
     least_gain_db: float | None = None,
     keep_location: bool = False,
     workers: int | None = None,
-    siblings: Iterable[Path | str] = (),
     on_step: StepHook | None = None,
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
@@ -233,8 +232,6 @@ def correct(
         Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
-    siblings : iterable of paths
-        Other photos of the body: a pixel that stands out in two pictures is defective and is replaced.
     on_step : callable
         Called as `on_step(done, total)`; raising `CancelledError` there stops the work. None shows the
         progress in a terminal.
@@ -276,7 +273,7 @@ def correct(
         if isinstance(image, LinearPhoto)
         else photo_from_array(np.asarray(image))
         if source is None
-        else photo.develop(source, siblings=[Path(name) for name in siblings])
+        else photo.develop(source)
     )
     corrected = correct_photo(
         developed,

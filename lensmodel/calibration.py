@@ -101,21 +101,15 @@ class Calibration:
         executor: Executor | None = None,
         *,
         ahead: int = AHEAD,
-        siblings: Iterable[Path] | None = None,
         on_event: EventHook = ignore_event,
     ) -> Iterator[CalibrationEvent]:
-        """Learn from photos in their order, on an executor if there is one; give what becomes of each.
-
-        `siblings` are the photos that tell of the defects of the sensor; by default all of them.
-        """
-        paths = list(paths)
-        siblings = paths if siblings is None else siblings
+        """Learn from photos in their order, on an executor if there is one; give what becomes of each."""
         jobs: Iterable[tuple[Path, Future[list[PsfSample]] | None]] = ((path, None) for path in paths)
         if executor is not None:
             jobs = processes.in_order(executor, samples_of_bytes, paths, self._sent, ahead=ahead)
         for path, job in jobs:
             try:
-                count = self.add(path, partial(self._sampled, path, job, siblings, on_event))
+                count = self.add(path, partial(self._sampled, path, job, on_event))
             except CancelledError:  # is of the whole work, not of one photo
                 raise
             except (LensModelError, OSError) as error:
@@ -159,7 +153,6 @@ class Calibration:
         self,
         path: Path,
         job: Future[list[PsfSample]] | None,
-        siblings: Iterable[Path],
         on_event: EventHook,
         key: str,
         admit: Admit,
@@ -174,7 +167,6 @@ class Calibration:
             key=key,
             admit=admit,
             executor=self._pool,
-            siblings=siblings,
             on_event=on_event,
         )
 

@@ -48,7 +48,6 @@ THREAD_MB: Final = 136
 # Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has.
 # Reading takes so many times as much (chosen, by counting): bytes, float32, float64, the model.
 MAX_UNPACKED, COPIES = 256 << 20, 8
-SIBLINGS: Final = 7  # photos that tell of the defects of a sensor (chosen): more tell hardly more
 # Size of the cache at most (chosen: some seventy photos of 24 megapixels as planes of float32), or half of
 # the free disk if that is less
 KEEP_BYTES: Final = 20 << 30
@@ -187,14 +186,12 @@ class JobContext:
                 return target
             target.parent.mkdir(parents=True, exist_ok=True)
             path = files.enter_context(self.original(photo))
-            siblings = self._siblings(photo, files)
             done = self.task(
                 "develop",
                 photo,
                 wanted,
-                reads=[path, *siblings],
+                reads=[path],
                 path=str(path),
-                siblings=[str(sibling) for sibling in siblings],
                 max_megapixels=self.settings.max_megapixels,
             )
             _, folder = files.enter_context(done)
@@ -208,16 +205,6 @@ class JobContext:
         """Store what a task wrote for readers that read all of it; nothing that is missing or too large."""
         if written.is_file() and written.stat().st_size <= MAX_RESULT:
             self.storage.put(key, written)
-
-    def _siblings(self, photo: PhotoRow, files: ExitStack) -> list[Path]:
-        """Provide other photos of the same body, which tell of defects of its sensor, if they are here."""
-        rows = [] if self.storage.folder is None else self.store.photos.siblings(photo, SIBLINGS)
-        folder, paths = files.enter_context(self.sandbox.folder()), list[Path]()
-        for row in rows:
-            with suppress(OSError):  # deleted meanwhile
-                file = self.storage.as_file(row.blob_key, folder, copied=self._copied)
-                paths.append(files.enter_context(file))
-        return paths
 
 
 def _patient(wanted: Wanted) -> Wanted:

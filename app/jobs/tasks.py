@@ -109,8 +109,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     """Develop `path` to linear planes in the folder."""
     del progress
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
-    siblings = [Path(name) for name in arguments.get("siblings", ())]
-    developed = photo.develop(Path(arguments["path"]), limits=limits, siblings=siblings)
+    developed = photo.develop(Path(arguments["path"]), limits=limits)
     sampling.save_developed(developed, folder)
     _show(folder / SHOWN, developed.planes, developed)
 

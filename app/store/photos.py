@@ -133,16 +133,6 @@ class Photos(Works[PhotoRow]):
         return session.scalar(query.order_by(func.random()).limit(1))
 
     @reads
-    def siblings(self, session: Session, photo: PhotoRow, limit: int) -> list[PhotoRow]:
-        """Return the newest other RAW photos of the same owner and body whose file is kept."""
-        if photo.body_key is None:
-            return []
-        same = (PhotoRow.owner_id == photo.owner_id, PhotoRow.body_key == photo.body_key)
-        raw = (PhotoRow.id != photo.id, PhotoRow.kind.in_(("raw", "dng")))
-        query = select(PhotoRow).where(*same, *raw, _FILED).order_by(PhotoRow.id.desc())
-        return list(session.scalars(query.limit(limit)))
-
-    @reads
     def existing(self, session: Session, photo_ids: Iterable[str]) -> set[str]:
         """Return which of these photos are not deleted and still have their file."""
         query = select(PhotoRow.public_id).where(PhotoRow.public_id.in_(list(photo_ids)), _FILED)

@@ -15,7 +15,7 @@ import json
 import logging
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -290,7 +290,6 @@ def samples_of_photo(
     admit: Callable[[PhotoMetadata], None] | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
-    siblings: Iterable[Path] = (),
     on_event: EventHook = ignore_event,
 ) -> list[PsfSample]:
     """Develop one photo, find its patches and estimate a PSF for each patch and channel."""
@@ -301,7 +300,7 @@ def samples_of_photo(
             admit(info.metadata)
         on_event(CalibrationEvent(path, "developing"))
 
-    developed = photo.develop(path, on_info=admitted, siblings=siblings)
+    developed = photo.develop(path, on_info=admitted)
     on_event(CalibrationEvent(path, "selecting"))
     method = estimators.resolve(config.estimator)
     selection = find_patches(developed, count=config.patches, selector=config.selector, estimator=method)

@@ -91,7 +91,7 @@ def _learn(
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)
     paths = [shot.path for shot in group.to_learn_from()]
-    for event in calibration.learn(paths, siblings=group.paths, on_event=on_event):
+    for event in calibration.learn(paths, on_event=on_event):
         if event.error is None:
             counted += 1
         else:

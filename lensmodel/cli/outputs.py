@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -112,7 +112,7 @@ class Correction:
         for number, path in enumerate(paths, start=begin):
             bar.show(description=f"correcting {path.name}", more=more)
             target = self.targets[path]
-            result = self._photo(path, target, lens, paths, partial(bar.part, number, more=more))
+            result = self._photo(path, target, lens, partial(bar.part, number, more=more))
             match result["state"]:
                 case "failed":
                     self.display.error(f"{path}: {result['reason']}")
@@ -133,9 +133,7 @@ class Correction:
             bar.show(completed=number + 1, more=more)
         return results
 
-    def _photo(
-        self, path: Path, target: Path, lens: Lens | None, siblings: Iterable[Path], on_step: StepHook
-    ) -> dict[str, Any]:
+    def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
         """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
         refused = self.refused.get(path)
         little = refused is None or isinstance(refused, NotEnoughEvidenceError)
@@ -154,7 +152,7 @@ class Correction:
             lossy = info.kind == "jpeg"
             least = SEEN_DB if self.sorted or (lossy and not self.force) else None
             corrected = lensmodel.correct(
-                path, lens, target, least_gain_db=least, siblings=siblings, on_step=on_step, **self.options
+                path, lens, target, least_gain_db=least, on_step=on_step, **self.options
             )
         except (LensModelError, OSError) as error:
             return files.failed(error)

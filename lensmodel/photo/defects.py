@@ -1,16 +1,12 @@
-"""Defective pixels of a sensor: found on the mosaic and replaced by their neighbours.
+"""Defective pixels of a sensor: found on the mosaic of one photo and replaced by their neighbours.
 
 A hot pixel taken for a point of light teaches a kernel as narrow as itself, and a correction makes a ring
-of it. Light comes through a lens: the pixels beside a point of light get some of it. So a single photo shows
-a defect where one pixel stands out of smooth surroundings that get none. In busy places, and where defects
-touch each other, it takes a second photo of the same body: what stands out at the same pixel in two different
-pictures is in neither of them.
+of it. Light comes through a lens: the pixels beside a point of light get some of it. So a photo shows a
+defect where one pixel stands out of smooth surroundings that get none; in busy places it stays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Final, TypeAlias
 
@@ -20,36 +16,24 @@ from numpy.typing import NDArray
 # Least height above the neighbours of the colour, in standard deviations of the noise and relative to how
 # much these differ, where texture stays below, and most of it in the pixels beside: points of light have a
 # tenth. All are chosen.
-_SIGMAS: Final = {"sure": 25.0, "likely": 10.0, "possible": 10.0}
-_CONTRAST: Final = {"sure": 5.0, "likely": 2.0, "possible": 1.5}
-_BESIDE: Final = {"sure": 0.05, "likely": 0.15, "possible": 0.25}
+_SURE: Final = (25.0, 5.0, 0.05)
+_LIKELY: Final = (10.0, 2.0, 0.15)
 
 _MANY: Final = 3.0  # where so many times more are sure than likely, the likely ones are defects too (chosen)
 _MOST: Final = 2e-3  # share of the pixels above which they are a picture, such as a sky of stars (chosen)
-_ALIKE: Final = 0.9  # correlation of small pictures from which on they show one scene (a burst: 0.99; chosen)
 _NEIGHBOURS: Final = 8  # of the same colour
 _FILLED_FROM: Final = 4  # of them, the nearest (chosen): more lie across edges
 _REACH: Final = 4  # pixels to the farthest of them, in any mosaic that is read
-_NEARLY: Final = 0.8  # of the least height (chosen): above all neighbours but one, not above their median
+# Least height above all neighbours but one, not above their median: in standard deviations, and relative to
+# how much those that are left differ (chosen)
+_NEARLY: Final = (8.0, 0.75)
 _SAMPLES: Final = 60_000  # pixels that tell of the noise (chosen): more would not change it
 _LEVELS: Final = 24  # at which noise is measured (chosen)
 _QUIET: Final = 0.3  # share of a level's pixels, most like their neighbours, that tell of the noise (chosen)
 _QUIET_HEIGHT: Final = 0.42  # their quantile of |N(0, 1 + pi / 16)|: white noise against a median of eight
-_SMALL: Final = (24, 36)  # of the pictures by which scenes are told apart (chosen)
 
 Places: TypeAlias = NDArray[np.int64]
 """Pixels of a mosaic by their number, row by row; sorted."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Suspects:
-    """What one photo tells of the defects of its sensor."""
-
-    sure: Places  # are defects
-    likely: Places  # are defects as far as this photo tells; `sure` among them
-    possible: Places  # are defects if they stand out in another picture too; `likely` among them
-    small: NDArray[np.float32]  # the picture, small: tells one scene from another
-    shape: tuple[int, int]
 
 
 class Neighbours:
@@ -98,7 +82,7 @@ class Neighbours:
         return at[0] * self.shape[1] + at[1]
 
 
-def suspects(values: NDArray[np.uint16], near: Neighbours) -> Suspects:
+def defects(values: NDArray[np.uint16], near: Neighbours) -> Places:
     """Find the pixels of a mosaic that stand alone, brighter or darker than all around them."""
     levels, deviations = _noise(values, near)
     flat, places = values.ravel(), _standing_out(values, near, levels, deviations)
@@ -108,41 +92,19 @@ def suspects(values: NDArray[np.uint16], near: Neighbours) -> Suspects:
     height = np.abs(flat[places] - middle)
     apart = np.sort(np.abs(ring - middle), axis=0)
     sigma = np.maximum(np.interp(middle, levels, deviations), 1.4826 * apart[_NEIGHBOURS // 2])
-    kept = np.maximum(_SIGMAS["possible"] * sigma, _CONTRAST["possible"] * apart[-2]) < height
-    places, sign, height, sigma, apart = (
-        array[..., kept] for array in (places, sign, height, sigma, apart[-2:])
-    )
     beside = near.touching(places)
     level = np.median(flat[near.of(beside.ravel())].astype(np.float32), axis=0).reshape(beside.shape)
     bumps = sign * (flat[beside] - level)
 
-    def alone(kind: str, differ: NDArray[np.floating], most: NDArray[np.floating], more: float) -> Places:
-        chosen = np.maximum(_SIGMAS[kind] * sigma, _CONTRAST[kind] * differ) < height
-        chosen &= (bumps.mean(axis=0) < _BESIDE[kind] * height) | (kind == "possible")
-        return np.sort(places[chosen & (most < _BESIDE[kind] * height + more * sigma)])
+    def alone(sigmas: float, contrast: float, most_beside: float) -> Places:
+        chosen = np.maximum(sigmas * sigma, contrast * apart[-1]) < height
+        chosen &= bumps.mean(axis=0) < most_beside * height
+        return np.sort(places[chosen & (np.abs(bumps).max(axis=0) < most_beside * height + 4.0 * sigma)])
 
-    most, median = np.abs(bumps).max(axis=0), np.median(np.abs(bumps), axis=0)
-    sure, likely = (alone(kind, apart[1], most, 4.0) for kind in ("sure", "likely"))
-    possible = np.union1d(likely, alone("possible", apart[0], median, 2.0))
-    if len(sure) <= _MANY * len(np.setdiff1d(likely, sure)):
-        likely = sure
+    sure, likely = alone(*_SURE), alone(*_LIKELY)
     if len(sure) > _MOST * values.size:
-        sure = likely = possible = places[:0]
-    return Suspects(sure, likely, possible, _small(values, near.period), values.shape)
-
-
-def defects_of(own: Suspects, others: Sequence[Suspects] = ()) -> Places:
-    """The defects of a sensor that a photo shows by itself or together with others of the body."""
-    scenes: list[list[Suspects]] = []
-    for photo in (own, *(other for other in others if other.shape == own.shape)):
-        same = next((scene for scene in scenes if _correlation(scene[0].small, photo.small) > _ALIKE), None)
-        scenes.append([photo]) if same is None else same.append(photo)
-    if len(scenes) == 1:
-        return own.likely
-    by_scene = [np.unique(np.concatenate([photo.possible for photo in scene])) for scene in scenes]
-    places, counts = np.unique(np.concatenate(by_scene), return_counts=True)
-    sure = [photo.sure for scene in scenes for photo in scene]
-    return np.unique(np.concatenate([places[counts > 1], *sure]))
+        return places[:0]
+    return likely if len(sure) > _MANY * len(np.setdiff1d(likely, sure)) else sure
 
 
 def replace_defects(values: NDArray[np.uint16], places: Places, near: Neighbours) -> int:
@@ -179,8 +141,7 @@ def _standing_out(
     index = near.inside(*(np.arange(-_REACH, side + _REACH) for side in values.shape))
     wide, period = values[np.ix_(*index)], near.period
     planes = {site: np.ascontiguousarray(wide[site[0] :: period, site[1] :: period]) for site in near.alike}
-    noise = np.interp(np.arange(1 << 16), levels, sigma)
-    least = (_NEARLY * _SIGMAS["possible"] * noise).astype(np.float32)
+    least = (_NEARLY[0] * np.interp(np.arange(1 << 16), levels, sigma)).astype(np.float32)
     found = []
     for (row, col), offsets in near.alike.items():
         site = values[row::period, col::period]
@@ -197,26 +158,9 @@ def _standing_out(
             np.minimum(second_low, np.maximum(low, one), out=second_low)
             np.minimum(low, one, out=low)
         spread = (second - np.minimum(second, second_low)).astype(np.float32)
-        need = np.maximum(np.float32(_CONTRAST["possible"] / 2.0) * spread, least[second])
+        need = np.maximum(np.float32(_NEARLY[1]) * spread, least[second])
         above = site - np.minimum(site, second)
         below = second_low - np.minimum(second_low, site)
         rows, cols = np.nonzero(np.maximum(above, below) > need)
         found.append((rows * period + row) * values.shape[1] + cols * period + col)
     return np.concatenate(found)
-
-
-def _small(values: NDArray[np.uint16], period: int) -> NDArray[np.float32]:
-    """The picture as logarithms of the means of blocks of whole periods."""
-    rows, cols = (
-        max(side // count // period, 1) * period for side, count in zip(values.shape, _SMALL, strict=True)
-    )
-    down, across = values.shape[0] // rows, values.shape[1] // cols
-    blocks = values[: down * rows, : across * cols].reshape(down, rows, across, cols)
-    return np.log1p(blocks.mean(axis=(1, 3), dtype=np.float32))
-
-
-def _correlation(one: NDArray[np.float32], two: NDArray[np.float32]) -> float:
-    """Correlation of two small pictures; of one without contrast, 1."""
-    if one.shape != two.shape or min(float(one.std()), float(two.std())) < 1e-4:
-        return float(one.shape == two.shape)
-    return float(np.corrcoef(one.ravel(), two.ravel())[0, 1])

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -17,17 +15,14 @@ from numpy.typing import ArrayLike
 
 from lensmodel.core.errors import (
     InvalidInputError,
-    LensModelError,
     MetadataMissingError,
     NotAnImageError,
     TruncatedImageError,
     UnsupportedFormatError,
 )
 from lensmodel.core.geometry import Frame
-from lensmodel.core.names import name_key, serial_key
 from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
 from lensmodel.photo.containers import check_size, opened_header
-from lensmodel.photo.defects import Suspects
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
@@ -39,7 +34,6 @@ MIN_SIDE = 16  # smaller pictures are icons, not photos
 
 # Compressions of DNG that LibRaw, as built for Python, opens but cannot decode.
 _UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
-_MOST: Final = 7  # photos that are asked (chosen): with eight, what stands out in one of three is found
 
 
 def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
@@ -86,49 +80,11 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
     return PhotoInfo(header.kind, width, height, metadata, said.is_centred(metadata), turns)
 
 
-def _suspects_of_siblings(
-    path: Path, metadata: PhotoMetadata, siblings: Iterable[Path], limits: Limits
-) -> list[Suspects]:
-    """Ask other RAW photos of the same body; what cannot be read, or is of another body, is passed over."""
-    told: list[Suspects] = []
-    for sibling in siblings:
-        if len(told) == _MOST:
-            break
-        with contextlib.suppress(LensModelError, OSError):
-            status = sibling.stat()
-            if os.path.samestat(status, path.stat()):
-                continue
-            body, seen = _suspects(sibling, status.st_mtime_ns, status.st_size, limits)
-            if seen is not None and body == _body(metadata):
-                told.append(seen)
-    return told
-
-
-@lru_cache(maxsize=256)  # answers (chosen): each is some thousand numbers
-def _suspects(
-    path: Path, changed_ns: int, size: int, limits: Limits
-) -> tuple[tuple[str, ...], Suspects | None]:
-    """The body of a photo and what its mosaic shows, nothing without a mosaic or a known body."""
-    del changed_ns, size  # a file that changed is another one
-    with opened_header(path, limits) as header:
-        body = _body(Said.of(header).metadata())
-    if not body[0]:
-        return body, None
-    with _opened(path, limits) as (_, raw):
-        mosaic = None if raw is None else Mosaic.of(raw)
-        return body, None if mosaic is None else mosaic.suspects()
-
-
-def _body(metadata: PhotoMetadata) -> tuple[str, ...]:
-    return name_key(metadata.camera_model), serial_key(metadata.body_serial)
-
-
 def develop(
     path: Path | str,
     *,
     limits: Limits | None = None,
     on_info: Callable[[PhotoInfo], None] | None = None,
-    siblings: Iterable[Path] = (),
 ) -> LinearPhoto:
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
@@ -144,9 +100,6 @@ def develop(
         How large it may be; checked before decoding.
     on_info : callable, optional
         Called with what `inspect` returns before anything is decoded; raising there refuses the photo.
-    siblings : iterable of Path
-        Other photos, which tell of the defective pixels of the sensor: RAW files of the same body are read,
-        others passed over.
 
     Returns
     -------
@@ -177,11 +130,7 @@ def develop(
         except MetadataMissingError:  # of a photo that is damaged nobody shall look up what it does not say
             read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
             raise
-        if raw is None:
-            developed = develop_raster(path, said, info)
-        else:
-            others = _suspects_of_siblings(path, info.metadata, siblings, limits)
-            developed = develop_raw(raw, said, info, others)
+        developed = develop_raster(path, said, info) if raw is None else develop_raw(raw, said, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)
     return developed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.types import BayerPattern, Plane
 from lensmodel.photo.containers import require_known_mosaic
-from lensmodel.photo.defects import Neighbours, Suspects, defects_of, replace_defects, suspects
+from lensmodel.photo.defects import Neighbours, defects, replace_defects
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.values import PlaneNoise
 
@@ -103,16 +102,10 @@ class Mosaic:
             random += deviation > 0.15 * scale and step > 0.9 * deviation
         return random / len(starts)
 
-    def suspects(self) -> Suspects:
-        """Find the pixels that may be defects of the sensor."""
-        return suspects(self.values, self._near())
-
-    def repair(self, others: Sequence[Suspects] = ()) -> int:
+    def repair(self) -> int:
         """Replace defective pixels in LibRaw's own memory, before it demosaics; return how many."""
-        return replace_defects(self.values, defects_of(self.suspects(), others), self._near())
-
-    def _near(self) -> Neighbours:
-        return Neighbours(self.colours, 2 if self.is_bayer else 6)
+        near = Neighbours(self.colours, 2 if self.is_bayer else 6)
+        return replace_defects(self.values, defects(self.values, near), near)
 
     def saturation(self) -> tuple[int, tuple[float, float, float]]:
         """Level at which the sensor clips, and that of each colour relative to it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC
@@ -20,7 +20,6 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3, srgb_to_linear
-from lensmodel.photo.defects import Suspects
 from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
@@ -91,13 +90,10 @@ def exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
     )
 
 
-def develop_raw(
-    raw: rawpy.RawPy, said: Said, info: PhotoInfo, others: Sequence[Suspects] = ()
-) -> LinearPhoto:
+def develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced.
 
-    No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates. `others`
-    tell what other photos of the body show of its defects.
+    No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates.
     """
     header, mosaic = said.header, Mosaic.of(raw)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
@@ -108,7 +104,7 @@ def develop_raw(
         white, clip = mosaic.saturation()
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
         kept, lost = opcodes.demosaiced(kept, cfa)
-        defects = mosaic.repair(others)
+        defects = mosaic.repair()
     balance = _white_balance(raw, mosaic)
     planes = _developed(raw, white, balance, stated)
     _, height, width = planes.shape

@@ -15,9 +15,8 @@ from lab.images import gains, to_srgb
 from lensmodel import calibrate, correct, photo, simulate
 from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
-from lensmodel.photo.defects import Neighbours, defects_of, suspects
+from lensmodel.photo.defects import Neighbours, defects
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.photo.values import PhotoMetadata
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)
 RANGE = CAMERA.white - CAMERA.black
@@ -57,11 +56,8 @@ def defective(clean: NDArray[np.uint16], at: NDArray[np.int64]) -> NDArray[np.ui
     return values.reshape(clean.shape)
 
 
-def write(path: Path, values: NDArray[np.uint16], body: str = "SC-1") -> Path:
-    metadata = PhotoMetadata(camera_model=body)
-    write_bayer_dng(
-        path, values, black=CAMERA.black, white=CAMERA.white, pattern=CAMERA.pattern, metadata=metadata
-    )
+def write(path: Path, values: NDArray[np.uint16]) -> Path:
+    write_bayer_dng(path, values, black=CAMERA.black, white=CAMERA.white, pattern=CAMERA.pattern)
     return path
 
 
@@ -83,70 +79,30 @@ def write_xtrans(path: Path, values: NDArray[np.uint16]) -> Path:
 
 
 @pytest.mark.parametrize(("count", "xtrans"), [(11, False), (110, False), (110, True)])
-def test_defects_are_replaced_and_told_and_other_photos_of_the_body_tell_the_rest(
+def test_defects_are_replaced_and_told(
     count: int, xtrans: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    save, height = (
-        (write_xtrans, 600) if xtrans else (write, 400)
-    )  # 11 and 110 are as 60 and 600 of 1.3 million
-    scenes = {scene: mosaic(scene, xtrans=xtrans, height=height) for scene in SCENES[:3]}
-    shots = [
-        save(tmp_path / f"{scene}.dng", defective(seen, places(count))) for scene, seen in scenes.items()
-    ]
-    clean = photo.develop(save(tmp_path / "clean.dng", scenes["spices"]))
-
-    alone, told = photo.develop(shots[0]), photo.develop(shots[0], siblings=shots)
+    # 11 and 110 are as 60 and 600 of 1.3 million
+    save, height = (write_xtrans, 600) if xtrans else (write, 400)
+    seen = mosaic(xtrans=xtrans, height=height)
+    clean = photo.develop(save(tmp_path / "clean.dng", seen))
+    repaired = photo.develop(save(tmp_path / "hot.dng", defective(seen, places(count))))
 
     assert clean.remarks == ()
     assert (clean.cfa is None) == xtrans
-    assert f"spices.dng: {alone.remarks[0]}" in caplog.text
-    assert alone.noise[1].variance(0.3) == pytest.approx(clean.noise[1].variance(0.3), rel=0.05)
-    for repaired, share, most in ((alone, 0.4, 0.6), (told, 0.9, 0.3)):
-        assert share * count <= int(repaired.remarks[0].split()[0]) <= count
-        damage = np.sqrt(np.mean((repaired.planes - clean.planes) ** 2))
-        assert damage < most * UNSEEN * np.sqrt(count / 110)
-
-
-@pytest.mark.parametrize("apart", [1, 2, 600, 601])
-def test_defects_that_touch_are_told_by_several_photos(apart: int) -> None:
-    first = places(40, seed=3) % (398 * 600)
-    near = Neighbours(colours_of(BAYER), 2)
-    at = np.union1d(first, first + apart)
-    seen = [suspects(defective(mosaic(scene), at), near) for scene in SCENES[:3]]
-
-    found = defects_of(seen[0], seen[1:])
-
-    assert np.isin(found, at).all()
-    assert np.isin(at, found).mean() > 0.9
-
-
-def test_photos_of_another_body_tell_nothing(tmp_path: Path) -> None:
-    at = places(110)
-    own = write(tmp_path / "own.dng", defective(mosaic(), at))
-    others = [
-        write(tmp_path / f"{scene}.dng", defective(mosaic(scene), at), body="SC-2") for scene in SCENES[1:]
-    ]
-
-    assert photo.develop(own, siblings=others).remarks == photo.develop(own).remarks
-
-
-def test_what_stands_at_one_place_in_two_frames_of_a_scene_is_the_scene() -> None:
-    near = Neighbours(colours_of(BAYER), 2)
-    first = suspects(mosaic("city"), near)
-    rng = np.random.default_rng(8)
-    again = (mosaic("city") + rng.normal(0.0, 4.0, mosaic("city").shape)).clip(0).astype(np.uint16)
-
-    assert len(defects_of(first, [suspects(again, near)])) == 0
+    assert f"hot.dng: {repaired.remarks[0]}" in caplog.text
+    assert repaired.noise[1].variance(0.3) == pytest.approx(clean.noise[1].variance(0.3), rel=0.05)
+    assert 0.4 * count <= int(repaired.remarks[0].split()[0]) <= count
+    damage = np.sqrt(np.mean((repaired.planes - clean.planes) ** 2))
+    assert damage < 0.6 * UNSEEN * np.sqrt(count / 110)
 
 
 @pytest.mark.parametrize("xtrans", [False, True])
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_picture_without_defects_has_none(scene: str, xtrans: bool) -> None:
     near = Neighbours(colours_of(XTRANS if xtrans else BAYER), 6 if xtrans else 2)
-    seen = {name: suspects(mosaic(name, xtrans=xtrans), near) for name in SCENES}
 
-    assert len(defects_of(seen[scene])) == 0
-    assert len(defects_of(seen[scene], [seen[name] for name in SCENES if name != scene])) == 0
+    assert len(defects(mosaic(scene, xtrans=xtrans), near)) == 0
 
 
 def test_the_fine_detail_of_an_xtrans_photo_is_no_damage(tmp_path: Path) -> None:
@@ -186,7 +142,7 @@ def test_defects_cost_the_whole_chain_nothing(xtrans: bool, tmp_path: Path) -> N
             save = write_xtrans if xtrans else write
             paths.append(save(tmp_path / f"{count}-{number}.dng", defective(seen, hot)))
         known = calibrate(paths[:2], aperture=settings.aperture, workers=1)
-        developed = photo.develop(paths[2], siblings=paths)
+        developed = photo.develop(paths[2])
         corrected = correct(developed, known, aperture=settings.aperture, workers=1)
         before, after = (
             np.moveaxis(to_srgb(planes * balance), 0, -1) for planes in (developed.planes, corrected.planes)
@@ -217,7 +173,7 @@ def test_points_of_light_behind_the_sharpest_lenses_are_no_defects(
     noisy = seen + rng.normal(0.0, 0.002, seen.shape)
     values = np.clip(CAMERA.black + RANGE * noisy, 0, CAMERA.white).astype(np.uint16)
 
-    found = defects_of(suspects(values, Neighbours(filters, 6 if xtrans else 2)))
+    found = defects(values, Neighbours(filters, 6 if xtrans else 2))
 
     assert len(found) == 0
 
@@ -232,7 +188,7 @@ def test_hot_and_dead_pixels_at_the_rim_are_found_too(
     values = np.rint(3000 + 20 * rng.standard_normal((200, 300))).astype(np.uint16)
     values[where] = 512 if dead else 9000
 
-    found = defects_of(suspects(values, Neighbours(colours_of(cell, (200, 300)), len(cell))))
+    found = defects(values, Neighbours(colours_of(cell, (200, 300)), len(cell)))
 
     assert [divmod(int(place), 300) for place in found] == [where]
 
@@ -241,4 +197,4 @@ def test_what_covers_the_picture_is_the_picture() -> None:
     values = np.rint(3000 + 20 * np.random.default_rng(2).standard_normal((200, 300))).astype(np.uint16)
     values[4::16, 4::16] = 9000
 
-    assert len(defects_of(suspects(values, Neighbours(colours_of(BAYER, (200, 300)), 2)))) == 0
+    assert len(defects(values, Neighbours(colours_of(BAYER, (200, 300)), 2))) == 0

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Engine, MetaData, create_engine
+import uploads
+from sqlalchemy import Engine, create_engine
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
@@ -24,9 +24,10 @@ from app.runtime.settings import Settings
 from app.sandbox.child import Outcome
 from app.sandbox.runner import Budget
 from app.store import LensName, Store, database
-from app.store.database import Database, new_id, upgrade
+from app.store.database import new_id, upgrade
+from app.store.lenses import LensState
 from app.store.owners import ANY_OWNER
-from app.store.tables import PROFILE_FILE, CorrectionRow, PhotoRow
+from app.store.tables import PROFILE_FILE, CorrectionRow, LensRow, PhotoRow
 from lab.kernels import gaussian
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample
@@ -47,46 +48,38 @@ class Steps:
         self.store, self.owner = store, owner
         self._numbers = itertools.count(1)
 
-    def receive(self, *, calibrate: bool = True, filename: str = "", **given: Any) -> PhotoRow:
-        return self._receive(f"{next(self._numbers):064x}", filename, calibrate=calibrate, given=given)
+    def receive(
+        self, *, sha256: str = "", filename: str = "", calibrate: bool = True, **given: Any
+    ) -> PhotoRow:
+        number, public_id = next(self._numbers), new_id()
+        self.store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
+        names = {"sha256": sha256 or f"{number:064x}", "filename": filename or f"p{number}.dng"}
+        options = {"owner": self.owner, "byte_size": 1000, "calibrate": calibrate, "given": given}
+        return uploads.receive(self.store, public_id, **names, **options).photo
 
     def receive_again(self, photo: PhotoRow, **given: Any) -> PhotoRow:
-        return self._receive(photo.sha256, photo.filename, calibrate=photo.calibrate, given=given)
-
-    def _receive(self, sha256: str, filename: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
-        public_id = new_id()
-        self.store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
-        return self.store.photos.receive(
-            self.owner,
-            public_id=public_id,
-            sha256=sha256,
-            filename=filename or f"p{int(sha256, 16)}.dng",
-            kind="dng",
-            byte_size=1000,
-            blob_key=f"photos/{public_id}/original",
-            calibrate=calibrate,
-            given=given,
-        ).photo
+        return self.receive(sha256=photo.sha256, filename=photo.filename, calibrate=photo.calibrate, **given)
 
     def named(self, name: LensName) -> str:
         """Give a lens to a photo that waits for one; return its id."""
         photo = self.receive()
         assert self.store.photos.change([photo.public_id], self.owner, {}, lens=name)
-        lens_id: str = self.fresh(photo).given["lens_id"]
-        return lens_id
+        return self.fresh(photo).given["lens_id"]
 
-    def inspect(self, photo: PhotoRow, *, serial: str | None = "123", aperture: float | None = 1.4) -> None:
+    def waiting(self, *, serial: str | None = None, aperture: float | None = 1.4) -> PhotoRow:
+        """Let a photo wait for its owner, who has to say what its file does not."""
+        photo = self.receive()
+        self.inspect(photo, serial=serial, aperture=aperture)
+        self.store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+        return photo
+
+    def inspect(
+        self, photo: PhotoRow, *, serial: str | None = "123", aperture: float | None = 1.4, **body: Any
+    ) -> None:
         self.store.photos.set_state(photo.public_id, ("received",), "inspecting")
-        self.store.photos.record_inspection(
-            photo.public_id,
-            LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none"),
-            width=6000,
-            height=4000,
-            aperture=aperture,
-            focal_mm=24.0,
-            focus_m=None,
-            pixel_pitch_um=6.0,
-        )
+        name = LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none")
+        header = {"width": 6000, "height": 4000, "focal_mm": 24.0, "focus_m": None, "pixel_pitch_um": 6.0}
+        self.store.photos.record_inspection(photo.public_id, name, **header | body, aperture=aperture)
 
     def plan(self, photo: PhotoRow, count: int = 2) -> None:
         self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
@@ -95,8 +88,17 @@ class Steps:
         self.store.photos.plan_patches(photo.public_id, photo.epoch, patches, [window(0, 0, reason="flat")])
         self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
 
-    def estimate(self, photo: PhotoRow, indices: tuple[int, ...] = (0, 1), *, width: float = 1.0) -> int:
-        kernel = gaussian(15, width * np.eye(2))
+    def planned(self, count: int = 2, **header: Any) -> PhotoRow:
+        """Bring a photo so far that its patches can be estimated."""
+        photo = self.receive()
+        self.inspect(photo, **header)
+        self.plan(photo, count)
+        return photo
+
+    def estimate(
+        self, photo: PhotoRow, indices: Sequence[int] = (0, 1), *, width: float = 1.0, size: int = 15
+    ) -> int:
+        kernel = gaussian(size, width * np.eye(2))
         samples = [
             (k, PsfSample(kernel, place, LensSettings(channel=channel), weight=0.5, estimator="default/1"))
             for k in indices
@@ -106,17 +108,22 @@ class Steps:
         return self.store.photos.add_samples(photo.public_id, photo.epoch, samples)
 
     def counted(
-        self, *, patches: int = 2, width: float = 1.0, filename: str = "", **options: Any
+        self,
+        *,
+        patches: int = 2,
+        width: float = 1.0,
+        size: int = 15,
+        filename: str = "",
+        **header: Any,
     ) -> PhotoRow:
         photo = self.receive(filename=filename)
-        self.inspect(photo, **options)
+        self.inspect(photo, **header)
         self.plan(photo, patches)
-        self.estimate(photo, tuple(range(patches)), width=width)
+        self.estimate(photo, range(patches), width=width, size=size)
         assert self.store.photos.finish(photo.public_id, photo.epoch) is not None
         return self.fresh(photo)
 
     def correct(self, photo: PhotoRow, **params: Any) -> CorrectionRow:
-        assert photo.lens is not None
         return self.store.jobs.correct(photo, photo.lens, 1, params)[0]
 
     def fresh(self, photo: PhotoRow) -> PhotoRow:
@@ -124,22 +131,23 @@ class Steps:
         assert found is not None
         return found
 
-    def lens_id(self, photo: PhotoRow) -> str:
+    def lens(self, photo: PhotoRow) -> LensRow:
         lens = self.fresh(photo).lens
         assert lens is not None
-        return lens.public_id
+        return lens
 
+    def lens_id(self, photo: PhotoRow) -> str:
+        return self.lens(photo).public_id
 
-SERVER = os.environ.get("LENSMODEL_TEST_DATABASE", "")
-"""A PostgreSQL database to empty and to run the tests on, instead of SQLite files."""
+    def learned(self, photo: PhotoRow) -> tuple[LensState, list[PsfSample]]:
+        """Return the state of the lens of a photo and all its samples."""
+        return self.store.lenses.samples_of(self.lens_id(photo))
 
 
 @pytest.fixture(scope="session")
 def usual_settings() -> Settings:
     """Read and check the environment once: for each test anew it takes as long as a small test."""
     return Settings(
-        database_url=SERVER,
-        storage_url="file:///the-folder-of-each-test" if SERVER else "",
         min_free_mb=0,
         task_user="none",  # trying others out takes a process for each folder
         task_niceness=0,  # tests wait for photos too: beside other programs they would starve
@@ -150,9 +158,7 @@ def usual_settings() -> Settings:
 
 @pytest.fixture
 def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
-    data = tmp_path / "data"
-    own = {"storage_url": f"file://{data / 'blobs'}"} if SERVER else {}
-    return usual_settings.model_copy(update={"data_dir": data, **own})
+    return usual_settings.model_copy(update={"data_dir": tmp_path / "data"})
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -186,28 +192,19 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "app.db"
 
 
-def emptied_of_tables(opened: Database) -> Database:
-    """Drop all tables that are there."""
-    there = MetaData()
-    there.reflect(opened.writer)
-    there.drop_all(opened.writer)
-    return opened
-
-
 @pytest.fixture
 def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
     settings.data_dir.mkdir(parents=True)
-    if SERVER:
-        emptied = emptied_of_tables(Database(SERVER))
-        upgrade(emptied)
-        emptied.close()
-    else:
-        shutil.copy(empty_database, settings.data_dir / "app.db")
-    opened = Store(settings)
-    # before rows that name files which are not there
-    Storage(settings.storage, create=False).settle(opened.photos.have_files)
-    yield opened
-    opened.close()
+    shutil.copy(empty_database, settings.data_dir / "app.db")
+    with closing(Store(settings)) as opened:
+        # before rows that name files which are not there
+        Storage(settings.storage, create=False).settle(opened.photos.have_files)
+        yield opened
+
+
+@pytest.fixture
+def storage(settings: Settings, store: Store) -> Storage:
+    return Storage(settings.storage)
 
 
 @pytest.fixture
@@ -239,24 +236,29 @@ class TasksHere:
 
 
 @pytest.fixture
-def reading(settings: Settings, store: Store) -> Iterator[None]:
-    """Read the profiles that are sent meanwhile, as a worker does."""
+def context(settings: Settings, store: Store) -> Any:
+    """Give what the jobs of a worker share, whose tasks run in this process."""
     from app.jobs.context import JobContext  # noqa: PLC0415 - as above
+
+    sandbox = TasksHere(settings.data_dir / "scratch")
+    return JobContext(settings, store, Storage(settings.storage, create=False), sandbox)
+
+
+@pytest.fixture
+def reading(store: Store, context: Any) -> Iterator[None]:
+    """Read the profiles that are sent meanwhile, as a worker does."""
     from app.jobs.queue import durable, end_job  # noqa: PLC0415 - as above
     from app.jobs.work import work_on  # noqa: PLC0415 - as above
 
-    sandbox: Any = TasksHere(settings.data_dir / "scratch")
-    context = JobContext(settings, store, Storage(settings.storage, create=False), sandbox)
     work = durable("photo", partial(work_on, context), partial(end_job, store))
     ended = threading.Event()
 
     def read() -> None:
         while not ended.wait(0.02):
             for job in store.jobs.to_do():
-                photo_id, epoch = str(job.arguments[0]), int(job.arguments[1])
-                row = store.photos.get(photo_id, ANY_OWNER)
+                row = store.photos.get(job.arguments[0], ANY_OWNER)
                 if row is not None and row.kind == PROFILE_FILE:  # photos are the test's own
-                    work(photo_id, epoch)
+                    work(*job.arguments)
 
     thread = threading.Thread(target=read)
     thread.start()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from typing import Any
 
 import pytest
+from conftest import Steps
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
@@ -15,19 +15,7 @@ from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 
-Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 SEEDS = (1, 26, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4)))
-
-
-@pytest.fixture
-def sound(store: Store) -> Callable[[], None]:
-    """Check what must hold in the tables at every moment."""
-
-    def check() -> None:
-        with store.database.reading() as session:
-            assert broken(session) == {}
-
-    return check
 
 
 class Owner:
@@ -78,13 +66,14 @@ class Owner:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_must_hold_holds_whatever_is_done_in_whatever_order(
-    store: Store, steps: Steps, sound: Callable[[], None], seed: int
+    store: Store, steps: Steps, seed: int
 ) -> None:
     owner, most = Owner(steps, seed), 0
     for _ in range(60):
         owner.act()
 
-        sound()
+        with store.database.reading() as session:
+            assert broken(session) == {}
         most = max([most, *(lens.sample_count for lens in store.lenses.page("local", before=None, limit=10))])
     assert most > 0
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+from conftest import Steps
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
 from app.store import LensName, Store
+from app.store.owners import ANY_OWNER
 from app.store.tables import EventRow, LensRow, PatchRow, PhotoRow, SampleRow
+
+OWNER = "local"
+WHY = ("no_usable_patches", "all is sky")
 
 
 def rows(store: Store, table: type[Any]) -> list[Any]:
@@ -16,138 +21,103 @@ def rows(store: Store, table: type[Any]) -> list[Any]:
         return list(session.scalars(select(table)))
 
 
-def lenses(client: TestClient) -> list[str]:
-    return [lens["id"] for lens in client.get("/v1/lenses").json()["items"]]
+def lenses(store: Store) -> list[str]:
+    return [lens.public_id for lens in rows(store, LensRow)]
 
 
 def test_a_deleted_lens_is_gone_and_its_photos_can_be_corrected_with_another(
-    client: TestClient, store: Store, steps: Any
+    client: TestClient, store: Store, steps: Steps
 ) -> None:
-    counted, running, waiting = steps.counted(), steps.receive(), steps.receive()
-    lens_id = steps.lens_id(counted)
-    steps.inspect(running)
-    steps.plan(running)
-    steps.inspect(waiting, serial=None)
-    store.photos.set_state(waiting.public_id, ("inspecting",), "needs_lens")
+    counted, running, waiting = steps.counted(), steps.planned(), steps.waiting()
+    address = f"/v1/lenses/{steps.lens_id(counted)}"
 
-    answer = client.delete(f"/v1/lenses/{lens_id}")
+    assert client.delete(address).status_code == 204
 
-    assert answer.status_code == 204
-    assert client.get(f"/v1/lenses/{lens_id}").status_code == 404
-    assert client.get(f"/v1/lenses/{lens_id}/psf?r=0").status_code == 404
-    assert client.delete(f"/v1/lenses/{lens_id}").status_code == 404
-    assert lenses(client) == []
-    assert [steps.fresh(photo).state for photo in (counted, running, waiting)] == [
-        *("stored", "cancelled", "needs_lens")
-    ]
-    assert rows(store, SampleRow) == rows(store, PatchRow) == rows(store, EventRow) == []
-    assert rows(store, LensRow) == []
+    assert client.get(address).status_code == client.get(f"{address}/psf?r=0").status_code == 404
+    assert client.delete(address).status_code == 404
+    states = [steps.fresh(photo).state for photo in (counted, running, waiting)]
+    assert states == ["stored", "cancelled", "needs_lens"]
+    for table in (SampleRow, PatchRow, EventRow, LensRow):
+        assert rows(store, table) == []
 
 
-def test_the_key_of_a_deleted_lens_is_given_to_no_other(client: TestClient, store: Store, steps: Any) -> None:
-    first = steps.fresh(steps.counted()).lens_id
-    client.delete(f"/v1/lenses/{lenses(client)[0]}")
+def test_nothing_that_still_ran_brings_a_deleted_lens_back(store: Store, steps: Steps) -> None:
+    running = steps.planned()
+    store.lenses.delete(steps.lens_id(running), OWNER)
 
-    second = steps.fresh(steps.counted()).lens_id
-
-    assert second > first
-
-
-def test_nothing_that_still_ran_brings_a_deleted_lens_back(
-    client: TestClient, store: Store, steps: Any
-) -> None:
-    running = steps.receive()
-    steps.inspect(running)
-    steps.plan(running)
-    client.delete(f"/v1/lenses/{steps.lens_id(running)}")
-
-    stored = steps.estimate(running)
-
-    assert stored == 0
+    assert steps.estimate(running) == 0
     assert store.photos.finish(running.public_id, 1) is None
-    assert lenses(client) == []
+    assert lenses(store) == []
 
 
-def test_the_same_lens_begins_anew_with_its_next_photo(client: TestClient, steps: Any) -> None:
-    first = steps.lens_id(steps.counted())
-    client.delete(f"/v1/lenses/{first}")
+def test_the_same_lens_begins_anew_with_its_next_photo(store: Store, steps: Steps) -> None:
+    first = steps.lens(steps.counted())
+    store.lenses.delete(first.public_id, OWNER)
 
-    second = steps.counted()
+    second = steps.lens(steps.counted())
 
-    assert steps.lens_id(second) != first
-    assert client.get(f"/v1/lenses/{steps.lens_id(second)}").json()["version"] == 1
+    assert second.public_id != first.public_id
+    assert second.id > first.id  # its key is given to no other
+    assert second.version == 1
 
 
-def test_a_lens_goes_with_its_last_photo_and_the_photos_hash_too(
-    client: TestClient, store: Store, steps: Any
-) -> None:
+def test_a_lens_goes_with_its_last_photo_and_the_photos_hash_too(store: Store, steps: Steps) -> None:
     one, two = steps.counted(), steps.counted()
 
-    client.delete(f"/v1/photos/{one.public_id}")
-    after_one = lenses(client)
-    client.delete(f"/v1/photos/{two.public_id}")
+    store.photos.delete(one.public_id, OWNER)
+    assert len(lenses(store)) == 1
+    store.photos.delete(two.public_id, OWNER)
 
-    assert len(after_one) == 1
-    assert lenses(client) == []
-    assert rows(store, LensRow) == rows(store, PhotoRow) == []
+    assert lenses(store) == rows(store, PhotoRow) == []
 
 
-def test_a_failed_or_cancelled_photo_leaves_no_lens_behind(
-    client: TestClient, store: Store, steps: Any
-) -> None:
+def test_a_failed_or_cancelled_photo_leaves_no_lens_behind(store: Store, steps: Steps) -> None:
     failed, cancelled = steps.receive(), steps.receive()
     steps.inspect(failed, serial="F-1")
     steps.inspect(cancelled, serial="C-1")
-    assert len(lenses(client)) == 2
+    assert len(lenses(store)) == 2
 
-    store.photos.fail(failed.public_id, 1, "no_usable_patches", "all is sky")
-    store.photos.cancel(cancelled.public_id, "local")
+    store.photos.fail(failed.public_id, 1, *WHY)
+    store.photos.cancel(cancelled.public_id, OWNER)
 
-    assert lenses(client) == []
-    assert rows(store, LensRow) == []
-    assert store.photos.retry(failed.public_id, "local")
-    again = steps.fresh(failed)
-    steps.inspect(again, serial="F-1")
-    assert len(lenses(client)) == 1
+    assert lenses(store) == []
+    assert store.photos.retry(failed.public_id, OWNER)
+    steps.inspect(steps.fresh(failed), serial="F-1")
+    assert len(lenses(store)) == 1
 
 
-def test_a_failed_photo_leaves_the_lens_of_others_alone(client: TestClient, store: Store, steps: Any) -> None:
+def test_a_failed_photo_leaves_the_lens_of_others_alone(store: Store, steps: Steps) -> None:
     counted, failed = steps.counted(), steps.receive()
     steps.inspect(failed)
 
-    store.photos.fail(failed.public_id, 1, "no_usable_patches", "all is sky")
+    store.photos.fail(failed.public_id, 1, *WHY)
 
-    assert lenses(client) == [steps.lens_id(counted)]
-    assert client.get(f"/v1/lenses/{steps.lens_id(counted)}").json()["samples"] == 6
+    assert lenses(store) == [steps.lens_id(counted)]
+    assert len(steps.learned(counted)[1]) == 6
 
 
-def test_a_lens_that_its_owner_named_waits_for_his_next_try(
-    client: TestClient, store: Store, steps: Any
-) -> None:
+def test_a_lens_that_its_owner_named_waits_for_his_next_try(store: Store, steps: Steps) -> None:
     photo = steps.receive()
-    store.photos.change([photo.public_id], "local", {}, lens=LensName(None, "Old lens", None, label="mine"))
+    store.photos.change([photo.public_id], OWNER, {}, lens=LensName(None, "Old lens", None, label="mine"))
+    lens_id = steps.fresh(photo).given["lens_id"]
     again = steps.fresh(photo)
     steps.inspect(again, serial=None)
-    store.photos.fail(photo.public_id, again.epoch, "no_usable_patches", "all is sky")
+    store.photos.fail(photo.public_id, again.epoch, *WHY)
 
-    assert len(lenses(client)) == 1
-    client.delete(f"/v1/photos/{photo.public_id}")
-    assert lenses(client) == []
+    assert lenses(store) == [lens_id]
+    assert store.photos.retry(photo.public_id, OWNER)
+    assert steps.fresh(photo).given["lens_id"] == lens_id
+    store.photos.delete(photo.public_id, OWNER)
+    assert lenses(store) == []
 
 
-def test_corrections_of_a_deleted_lens_that_are_finished_stay(
-    client: TestClient, store: Store, steps: Any
-) -> None:
+def test_corrections_of_a_deleted_lens_that_are_finished_stay(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    common = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
-    finished = steps.correct(photo, **common)
-    store.jobs.set_state(finished.public_id, ("queued",), "succeeded")
-    waiting = steps.correct(photo, **{**common, "strength": 0.5})
+    lens_id, corrections = steps.lens_id(photo), [steps.correct(photo, strength=s) for s in (1.0, 0.5)]
+    store.jobs.set_state(corrections[0].public_id, ("queued",), "succeeded")
 
-    lens_id = steps.lens_id(photo)
+    store.lenses.delete(lens_id, OWNER)
 
-    client.delete(f"/v1/lenses/{lens_id}")
-
-    shown = [client.get(f"/v1/corrections/{row.public_id}").json() for row in (finished, waiting)]
-    assert [row["state"] for row in shown] == ["succeeded", "cancelled"]
-    assert {row["lens_id"] for row in shown} == {lens_id}
+    left = [store.jobs.get(row.public_id, ANY_OWNER) for row in corrections]
+    assert [row.state for row in left] == ["succeeded", "cancelled"]
+    assert {row.lens_public_id for row in left} == {lens_id}

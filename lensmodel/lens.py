@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,12 +15,9 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import field_grid
 from lensmodel.core.names import full_name
 from lensmodel.core.psf import PsfSample, centred
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
+from lensmodel.core.types import Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class Settings(TypedDict, total=False):
@@ -85,29 +82,18 @@ class Lens:
             moved to the middle pixel.
         r, phi : array_like of float, shape (n,)
             Field positions: half diagonals 0..1, and radians.
-        aperture : array_like of float, shape (n,) or (), optional
-            f-number of each, or of all; None where it is unknown.
-        channel : {"r", "g", "b"} or sequence of them
-            Color of each, or of all.
-        weight : array_like of float, shape (n,) or ()
-            Confidence 0..1, which scales its part in answers.
-        photo : str or sequence of str
-            What each was measured on: kernels of one photo share its faults.
+        aperture, channel, weight, photo : array_like of shape (n,) or ()
+            Of each kernel, or of all: the f-number, None where it is unknown; "r", "g" or "b"; a confidence
+            0..1, which scales its part in answers; what it was measured on, whose faults its kernels share.
         pixel_pitch_um : float, optional
             Pixels of the kernels in micrometres, so that sensors with other pixels may ask.
         model : ModelSettings, optional
             Choices of the regression.
 
-        Returns
-        -------
-        Lens
-
         Raises
         ------
-        InvalidKernelError
-            If a kernel cannot be a PSF.
         InvalidInputError
-            If shapes do not fit, or another value is out of its range.
+            If a kernel cannot be a PSF, shapes do not fit, or another value is out of its range.
         NoSamplesError
             If there is no kernel, or none has a weight.
         """
@@ -115,15 +101,9 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        given = {
-            "r": r,
-            "phi": phi,
-            "aperture": aperture,
-            "channel": channel,
-            "weight": weight,
-            "photo": photo,
-        }
-        columns = [_each(values, n, name) for name, values in given.items()]
+        names = ("r", "phi", "aperture", "channel", "weight", "photo")
+        given = (r, phi, aperture, channel, weight, photo)
+        columns = [_each(values, n, name) for values, name in zip(given, names, strict=True)]
         samples = [
             PsfSample(
                 centred(kernel),
@@ -140,42 +120,13 @@ class Lens:
 
     @classmethod
     def load(cls, path: Path | str) -> Lens:
-        """Open a lens profile.
-
-        Parameters
-        ----------
-        path : path
-            A file that `save` or the command wrote.
-
-        Returns
-        -------
-        Lens
-
-        Raises
-        ------
-        InvalidInputError
-            If the file is no profile, or one of another format.
-        FileNotFoundError
-            If there is none.
-        """
+        """Open a lens profile that `save` or the command wrote; `InvalidInputError` if it is none."""
         return cls(load_profile(path))
 
     def save(self, path: Path | str) -> None:
         """Write the lens to a file, by custom `*.lensprofile`; it appears complete or not at all.
 
         A file of that name is replaced. The format is plain JSON and npy in a zip: no pickle, no code.
-
-        Parameters
-        ----------
-        path : path
-            Its folder must exist.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        InvalidInputError
-            If it has more samples than a file may hold.
         """
         save_profile(path, self.profile)
 
@@ -193,12 +144,6 @@ class Lens:
         **settings
             `aperture`, the f-number, where None takes all apertures of the samples together; the same goes
             for `focal_mm` in mm and `focus_m` in metres. `channel`, "r", "g" (default) or "b".
-
-        Returns
-        -------
-        PsfAnswer
-            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2;
-            `.answered_by` what made it; `.photos` and `.effective_samples` what of.
 
         Warns
         -----
@@ -222,25 +167,19 @@ class Lens:
     def kernels(
         self, r: ArrayLike, phi: ArrayLike, *, size: int = DEFAULT_SIZE, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
-        """Return the kernels of many places at once, faster than `psf` for each.
-
-        Parameters
-        ----------
-        r, phi : array_like of float
-            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
-        size, **settings
-            As of `psf`.
+        """Return the kernels of `psf` at many places, `r` and `phi` of shapes that broadcast to one shape S.
 
         Returns
         -------
         ndarray of float64, shape (*S, size, size)
-
-        Raises
-        ------
-        InvalidInputError
-            If the shapes of `r` and `phi` do not broadcast, or a value is out of its range.
         """
-        radii, angles = _places_joined(r, phi)
+        radii, angles = np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
+        try:
+            radii, angles = np.broadcast_arrays(radii, angles)
+        except ValueError as error:
+            raise InvalidInputError(
+                f"r and phi must have shapes that broadcast, got {radii.shape} and {angles.shape}"
+            ) from error
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
@@ -254,163 +193,42 @@ class Lens:
 
         Parameters
         ----------
-        r, phi : array_like of float
-            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
+        r, phi, **settings
+            As of `kernels`.
         frequencies : array_like of float, shape (n,) or ()
             Cycles/pixel; not negative.
-        **settings
-            As of `psf`.
 
         Returns
         -------
         ndarray of float64, shape (2, *S, n)
             Tangential (contrast along the radius), then sagittal; 1 at frequency 0.
-
-        Raises
-        ------
-        InvalidInputError
-            If the frequencies are no list of finite numbers from 0 on, the shapes of `r` and `phi` do not
-            broadcast, or a value is out of its range.
         """
-        wanted = _frequencies_of(frequencies)
+        wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        if wanted.ndim != 1:
+            raise InvalidInputError(
+                f"frequencies must have the shape (n,), got {wanted.shape}; give a flat list"
+            )
+        wrong = wanted[~(np.isfinite(wanted) & (wanted >= 0.0))]
+        if wrong.size:
+            raise InvalidInputError(
+                f"frequencies must be finite and not negative, cycles/pixel, got {wrong[0]:g}; leave it out"
+            )
         kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, lambda kernel, angle: mtf_from_kernel(kernel, angle, wanted))
 
     def mtf50_map(
         self, rows: int = 20, cols: int = 30, *, aspect: float = 1.5, **settings: Unpack[Settings]
     ) -> NDArray[np.float64]:
-        """Return where contrast falls to one half, over the picture.
-
-        Parameters
-        ----------
-        rows, cols : int
-            Equal cells of the picture; each value is that of its cell's centre.
-        aspect : float
-            Width over height of the picture.
-        **settings
-            As of `psf`.
+        """Return where contrast falls to one half, at the centres of the cells of `field_grid`.
 
         Returns
         -------
         ndarray of float64, shape (2, rows, cols)
             Tangential and sagittal MTF50 in cycles/pixel; row 0 is the top in sensor orientation.
-
-        Raises
-        ------
-        InvalidInputError
-            If there are no cells, or a value is out of its range.
         """
         r, phi = field_grid(rows, cols, aspect=aspect)
         kernels = self.kernels(r, phi, **settings)
         return _both_ways(kernels, phi, mtf50_from_kernel)
-
-    def psf_grid(
-        self,
-        rows: int = 5,
-        cols: int = 7,
-        *,
-        aspect: float = 1.5,
-        aperture: float | None = None,
-        channels: Sequence[Channel] = CHANNELS,
-        size: int = 31,
-    ) -> dict[str, Any]:
-        """Return the kernels over the picture with their axes, as `xarray.DataArray.from_dict` takes them.
-
-        Parameters
-        ----------
-        rows, cols : int
-            Equal cells of the picture; each kernel is that of its cell's centre.
-        aspect : float
-            Width over height of the picture.
-        aperture, size
-            As of `psf`.
-        channels : sequence of {"r", "g", "b"}
-            Colors.
-
-        Returns
-        -------
-        dict
-            `dims` channel, row, col, v, u; `data`, an ndarray of float64; `coords` with `r` and `phi` of each
-            cell, and pixels from the kernel's middle: `u` to the right, `v` downwards.
-        """
-        r, phi = field_grid(rows, cols, aspect=aspect)
-        data = np.stack([self.kernels(r, phi, aperture=aperture, channel=c, size=size) for c in channels])
-        pixels = np.arange(size) - size // 2
-        coords = {
-            "channel": (("channel",), list(channels)),
-            "r": (("row", "col"), r),
-            "phi": (("row", "col"), phi),
-            "u": (("u",), pixels),
-            "v": (("v",), pixels),
-        }
-        return {
-            "dims": ("channel", "row", "col", "v", "u"),
-            "coords": {name: {"dims": dims, "data": values} for name, (dims, values) in coords.items()},
-            "data": data,
-            "name": "psf",
-            "attrs": {"lens": self.description},
-        }
-
-    def plot_field(
-        self,
-        rows: int = 5,
-        cols: int = 7,
-        *,
-        aspect: float = 1.5,
-        aperture: float | None = None,
-        channel: Channel = "g",
-        size: int = 25,
-    ) -> Figure:
-        """Draw the PSF over the picture, each cell to its own brightest pixel; needs the extra `report`.
-
-        Parameters
-        ----------
-        rows, cols, aspect, aperture, channel, size
-            As of `psf_grid`.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            A notebook shows it after `%matplotlib inline`; `.savefig(...)` writes it.
-        """
-        from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
-
-        grid = self.psf_grid(rows, cols, aspect=aspect, aperture=aperture, channels=(channel,), size=size)
-        figure = Figure(figsize=(1.3 * cols, 1.3 * rows + 0.4), layout="constrained")
-        figure.suptitle(f"{self.description}{'' if aperture is None else f', f/{aperture:g}'}")
-        for axes, kernel in zip(
-            figure.subplots(rows, cols, squeeze=False).flat, grid["data"].reshape(-1, size, size), strict=True
-        ):
-            axes.imshow(kernel, cmap="gray", vmin=0.0)
-            axes.set(xticks=[], yticks=[])
-        return figure
-
-    def sample_table(self) -> dict[str, NDArray[Any]]:
-        """Return what the lens was made of as columns of one length; `pandas.DataFrame` takes them.
-
-        Returns
-        -------
-        dict of str to ndarray
-            r, phi, aperture, focal_mm, focus_m, channel, weight, error, photo, estimator; numbers that are
-            not known are NaN.
-        """
-        columns: dict[str, Callable[[PsfSample], Any]] = {
-            "r": lambda s: s.position.r,
-            "phi": lambda s: s.position.phi,
-            "aperture": lambda s: s.settings.aperture,
-            "focal_mm": lambda s: s.settings.focal_mm,
-            "focus_m": lambda s: s.settings.focus_m,
-            "weight": lambda s: s.weight,
-            "error": lambda s: s.error,
-            "channel": lambda s: s.settings.channel,
-            "photo": lambda s: self.profile.photos.get(s.photo, s.photo),
-            "estimator": lambda s: s.estimator,
-        }
-        texts = {"channel", "photo", "estimator"}
-        return {
-            name: np.array([of(s) for s in self.samples], dtype=np.str_ if name in texts else np.float64)
-            for name, of in columns.items()
-        }
 
     @property
     def model(self) -> LensModel:
@@ -441,30 +259,6 @@ def _both_ways(
     ]
     values = np.array(measured, dtype=np.float64)
     return values.reshape(2, *angles.shape, *values.shape[2:])
-
-
-def _places_joined(r: ArrayLike, phi: ArrayLike) -> Sequence[NDArray[np.float64]]:
-    """Broadcast the two numbers of field positions to arrays of one shape."""
-    radii, angles = np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
-    try:
-        return np.broadcast_arrays(radii, angles)
-    except ValueError as error:
-        raise InvalidInputError(
-            f"r and phi must have shapes that broadcast, got {radii.shape} and {angles.shape}"
-        ) from error
-
-
-def _frequencies_of(values: ArrayLike) -> NDArray[np.float64]:
-    """Return frequencies in cycles/pixel, shape (n,); one number is a list of one."""
-    wanted = np.atleast_1d(np.asarray(values, dtype=np.float64))
-    if wanted.ndim != 1:
-        raise InvalidInputError(f"frequencies must have the shape (n,), got {wanted.shape}; give a flat list")
-    wrong = wanted[~(np.isfinite(wanted) & (wanted >= 0.0))]
-    if wrong.size:
-        raise InvalidInputError(
-            f"frequencies must be finite and not negative, in cycles/pixel, got {wrong[0]:g}; leave it out"
-        )
-    return wanted
 
 
 def _each(values: ArrayLike | Sequence[str] | None, n: int, name: str) -> list[Any]:

@@ -3,31 +3,25 @@
 A curve is a table of linear light at evenly spaced file values, one entry for each of 65536
 codes, so that 8 and 16 bit files are decoded by look-up and encoded by the inverse.
 
-Profiles are read and made by LittleCMS, but for one with primaries that no chromaticities give. Where a file
-declares its colour space by numbers, a profile is made of these.
+Profiles are read and made by LittleCMS, but for one with primaries that no chromaticities give.
 
-Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022; "Portable Network Graphics, third edition", W3C, 2025,
-sections 4.3 and 11.3.2; ITU-T H.273, 2021; CIPA DC-008-2023 (Exif 3.0) and DCF 2.0, 2010 (R03); "TIFF
-Revision 6.0", Aldus, 1992, section 20.
+Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import UnsupportedFormatError
 from lensmodel.photo.values import Matrix3, Transfer
 
 CODES: Final = 65536  # of 16 bits
-_CURVE_POINTS: Final = 4096  # of a profile's table: the most that all programs read
 _LEAST_COLUMN: Final = 1e-3  # of XYZ: a channel that gives no light has no curve
 _ADDITIVE: Final = 2e-3  # error in XYZ up to which channels add up (chosen): rounding makes a tenth of it
 
@@ -222,94 +216,7 @@ def camera_to_srgb(xyz_to_camera: Matrix) -> Matrix | None:
     return np.linalg.inv(balanced) if abs(np.linalg.det(balanced)) > 1e-6 else None
 
 
-# --- colour spaces that a file declares by numbers -----------------------------------------------
-
-DeclaredCurve: TypeAlias = float | NDArray[np.float64] | None
-"""An exponent, a table of linear light, or that of sRGB."""
-
-
 def named_profile(name: Literal["srgb", "adobergb"]) -> bytes:
-    """Return the profile of a standard colour space."""
-    return _undated(imagecodecs.cms_profile(name))
-
-
-def _undated(icc: bytes) -> bytes:
-    """Fix the date of a profile, so that it is the same bytes each time."""
+    """Return the profile of a standard colour space, of a fixed date: the same bytes each time."""
+    icc = imagecodecs.cms_profile(name)
     return icc[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + icc[36:]
-
-
-USUAL_GAMMA: Final = 1.0 / 0.45455  # by which files approximate the curve of sRGB
-
-
-@dataclass(frozen=True, slots=True)
-class ColourSpace:
-    """Chromaticities x, y of white, and of red, green and blue."""
-
-    white: tuple[float, float]
-    primaries: tuple[float, ...]
-
-    @classmethod
-    def of(cls, white: Sequence[float], primaries: Sequence[float]) -> ColourSpace | None:
-        """Return it where the primaries span a triangle around the white."""
-        if len(white) != 2 or len(primaries) != 6 or not np.isfinite([*white, *primaries]).all():
-            return None
-        corners = np.reshape(primaries, (3, 2)) - np.asarray(white)
-        following = np.roll(corners, -1, axis=0)
-        areas = corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]
-        spans = white[1] > 0.01 and (areas.min() > 1e-3 or areas.max() < -1e-3)
-        return cls((white[0], white[1]), tuple(primaries)) if spans else None
-
-    def profile(self, curve: DeclaredCurve) -> bytes | None:
-        """Profile of the space with a curve; None where it is sRGB, or its usual approximation."""
-        pairs = zip((*self.white, *self.primaries), (*BT709.white, *BT709.primaries), strict=True)
-        usual = curve is None or (isinstance(curve, float) and abs(curve - USUAL_GAMMA) < 0.02)
-        if usual and max(abs(a - b) for a, b in pairs) < 0.002:  # files round them
-            return None
-        chosen: dict[str, Any] = {"gamma": curve}
-        if not isinstance(curve, float):
-            table = srgb_to_linear(np.linspace(0.0, 1.0, _CURVE_POINTS)) if curve is None else curve
-            chosen = {"transferfunction": np.rint(table * 65535.0).astype(np.uint16)}
-        xy = np.reshape(self.primaries, (3, 2))
-        primaries = np.hstack([xy, np.ones((3, 1))]).ravel().tolist()
-        white = [*self.white, 1.0]
-        return _undated(imagecodecs.cms_profile("rgb", whitepoint=white, primaries=primaries, **chosen))
-
-
-_D65: Final = (0.3127, 0.329)
-BT709: Final = ColourSpace(_D65, (0.64, 0.33, 0.30, 0.60, 0.15, 0.06))
-_PRIMARIES: Final[Mapping[int, ColourSpace]] = {
-    1: BT709,
-    9: ColourSpace(_D65, (0.708, 0.292, 0.170, 0.797, 0.131, 0.046)),  # BT.2020
-    12: ColourSpace(_D65, (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)),  # Display P3
-}
-_CODES: Final = np.linspace(0.0, 1.0, _CURVE_POINTS)
-_TELEVISION: Final = np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1.0 / 0.45))
-_CURVES: Final[Mapping[int, DeclaredCurve]] = {
-    **dict.fromkeys((1, 6, 14, 15), _TELEVISION),
-    4: 2.2,
-    5: 2.8,
-    8: 1.0,
-    13: None,
-}
-
-
-def profile_by_chunks(icc: bytes | None, chunks: Mapping[bytes, bytes]) -> bytes | None:
-    """Profile of a PNG by its chunks, in their order of precedence; None is sRGB."""
-    if len(coded := chunks.get(b"cICP", b"")) == 4:
-        primaries, curve, matrix, full = coded
-        if primaries not in _PRIMARIES or curve not in _CURVES or matrix != 0 or full != 1:
-            hdr = {16: ", PQ", 18: ", HLG"}.get(curve, "")
-            raise UnsupportedFormatError(
-                f"the PNG's colours are coded as {primaries}/{curve}/{matrix}/{full} (ITU-T H.273{hdr}), "
-                "which is not read; convert it to sRGB or Display P3"
-            )
-        return _PRIMARIES[primaries].profile(_CURVES[curve])
-    if icc is not None or b"sRGB" in chunks:
-        return icc
-    space, gamma = BT709, USUAL_GAMMA
-    if len(inverse := chunks.get(b"gAMA", b"")) == 4 and any(inverse):
-        gamma = 100_000.0 / struct.unpack(">I", inverse)[0]
-    if len(places := chunks.get(b"cHRM", b"")) == 32:
-        numbers = [place / 100_000.0 for place in struct.unpack(">8I", places)]
-        space = ColourSpace.of(numbers[:2], numbers[2:]) or BT709
-    return space.profile(gamma) if 0.1 < gamma < 10.0 else None

@@ -1,12 +1,14 @@
 """What a photo file says of its picture, before a pixel is decoded: kind, size, and where its metadata lie.
 
-Sources: ITU-T T.81, annex B (JPEG); "Portable Network Graphics, third edition", W3C, 2025, sections 5 and 11;
-"TIFF Revision 6.0", Aldus, 1992; Adobe, "Digital Negative (DNG) Specification" 1.6, 2021; CIFF 1.0, 1997.
+Sources: ITU-T T.81, annex B; ICC.1:2022, annex B.4 (profiles in a JPEG); "Portable Network Graphics, third
+edition", W3C, 2025, sections 4.3, 5 and 11; "TIFF Revision 6.0", Aldus, 1992; Adobe, "Digital Negative (DNG)
+Specification" 1.6, 2021; CIFF 1.0, 1997.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import mmap
 import re
 import statistics
@@ -17,6 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from PIL.JpegImagePlugin import JpegImageFile
+
 from lensmodel.core.errors import (
     DecompressionBombError,
     ImageTooLargeError,
@@ -24,8 +28,6 @@ from lensmodel.core.errors import (
     TruncatedImageError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.colour import profile_by_chunks
-from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
 from lensmodel.photo.tiff import MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, Tags, TiffReader
 from lensmodel.photo.values import FileKind, Limits
 
@@ -50,7 +52,7 @@ class Header:
     directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
     tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
     camera: tuple[str, str] | None = None  # maker and model of a CRW file, which has no TIFF structure
-    xmp: bytes | None = None  # XMP packet, and ICC profile: of a PNG also one made of what its chunks declare
+    xmp: bytes | None = None
     icc: bytes | None = None
     icc_lost: bool = False  # whether there is an ICC profile that cannot be read at all
     # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
@@ -137,6 +139,52 @@ def opened_header(path: Path, limits: Limits) -> Iterator[Header]:
 # --- JPEG --------------------------------------------------------------------------------------
 
 _END_OF_IMAGE: Final = b"\xff\xd9"  # marker: ITU-T T.81, table B.1
+_MAX_READS: Final = 1 << 17  # of a header: four of each segment and one of each stray byte (chosen)
+_PART_NUMBER, _PART_DATA = 12, 14  # of a part of a profile, behind the identifying text
+
+
+class JpegSegments(io.BytesIO):
+    """Bytes of a JPEG for Pillow; Exif and profile in its header are kept here, and blank there.
+
+    Pillow joins blocks of Exif in quadratic time, reads all values of their directories into memory however
+    often they overlap, and drops an ICC profile whose parts are counted wrongly.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self.exif, self.parts = list[bytes](), list[bytes]()
+        self.reads, self.in_header = 0, True
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read on, as a file does."""
+        data = super().read(size)
+        if not self.in_header:
+            return data
+        self.reads += 1
+        if self.reads > _MAX_READS:
+            raise NotAnImageError(
+                f"the JPEG's header does not end within {_MAX_READS // 4} segments, or "
+                f"{_MAX_READS} stray bytes; save it anew from the original"
+            )
+        if data.startswith(b"Exif\0"):
+            self.exif.append(data)
+        elif data.startswith(b"ICC_PROFILE\0"):
+            self.parts.append(data)
+        else:
+            return data
+        return bytes(len(data))
+
+    def profile(self) -> bytes | None:
+        """Put the parts of the ICC profile together by their numbers, however many they say to be."""
+        ordered = sorted(dict.fromkeys(self.parts), key=lambda part: part[_PART_NUMBER : _PART_NUMBER + 1])
+        return b"".join(part[_PART_DATA:] for part in ordered) if ordered else None
+
+
+def opened_jpeg(segments: JpegSegments) -> JpegImageFile:
+    """Read the header of a JPEG, of several pictures that of the first."""
+    image = JpegImageFile(segments)
+    segments.in_header = False
+    return image
 
 
 def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
@@ -183,6 +231,13 @@ def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]
 # --- PNG ---------------------------------------------------------------------------------------
 
 _OF_PICTURE: Final = {b"PLTE", b"tRNS", b"IDAT"}
+# What PNG chunks hold for sRGB, in their order of precedence: ITU-T H.273; 100,000 times a gamma and places
+# x, y of white, red, green, blue, and how far others round these (chosen)
+_OF_SRGB: Final = {
+    b"cICP": (">4B", (1, 13, 0, 1), 0),
+    b"gAMA": (">I", (45455,), 400),
+    b"cHRM": (">8I", (31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), 400),
+}
 _PNG_END: Final = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
@@ -200,23 +255,43 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
             f"the PNG's header is impossible: {width} x {height}, {bits} bits, type {colour}"
         )
     check_size(width, height, len(buffer), limits)  # before a bomb's end is missed
-    header, has_data, declared = Header("png", width, height, channels, bits), False, dict[bytes, bytes]()
+    found = dict[bytes, bytes]()
     for name, start, length in png_chunks(buffer):
-        has_data = has_data or name == b"IDAT"
         body = b"" if name == b"IDAT" else bytes(buffer[start : start + min(length, MAX_BLOCK_BYTES)])
-        if name == b"eXIf" and (reader := TiffReader.open(body)):
-            header = replace(header, tiff=(*header.tiff, reader))
-        elif name == b"iCCP":
-            profile = _inflated(body.partition(b"\0")[2][1:])
-            header = replace(header, icc=profile, icc_lost=profile is None)
-        elif name == b"iTXt" and body.startswith(b"XML:com.adobe.xmp\0"):
-            text = body[20:].partition(b"\0")[2].partition(b"\0")[2]
-            header = replace(header, xmp=_inflated(text) if body[18:19] == b"\1" else text)
-        elif name in {b"cICP", b"sRGB", b"gAMA", b"cHRM"} and length <= 32:
-            declared[name] = body
-    if not has_data:
+        if name != b"iTXt" or body.startswith(b"XML:com.adobe.xmp\0"):
+            found.setdefault(name, body)
+    if b"IDAT" not in found:
         raise TruncatedImageError("the PNG has no image data")
-    return replace(header, icc=profile_by_chunks(header.icc, declared))
+    exif, text = TiffReader.open(found.get(b"eXIf", b"")), found.get(b"iTXt", b"")
+    xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
+    icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
+    if icc is None:
+        _require_srgb(found)
+    return Header(
+        "png",
+        width,
+        height,
+        channels,
+        bits,
+        tiff=() if exif is None else (exif,),
+        xmp=_inflated(xmp) if text[18:19] == b"\1" else xmp,
+        icc=icc,
+        icc_lost=icc is None and b"iCCP" in found,
+    )
+
+
+def _require_srgb(chunks: Mapping[bytes, bytes]) -> None:
+    """Refuse a PNG without a profile whose chunks declare other colours: they would be lost."""
+    for name, (numbers, of_srgb, tolerance) in _OF_SRGB.items():
+        body = chunks.get(name, b"")
+        said = struct.unpack(numbers, body) if len(body) == struct.calcsize(numbers) else ()
+        if any(said) and max(abs(a - b) for a, b in zip(said, of_srgb, strict=True)) > tolerance:
+            raise UnsupportedFormatError(
+                f"the PNG's chunk {name.decode()} declares colours other than sRGB; convert it to sRGB, or "
+                "save it with an ICC profile"
+            )
+        if b"sRGB" in chunks:
+            return  # goes before gAMA and cHRM
 
 
 def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, int, int]]:

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
-from lensmodel.photo.colour import BT709, ColourSpace, named_profile
 from lensmodel.photo.containers import Header
 from lensmodel.photo.tiff import EXIF, UNDEFINED, Tag, Tags, TiffReader, Value, rationals, shorts, text
 from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
@@ -144,17 +143,11 @@ class Said:
         """Stops by which a DNG asks to be brightened, None where it does not say or is absurd."""
         return _first_within(-10.0, 10.0, self.tags.number(0xC62A))
 
-    def profile(self) -> bytes | None:
-        """Profile of the colour space that a TIFF or JPEG declares by its tags; None is sRGB."""
-        tags, space, gamma = self.tags, self.tags.number(0xA001), self.tags.number(0xA500)
-        if space == 1:
-            return None
-        if space == 2 or "R03" in [reader.below(tags, 0xA005).text(1) for reader in self.header.tiff]:
-            return named_profile("adobergb")
-        white, primaries = tags.numbers(318), tags.numbers(319)
-        declared = ColourSpace.of(white, primaries) if white or primaries else BT709
-        curve = gamma if gamma is not None and 0.1 < gamma < 10.0 else None
-        return None if declared is None else declared.profile(curve)
+    @property
+    def adobe_rgb(self) -> bool:
+        """Whether EXIF declares Adobe RGB, by its ColorSpace or as DCF 2.0 does; what says less is sRGB."""
+        space, readers = self.tags.number(0xA001), self.header.tiff
+        return space == 2 or (space != 1 and "R03" in [r.below(self.tags, 0xA005).text(1) for r in readers])
 
     @property
     def _zoom(self) -> float:

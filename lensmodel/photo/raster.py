@@ -23,9 +23,8 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Planes
-from lensmodel.photo.colour import CODES, curves_of, decode, is_of_rgb, matrix_profile
-from lensmodel.photo.containers import Header, png_picture
-from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
+from lensmodel.photo.colour import CODES, curves_of, decode, is_of_rgb, matrix_profile, named_profile
+from lensmodel.photo.containers import Header, JpegSegments, opened_jpeg, png_picture
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
 from lensmodel.photo.values import Encoding, LinearPhoto, PhotoInfo, PhotoMetadata, Transfer
@@ -91,7 +90,7 @@ def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tu
         return "icc", icc, _without_profile("its other tags say") if lost else ()
     if icc is not None and not floating and is_of_rgb(icc):
         return "srgb", icc, ()
-    declared = None if floating else said.profile()
+    declared = named_profile("adobergb") if said.adobe_rgb and not floating else None
     instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
     without = _without_profile(instead) if lost or icc is not None else ()
     return ("linear" if floating else "icc" if declared else "srgb"), declared, without

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import rawpy
-from numpy.typing import NDArray
-from PIL import Image
 
 from lensmodel.core.errors import LensModelError, RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo import opcodes
-from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3, srgb_to_linear
-from lensmodel.photo.jpeg import JpegSegments, opened_jpeg
+from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
-from lensmodel.photo.raster import UNDECODABLE
 from lensmodel.photo.values import Encoding, LensIdentity, LinearPhoto, PhotoInfo, PhotoMetadata, PlaneNoise
-
-log = logging.getLogger(__name__)
 
 _NOISE_MIX: Final = np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]])
 """Share of the variance of each colour's pixels (column) in each plane that AHD makes (row): measured on flat
@@ -105,7 +98,7 @@ def develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
         kept, lost = opcodes.demosaiced(kept, cfa)
         defects = mosaic.repair()
-    balance = _white_balance(raw, mosaic)
+    balance, own_balance = _white_balance(raw)
     planes = _developed(raw, white, balance, stated)
     _, height, width = planes.shape
     noise = _plane_noise(planes, sensor_noise, balance)
@@ -134,6 +127,7 @@ def develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
         remarks=(
             *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
             *((f"{defects} defective pixel{many} replaced",) if defects else ()),
+            *(() if own_balance else ("it does not say its white balance, and that of daylight is taken",)),
         ),
     )
 
@@ -205,23 +199,13 @@ def _plane_noise(
     return r, g, b
 
 
-def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:
-    """Multipliers of the camera, green 1: as written, else as its own JPEG shows, else daylight."""
-    if known := _relative(*raw.camera_whitebalance[:3]):
-        return known
-    table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
-    shown = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
-    if shown is not None and (known := _relative(shown[0], 1.0, shown[1])):
-        return known
-    if known := _relative(*raw.daylight_whitebalance[:3]):
-        log.info("the RAW file does not say its white balance; daylight is assumed")
-    return known or (1.0, 1.0, 1.0)
-
-
-def _relative(r: float, g: float, b: float) -> tuple[float, float, float] | None:
-    """Multipliers relative to that of green; None where they are absurd."""
-    sound = min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20
-    return (float(r) / float(g), 1.0, float(b) / float(g)) if sound else None
+def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
+    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own, not daylight's."""
+    for own, multipliers in ((True, raw.camera_whitebalance), (False, raw.daylight_whitebalance)):
+        r, g, b = multipliers[:3]
+        if min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20:  # others are absurd
+            return (float(r) / float(g), 1.0, float(b) / float(g)), own
+    return (1.0, 1.0, 1.0), False
 
 
 def _colour(
@@ -236,82 +220,3 @@ def _colour(
         return None, None
     balanced = np.linalg.inv(SRGB_TO_XYZ_D65 @ of_file)
     return of_file, balanced / np.asarray(white_balance)[:, None]
-
-
-# --- white balance as the camera applied it, out of its own JPEG of the photo ---------------------
-
-_Grid: TypeAlias = NDArray[np.float64]
-"""Means over blocks, `(row, col, colour)`."""
-
-_BLOCKS: Final = 96  # along the longer side: a few pixels of misplacement do not matter then
-_SMALLEST_JPEG: Final = 2 * _BLOCKS  # pixels; the shorter side may have half, one to a block (chosen)
-_MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory: so many take 200 MB (chosen)
-_ASPECT: Final = 0.03  # how much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs
-_LIKENESS: Final = 0.8  # least correlation of the lightness of both; a JPEG of something else stays far below
-_MIDTONES: Final = (0.15, 0.8)  # of the JPEG's numbers, in which a camera's tone curve is nearest to sRGB
-_UNCLIPPED: Final = 0.5  # largest mean of a block, full is 1 (chosen): leaves brighter pixels room
-_NEUTRAL: Final = 1.6  # largest over smallest colour: settings of the camera change strong colours more
-_LEAST_BLOCKS: Final = 24  # fewer near-neutral blocks than this may all be of one object that is not grey
-
-
-def balance_of_rendition(
-    raw: rawpy.RawPy, mosaic: Mosaic | None, to_srgb: Matrix | None
-) -> tuple[float, float] | None:
-    """Estimate the white balance from the JPEG that the camera put beside its RAW data.
-
-    Some cameras, as the EOS D30, write no multipliers into their RAW files. With J the JPEG in linear light,
-    C the matrix from balanced camera colours to sRGB, and s the means of the sensor over the same block, the
-    multipliers of red and blue relative to green are::
-
-        m_k = median over near-neutral blocks of (C^-1 J)_k s_g / ((C^-1 J)_g s_k)
-    """
-    if mosaic is None or not mosaic.is_bayer or (picture := _jpeg_of(raw)) is None:
-        return None
-    planes = mosaic.sites(mosaic.white)
-    rows, cols = (min(sides) for sides in zip(*(plane.shape for plane in planes), strict=True))
-    sites = np.stack([plane[:rows, :cols] for plane in planes], axis=-1)  # of odd sides the rest is cut off
-    height, width, _ = sites.shape
-    rows, cols = (round(_BLOCKS * side / max(height, width)) for side in (height, width))
-    stretched = abs(np.log(picture.width * height / (picture.height * width))) > _ASPECT
-    if stretched or min(rows, cols) < 8 or min(height, width) < _SMALLEST_JPEG // 2:
-        return None
-    pixels = np.asarray(picture.resize((4 * cols, 4 * rows), Image.Resampling.BOX), dtype=np.float64) / 255.0
-    numbers, shown, sensor = (
-        _block_means(values, rows, cols) for values in (pixels, srgb_to_linear(pixels), sites)
-    )
-    greens = [np.sqrt(np.maximum(grid[..., 1], 0.0)).ravel() for grid in (shown, sensor)]
-    if min(float(green.std()) for green in greens) < 1e-6 or np.corrcoef(np.stack(greens))[0, 1] < _LIKENESS:
-        return None
-    balanced = shown if to_srgb is None else shown @ np.linalg.inv(to_srgb).T
-    most = numbers.max(axis=-1)
-    used = (most > _MIDTONES[0]) & (most < _MIDTONES[1]) & (sensor.max(axis=-1) < _UNCLIPPED)
-    used &= (shown.max(axis=-1) < _NEUTRAL * shown.min(axis=-1)) & (sensor.min(axis=-1) > 0.0)
-    used &= balanced.min(axis=-1) > 0.0
-    if used.sum() < _LEAST_BLOCKS:
-        return None
-    red, green, blue = (balanced[used] / sensor[used]).T
-    return float(np.median(red / green)), float(np.median(blue / green))
-
-
-def _jpeg_of(raw: rawpy.RawPy) -> Image.Image | None:
-    """Decode the embedded JPEG, scaled down where it is large; `None` without a sound one."""
-    try:
-        thumb = raw.extract_thumb()
-        if thumb.format != rawpy.ThumbFormat.JPEG or not isinstance(thumb.data, bytes):
-            return None
-        picture = opened_jpeg(JpegSegments(thumb.data))
-        if picture.width * picture.height > _MOST_JPEG_PIXELS or min(picture.size) < _SMALLEST_JPEG // 2:
-            return None
-        picture.draft("RGB", (4 * _BLOCKS, 4 * _BLOCKS))
-        return picture.convert("RGB") if picture.mode in {"RGB", "L"} else None
-    except (rawpy.LibRawError, *UNDECODABLE):
-        return None
-
-
-def _block_means(values: NDArray[np.floating], rows: int, cols: int) -> _Grid:
-    """Means over `rows` x `cols` blocks that cover the whole, none of them empty."""
-    height, width = values.shape[:2]
-    tops, lefts = np.arange(rows) * height // rows, np.arange(cols) * width // cols
-    sums = np.add.reduceat(np.add.reduceat(values.astype(np.float64), tops, axis=0), lefts, axis=1)
-    counts = np.diff(np.append(tops, height))[:, None] * np.diff(np.append(lefts, width))[None, :]
-    return np.asarray(sums / counts[:, :, None])

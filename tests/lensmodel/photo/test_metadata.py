@@ -13,13 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
+from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.metadata import Said, is_placeholder
+from lensmodel.photo.raw import opened_raw
 from lensmodel.photo.xmp import read_xmp
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
@@ -279,6 +283,52 @@ def test_xmp_numbers_are_read_and_absurd_ones_at_once_refused(
     metadata_of: Read, text: str, value: float | None
 ) -> None:
     assert metadata_of(jpeg_with({}, {}, xmp_with(f'exif:FNumber="{text}"'))).aperture == value
+
+
+# --- CRW files, which are older than EXIF -----------------------------------------------------------
+
+HEAP = b"II" + struct.pack("<I", 26) + b"HEAPCCDR" + bytes(12)
+
+
+@pytest.mark.parametrize(
+    ("record", "model"),
+    [(b"Canon\0Canon EOS D30\0\0\xfb\x7f", "Canon EOS D30"), (b"Ca\x14non\0\x01\0", None)],
+)
+def test_the_camera_of_a_crw_is_named(record: bytes, model: str | None, metadata_of: Read) -> None:
+    seen = metadata_of(HEAP + record)
+
+    assert (seen.camera_maker, seen.camera_model) == ("Canon", model)
+
+
+@given(rest=st.binary(max_size=400), order=st.sampled_from([b"II", b"MM"]))
+def test_any_bytes_after_the_mark_of_a_crw_are_survived(
+    rest: bytes, order: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.crw"  # a folder for each would take longer than all else
+    path.write_bytes(order + struct.pack("<I", 14) + b"HEAPCCDR" + rest)
+
+    assert read_metadata(path).camera_maker == "Canon"
+
+
+@pytest.mark.tools
+def test_a_real_crw_names_its_settings_and_its_missing_white_balance_is_told(shared_data: Path) -> None:
+    developed = photo.develop(shared_data / "real" / "canon_d30_xmas_tree.crw")
+    seen = developed.info.metadata
+
+    assert (seen.aperture, seen.focal_mm, seen.iso) == (5.6, 31.0, 100.0)
+    assert (seen.camera_model, seen.taken_at) == ("Canon EOS D30", datetime(2018, 1, 1, 13, 3, 32))  # noqa: DTZ001  the camera's clock has no zone
+    assert developed.encoding.white_balance == pytest.approx(
+        (2.10, 1.0, 1.06), abs=0.01
+    )  # LibRaw's for daylight
+    assert any("daylight" in remark for remark in developed.remarks)
+
+
+@pytest.mark.parametrize("head", [HEAP, b"II*\0\x10\0\0\0CR\x02\0", b"\0MRM"], ids=["CRW", "CR2", "MRW"])
+def test_a_kind_that_no_camera_writes_anew_is_damaged_and_not_unknown(head: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "photo.raw"
+    path.write_bytes(head + bytes(400))
+    with pytest.raises(TruncatedImageError, match="damaged"), opened_raw(path):
+        pass
 
 
 # --- real files --------------------------------------------------------------------------------

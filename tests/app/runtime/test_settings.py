@@ -1,0 +1,123 @@
+"""The settings, and the compose file that gives some, as far as it can be checked without containers."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml  # type: ignore[import-untyped]  # its types are a package of their own
+
+from app.runtime.settings import PREFIX, Settings, described
+
+ROOT = Path(__file__).parents[3]
+COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+OURS = {name: service for name, service in SERVICES.items() if service["image"] == "lensmodel"}
+SERVER = "postgresql+psycopg://db/lens"
+
+
+def test_an_unknown_setting_is_refused_with_the_likely_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_WORKER_SLOT", "3")
+
+    with pytest.raises(ValueError, match="did you mean LENS_WORKER_SLOTS"):
+        Settings()
+
+
+def test_a_port_open_to_the_world_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not Settings().needs_keys
+    monkeypatch.setenv("LENS_API_KEY", "what clients send is no setting")
+    monkeypatch.setenv("LENS_HOST", "0.0.0.0")
+
+    assert Settings().needs_keys
+    with pytest.raises(ValueError, match="LENS_AUTH=none lets everybody in"):
+        Settings(auth="none")
+
+
+def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no estimator 'nothing'; known: .*michaeli-irani"):
+        Settings(estimator="nothing")
+    assert Settings(estimator="michaeli-irani").estimator == "michaeli-irani"
+
+
+def test_the_page_of_the_service_lists_all_settings() -> None:
+    rows = []
+    for name, said in described().items():
+        field = Settings.model_fields[name]
+        default = "cores of the machine" if field.default_factory else str(field.default).lower() or "none"
+        rows.append(f"| `{PREFIX}{name.upper()}` | {default} | {said} |")
+
+    page = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+    assert "\n".join(["| setting | default | |", "|---|---|---|", *rows]) in page
+
+
+def test_a_database_server_needs_storage_that_all_machines_see_and_has_the_jobs() -> None:
+    with pytest.raises(ValueError, match="s3://"):
+        Settings(database_url=SERVER)
+
+    settings = Settings(database_url=SERVER, storage_url="s3://lensmodel")
+
+    assert settings.jobs == settings.database
+
+
+def test_every_setting_of_the_compose_file_is_known_and_they_fit_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    environment = OURS["api"]["environment"]
+    for name, value in environment.items():
+        monkeypatch.setenv(name, re.sub(r"\$\{[^}]+\}", "secret", value))
+
+    settings = Settings(host="0.0.0.0")
+
+    assert {service["command"][0] for service in OURS.values()} == {"api", "worker"}
+    assert environment == OURS["worker"]["environment"]
+    assert settings.database.startswith("postgresql")
+    assert settings.storage == "s3://lensmodel"
+    assert settings.hosts
+    assert len([name for name in environment if name.startswith(PREFIX)]) == 3
+
+
+def test_our_containers_have_no_rights_and_a_root_that_nobody_writes_to() -> None:
+    for service in OURS.values():
+        assert service["read_only"] is True
+        assert service["cap_drop"] == ["ALL"]
+        assert "no-new-privileges:true" in service["security_opt"]
+        assert any(str(volume).endswith("/data") for volume in service["volumes"])
+
+
+def test_ports_are_published_on_loopback_only() -> None:
+    published = [port for service in SERVICES.values() for port in service.get("ports", [])]
+
+    assert published
+    assert all(port.startswith("127.0.0.1:") for port in published)
+
+
+def test_no_secret_is_written_down_and_no_image_floats() -> None:
+    for name, service in SERVICES.items():
+        for key, value in service.get("environment", {}).items():
+            if "PASSWORD" in key or "SECRET" in key:
+                assert value.startswith("${"), f"{name}: {key}"
+        if name not in OURS:
+            assert re.search(r":\d", service["image"]), service["image"]
+
+
+def test_whatever_is_waited_for_exists_and_can_tell_its_health_and_volumes_are_declared() -> None:
+    volumes = [str(volume) for service in SERVICES.values() for volume in service.get("volumes", [])]
+    assert {path.split(":")[0] for path in volumes if path[0] != "/"} == set(COMPOSE["volumes"])
+    for service in SERVICES.values():
+        for other, wait in service.get("depends_on", {}).items():
+            if wait["condition"] == "service_healthy":
+                assert "test" in SERVICES[other]["healthcheck"]
+
+
+def test_dockerfile_ends_as_a_user_without_rights_and_says_its_health() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    last = text.rsplit("\nFROM ", 1)[1]
+
+    assert text.count("\nFROM ") == 2
+    assert "ARG BASE=" in text
+    assert re.search(r"^USER 10001", last, re.MULTILINE)
+    assert "VOLUME /data" in last
+    assert "HEALTHCHECK" in last
+    assert not re.search(r"^ADD ", text, re.MULTILINE)

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import io
-import json
 import zipfile
 from dataclasses import replace
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
+from states import Steps, refusal, store_report
 
-from app.blobs.storage import Storage
-from app.runtime.settings import Settings
 from app.store import LensName, Store
-from app.store.lenses import report_key
-from app.store.owners import ANY_OWNER
-from lensmodel.core.codec import to_json
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings
 from lensmodel.model.answer import PAPER
 from lensmodel.model.profile import Camera, read_profile, write_profile
-from lensmodel.report import lens_report
-
-Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
 
 def put_profile(client: TestClient, lens: str, content: bytes, **query: bool) -> tuple[dict[str, Any], Any]:
@@ -35,114 +27,111 @@ def put_profile(client: TestClient, lens: str, content: bytes, **query: bool) ->
     return job, client.get(f"/v1/lenses/{lens}").json()
 
 
-def test_several_photos_are_named_at_once(client: TestClient, steps: Steps, store: Store) -> None:
-    photos = [steps.receive() for _ in range(3)]
-    for photo in photos:
-        steps.inspect(photo, serial=None)
-        store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+@pytest.fixture
+def lens(steps: Steps) -> str:
+    """A lens that knows its blur at four places."""
+    return steps.lens_id(steps.counted(patches=4))
+
+
+@pytest.fixture
+def profile(client: TestClient, lens: str) -> bytes:
+    sent = client.get(f"/v1/lenses/{lens}/profile")
+    assert sent.headers["content-disposition"].endswith(".lensprofile")
+    return sent.content
+
+
+def changed(profile: bytes, **changes: Any) -> bytes:
+    """Return a profile in which something else is written."""
+    known: LensProfile = read_profile(io.BytesIO(profile), "The answer")
+    out = io.BytesIO()
+    write_profile(out, replace(known, **changes))
+    return out.getvalue()
+
+
+@pytest.fixture
+def other(steps: Steps) -> str:
+    """A lens without photos."""
+    return steps.named(LensName(None, None, None, label="Another"))
+
+
+def test_several_photos_are_named_at_once_or_none(client: TestClient, steps: Steps, lens: str) -> None:
+    photos = [steps.waiting() for _ in range(3)]
     keys = [photo.public_id for photo in photos]
 
-    named = client.patch(
-        "/v1/photos", json={"photo_ids": keys, "new_lens": {"label": "Mine"}, "aperture": 2.0}
-    )
+    gone = client.patch("/v1/photos", json={"photo_ids": [keys[0], "gone"], "lens_id": lens})
+    assert refusal(gone) == (404, "unknown_photo")
+    assert "lens_id" not in steps.fresh(photos[0]).given
+    change = {"photo_ids": keys, "new_lens": {"label": "Mine"}, "aperture": 2.0}
+    named = client.patch("/v1/photos", json=change)
 
     assert named.status_code == 200, named.text
     rows = [steps.fresh(photo) for photo in photos]
     assert len({row.given["lens_id"] for row in rows}) == 1
-    assert {row.given["aperture"] for row in rows} == {2.0}
-    assert {row.state for row in rows} == {"received"}
+    assert {(row.given["aperture"], row.state) for row in rows} == {(2.0, "received")}
 
 
-def test_a_lens_is_renamed_and_named_after_its_model_again(client: TestClient, steps: Steps) -> None:
-    lens = steps.lens_id(steps.counted())
-
-    assert client.patch(f"/v1/lenses/{lens}", json={"label": "Old one"}).json()["label"] == "Old one"
-    assert client.patch(f"/v1/lenses/{lens}", json={"label": None}).json()["label"] is None
+def test_a_lens_is_renamed_and_named_after_its_model_again(client: TestClient, lens: str) -> None:
+    for label in ("Old one", None):
+        assert client.patch(f"/v1/lenses/{lens}", json={"label": label}).json()["label"] == label
 
 
-def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -> None:
+def test_merged_lenses_are_one(client: TestClient, steps: Steps) -> None:
+    def merge(one: str, other: str, **insisting: bool) -> Any:
+        return client.patch(f"/v1/lenses/{one}", json={"merge_into": other, **insisting})
+
     one, two = (steps.counted(serial=serial) for serial in ("1", "2"))
     first, second = steps.lens_id(one), steps.lens_id(two)
 
-    asked = client.patch(f"/v1/lenses/{first}", json={"merge_into": second})
-    merged = client.patch(f"/v1/lenses/{first}", json={"merge_into": second, "any_lens": True}).json()
+    asked = merge(first, second)
+    merged = merge(first, second, any_lens=True).json()
 
-    assert (asked.status_code, asked.json()["code"]) == (409, "other_lens")
+    assert refusal(asked) == (409, "other_lens")
     assert "its serial number is 1, that of the lens 2" in asked.json()["detail"]
     assert (merged["id"], merged["photos"], merged["samples"]) == (second, 2, 12)
     assert client.get(f"/v1/lenses/{first}").status_code == 404
     assert steps.lens_id(one) == second
     busy = steps.receive()
     steps.inspect(busy, serial="3")
-    third = steps.lens_id(busy)
-    refused = client.patch(f"/v1/lenses/{third}", json={"merge_into": second, "any_lens": True})
-    assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
+    assert refusal(merge(steps.lens_id(busy), second, any_lens=True)) == (409, "conflict")
 
 
 @pytest.mark.usefixtures("reading")
-def test_its_own_profile_tells_a_lens_nothing(client: TestClient, steps: Steps) -> None:
-    lens = steps.lens_id(steps.counted())
-    file = client.get(f"/v1/lenses/{lens}/profile").content
+def test_a_profile_goes_out_and_comes_back_once(
+    client: TestClient, lens: str, other: str, profile: bytes
+) -> None:
     known = client.get(f"/v1/lenses/{lens}").json()
 
-    _, again = put_profile(client, lens, file)
-
-    assert [again[name] for name in ("photos", "samples", "version")] == [
-        known[name] for name in ("photos", "samples", "version")
-    ]
-
-
-@pytest.mark.usefixtures("reading")
-def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, store: Store) -> None:
-    lens = steps.lens_id(steps.counted(patches=4))
-    other = steps.named(LensName(None, None, None, label="Another"))
-    sent = client.get(f"/v1/lenses/{lens}/profile")
-    assert sent.headers["content-disposition"].endswith(".lensprofile")
-
-    job, taken = put_profile(client, other, sent.content)
-    _, again = put_profile(client, other, sent.content)
+    job, taken = put_profile(client, other, profile)
+    _, again = put_profile(client, other, profile)
+    _, itself = put_profile(client, lens, profile)  # its own tells a lens nothing
 
     assert job["state"] == "succeeded", job
-    assert (taken["photos"], taken["samples"]) == (1, 12)
-    assert again == taken
+    assert (taken["photos"], taken["samples"], again) == (1, 12, taken)
+    assert all(itself[name] == known[name] for name in ("photos", "samples", "version"))
     question = {"r": 0.5, "phi": 0.4, "aperture": 1.4}
-    kernels = [
-        client.get(f"/v1/lenses/{key}/psf.json", params=question).json()["psf"] for key in (lens, other)
-    ]
-    assert kernels[0] == kernels[1]
-    photo = client.get("/v1/photos", params={"lens_id": other}).json()["items"][0]
-    refused = client.post("/v1/corrections", json={"photo_id": photo["id"]})
-    assert refused.status_code == 409
+    kernels = [client.get(f"/v1/lenses/{key}/psf.json", params=question).json() for key in (lens, other)]
+    assert kernels[0]["psf"] == kernels[1]["psf"]
+    photo = client.get("/v1/photos", params={"lens_id": other}).json()["items"][0]["id"]
+    assert client.post("/v1/corrections", json={"photo_id": photo}).status_code == 409
     bad = client.put(f"/v1/lenses/{other}/profile", content=b"no profile")
-    assert (bad.status_code, bad.json()["code"]) == (400, "malformed_upload")
-    assert client.put("/v1/lenses/gone/profile", content=sent.content).status_code == 404
+    assert refusal(bad) == (400, "malformed_upload")
+    assert client.put("/v1/lenses/gone/profile", content=profile).status_code == 404
     listed = client.get("/v1/photos").json()["items"]
     assert {entry["kind"] for entry in listed} == {None}  # photos, and no files of profiles
 
 
 @pytest.mark.usefixtures("reading")
 def test_a_profile_of_another_lens_is_refused_until_its_owner_insists(
-    client: TestClient, steps: Steps
+    client: TestClient, steps: Steps, profile: bytes
 ) -> None:
-    first, second = (steps.lens_id(steps.counted(patches=4, serial=serial)) for serial in ("1", "2"))
-    sent = client.get(f"/v1/lenses/{first}/profile").content
+    second = steps.lens_id(steps.counted(serial="2"))
 
-    refused, untouched = put_profile(client, second, sent)
+    refused, untouched = put_profile(client, second, profile)
+    taken, lens = put_profile(client, second, profile, any_lens=True)
+
     assert (refused["error"]["status"], refused["error"]["code"]) == (409, "other_lens")
-    assert "its serial number is 1, that of the lens 2" in refused["error"]["detail"]
-    assert untouched["photos"] == 1
-    taken, lens = put_profile(client, second, sent, any_lens=True)
-    assert (taken["state"], lens["photos"]) == ("succeeded", 2)
-
-
-@pytest.mark.usefixtures("reading")
-def test_a_lens_is_made_of_a_profile_alone(client: TestClient, steps: Steps) -> None:
-    sent = client.get(f"/v1/lenses/{steps.lens_id(steps.counted(patches=4))}/profile").content
-
-    made = client.post("/v1/lenses", json={"label": "Given away"})
-    assert (made.status_code, made.json()["label"], made.json()["photos"]) == (201, "Given away", 0)
-    assert put_profile(client, made.json()["id"], sent)[1]["photos"] == 1
-    assert "Given away" in client.get("/").text
+    assert "its serial number is 123, that of the lens 2" in refused["error"]["detail"]
+    assert (untouched["photos"], taken["state"], lens["photos"]) == (1, "succeeded", 2)
 
 
 D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8")
@@ -150,7 +139,7 @@ D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8
 
 @pytest.mark.usefixtures("reading")
 @pytest.mark.parametrize(
-    ("lens", "cameras", "name"),
+    ("lens_is", "cameras", "name"),
     [
         ({"label": "Grandfather's", "maker": "Zeiss", "model": "Biotar"}, (D750,), "Grandfather's"),
         ({"maker": "Canon", "model": "EF24mm f/1.4L"}, (D750,), "Canon EF24mm f/1.4L"),
@@ -161,115 +150,45 @@ D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8
         ({"label": "two\nlines"}, (), "file"),
     ],
 )
-def test_a_lens_made_of_a_profile_is_called_as_that_says_else_as_its_file(
-    client: TestClient, steps: Steps, lens: dict[str, str], cameras: tuple[Camera, ...], name: str
+def test_a_lens_made_of_a_profile_alone_is_called_as_that_says_else_as_its_file(
+    client: TestClient, profile: bytes, lens_is: dict[str, str], cameras: tuple[Camera, ...], name: str
 ) -> None:
-    sent, of = io.BytesIO(), steps.lens_id(steps.counted(patches=4))
-    known = read_profile(io.BytesIO(client.get(f"/v1/lenses/{of}/profile").content), "The answer")
-    write_profile(sent, replace(known, lens=lens, cameras=cameras))
-    made, kept = (client.post("/v1/lenses", json={"label": "file"}).json()["id"] for _ in range(2))
+    sent = changed(profile, lens=lens_is, cameras=cameras)
 
-    for lens_id, rename, called in ((made, True, name), (kept, False, "file")):
-        job, shown = put_profile(client, lens_id, sent.getvalue(), rename=rename)
-        assert (job["state"], shown["label"]) == ("succeeded", called)
+    for rename, called in ((True, name), (False, "file")):
+        made = client.post("/v1/lenses", json={"label": "file"})
+        assert (made.status_code, made.json()["label"], made.json()["photos"]) == (201, "file", 0)
+        job, shown = put_profile(client, made.json()["id"], sent, rename=rename)
+        assert (job["state"], shown["label"], shown["photos"]) == ("succeeded", called, 1)
 
 
 def test_a_profile_is_not_read_beside_the_keys_of_the_database(
-    client: TestClient, steps: Steps, store: Store, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, store: Store, other: str, profile: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lens = steps.lens_id(steps.counted(patches=4))
-    sent = client.get(f"/v1/lenses/{lens}/profile").content
-    other = steps.named(LensName(None, None, None, label="Another"))
-    read: list[object] = []
-    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: read.append("read"))
+    monkeypatch.delattr(zipfile.ZipFile, "read")
 
-    answer = client.put(f"/v1/lenses/{other}/profile", content=sent)
+    answer = client.put(f"/v1/lenses/{other}/profile", content=profile)
 
-    assert (answer.status_code, read) == (202, [])
+    assert answer.status_code == 202
     job = client.get(answer.headers["location"]).json()
     assert (job["state"], job["id"]) == ("queued", store.jobs.to_do()[-1].arguments[0])
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202
 
 
 @pytest.mark.usefixtures("reading")
-def test_a_profile_of_another_model_is_refused(client: TestClient, steps: Steps) -> None:
-    lens = steps.lens_id(steps.counted(patches=4))
-    profile = read_profile(io.BytesIO(client.get(f"/v1/lenses/{lens}/profile").content), "The answer")
-    sent = io.BytesIO()
-    paper = LensModel.fit(profile.model.samples, ModelSettings(mode=PAPER))
-    write_profile(sent, replace(profile, model=paper))
+def test_a_profile_of_another_model_is_refused(client: TestClient, lens: str, profile: bytes) -> None:
+    samples = read_profile(io.BytesIO(profile), "The answer").model.samples
+    paper = LensModel.fit(samples, ModelSettings(mode=PAPER))
 
-    job, _ = put_profile(client, lens, sent.getvalue())
+    job, _ = put_profile(client, lens, changed(profile, model=paper))
 
     assert job["error"]["code"] == "conflict"
 
 
-@pytest.fixture
-def reported(client: TestClient, steps: Steps, store: Store, settings: Settings) -> str:
-    """A lens whose newest version has its report."""
-    lens_id: str = steps.lens_id(steps.counted(patches=6))
-    _, stored = store.lenses.samples_of(lens_id)
-    test = lens_report(LensModel.fit(stored), "A lens", rows=5, size=15, channels=("g",))
-    lens = store.lenses.get(lens_id, ANY_OWNER)
-    assert lens is not None
-    key = report_key(lens_id, lens.version, lens.rebuild_epoch)
-    Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())
-    return lens_id
-
-
-@pytest.mark.parametrize(
-    ("form", "begins"),
-    [("json", b"{"), ("csv", b"quantity,"), ("pdf", b"%PDF-")],
-)
-def test_a_report_comes_in_each_form(client: TestClient, reported: str, form: str, begins: bytes) -> None:
-    address = f"/v1/lenses/{reported}/report.{form}"
-    answer = client.get(address)
-
-    assert answer.status_code == 200, answer.text
-    assert answer.content.startswith(begins)
-    if form == "json":
-        details = answer.json()["details"]
-        assert details["Photos"].endswith(".dng")
-        assert details["Written"].startswith("20")
-    assert client.get(address, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
-
-
-def test_a_report_that_is_not_made_yet_says_so(client: TestClient, steps: Steps) -> None:
-    lens = steps.lens_id(steps.counted())
-    answer = client.get(f"/v1/lenses/{lens}/report.json")
-
-    assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
-
-
-def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) -> None:
-    first, page = client.get(f"/lenses/{reported}").text, client.get(f"/lenses/{reported}/tests").text
-
-    for title in ("What it does to your pictures", "Is it a good copy?", "Which photo next?"):
-        assert title in first
-    assert "this copy is" in first
-    assert 'alt="MTF50 in cycles/pixel' in page
-    charts = client.get(f"/ui/lenses/{reported}/charts", params={"unit": "lp/mm", "aperture": "1.4"})
-    assert "MTF50 in line pairs per mm" in charts.text
-    for wrong in ({"aperture": ".."}, {"aperture": "x"}):
-        answer = client.get(f"/ui/lenses/{reported}/charts", params=wrong)
-        assert answer.status_code == 422, (wrong, answer.text)
-    assert "PATCH" not in page
-
-
-def test_photos_that_cannot_all_change_stay_as_they_are(client: TestClient, steps: Any) -> None:
-    lens, photo = steps.lens_id(steps.counted()), steps.receive()
-
-    answer = client.patch("/v1/photos", json={"photo_ids": [photo.public_id, "gone"], "lens_id": lens})
-
-    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_photo")
-    assert "lens_id" not in steps.fresh(photo).given
-
-
 @pytest.mark.usefixtures("reading")
 def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
-    client: TestClient, steps: Any, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, lens: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lens = steps.lens_id(steps.counted())
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", bytes(1 << 20))
@@ -280,4 +199,29 @@ def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
     job, _ = put_profile(client, lens, bomb.getvalue())
 
     assert (job["error"]["status"], read) == (413, [])
-    assert client.put(f"/v1/lenses/{lens}/profile", content=b"no archive").status_code == 400
+
+
+def test_a_report_comes_in_each_form_once_it_is_made_and_its_page_shows_it(
+    client: TestClient, steps: Steps
+) -> None:
+    lens = steps.lens_id(steps.counted(patches=6))
+    assert refusal(client.get(f"/v1/lenses/{lens}/report.json")) == (409, "not_ready")
+    store_report(client, lens)
+
+    for form, begins in (("json", b"{"), ("csv", b"quantity,"), ("pdf", b"%PDF-")):
+        answer = client.get(f"/v1/lenses/{lens}/report.{form}")
+        tag = {"If-None-Match": answer.headers["etag"]}
+        assert answer.content.startswith(begins), answer.text
+        assert client.get(f"/v1/lenses/{lens}/report.{form}", headers=tag).status_code == 304
+    details = client.get(f"/v1/lenses/{lens}/report.json").json()["details"]
+    assert details["Photos"].endswith(".dng")
+    assert details["Written"].startswith("20")
+
+    first, page = client.get(f"/lenses/{lens}").text, client.get(f"/lenses/{lens}/tests").text
+    for title in ("What it does to your pictures", "Is it a good copy?", "Which photo next?"):
+        assert title in first
+    assert 'alt="MTF50 in cycles/pixel' in page
+    assert "PATCH" not in page
+    charts = f"/ui/lenses/{lens}/charts"
+    assert "MTF50 in line pairs per mm" in client.get(f"{charts}?unit=lp/mm&aperture=1.4").text
+    assert [client.get(f"{charts}?aperture={wrong}").status_code for wrong in ("..", "x")] == [422, 422]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import statistics
-import time
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,9 @@ import pytest
 import tifffile
 from PIL import Image
 from starlette.testclient import TestClient
+from states import Steps, refusal
 
+from app.http import model_cache
 from app.http.model_cache import ModelCache
 from app.routes.psf import accepted
 from app.schemas import PsfQuery
@@ -21,7 +21,7 @@ from app.store import Store
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import FieldPosition, LensSettings
 
-Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+PLACE = "r=0.9&phi=0.59&aperture=1.4"
 
 
 @pytest.fixture
@@ -39,38 +39,43 @@ def ask(client: TestClient, lens: str, **query: float | str) -> dict[str, Any]:
 def test_a_lens_tells_who_it_is_and_what_it_knows(client: TestClient, lens: str) -> None:
     shown = client.get(lens).json()
 
-    assert (shown["maker"], shown["model"], shown["serial"]) == ("Canon", "EF24mm f/1.4L", "123")
-    assert (shown["serial_source"], shown["version"], shown["photos"], shown["samples"]) == ("exif", 1, 1, 18)
-    assert (shown["apertures"], shown["focal_lengths_mm"]) == ([1.4], [24.0])
+    told = {
+        "maker": "Canon",
+        "model": "EF24mm f/1.4L",
+        "serial": "123",
+        "serial_source": "exif",
+        "version": 1,
+    }
+    known = {"photos": 1, "samples": 18, "apertures": [1.4], "focal_lengths_mm": [24.0]}
+    assert shown.items() >= (told | known).items()
     assert client.get(shown["links"]["photos"]).json()["items"][0]["lens_id"] == shown["id"]
     assert shown["id"] in lens
     assert "123" not in str(shown["links"]).replace(shown["id"], "")
 
 
 def test_lenses_are_found_by_model_and_serial(client: TestClient, steps: Steps) -> None:
-    steps.counted(serial="1")
-    second = steps.lens_id(steps.counted(serial="2"))
+    first, second = (steps.lens_id(steps.counted(serial=serial)) for serial in "12")
 
-    assert len(client.get("/v1/lenses?model=ef24MM f/1.4l").json()["items"]) == 2
-    found = client.get("/v1/lenses?model=EF24mm f/1.4L&serial=2").json()["items"]
-    assert [lens["id"] for lens in found] == [second]
-    assert client.get("/v1/lenses?serial=3").json()["items"] == []
-    assert len(client.get("/v1/lenses?model=&serial=").json()["items"]) == 2  # blank asks for all
+    for query, found in {
+        "model=ef24MM f/1.4l": [second, first],
+        "model=EF24mm f/1.4L&serial=2": [second],
+        "serial=3": [],
+        "model=&serial=": [second, first],  # blank asks for all
+    }.items():
+        assert [lens["id"] for lens in client.get(f"/v1/lenses?{query}").json()["items"]] == found, query
 
 
 def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> None:
     answer = ask(client, lens)
 
     kernel = np.array(answer["psf"]["data"])
-    assert kernel.shape == (55, 55)
-    assert answer["psf"]["shape"] == [55, 55]
+    assert list(kernel.shape) == answer["psf"]["shape"] == [55, 55]
     assert kernel.min() >= 0
     assert kernel.sum() == pytest.approx(1, abs=1e-6)
     assert np.abs(centroid(kernel)).max() < 0.05
-    assert answer["version"] == 1
     asked = {"r": 0.9, "phi": 0.59, "aperture": 1.4, "channel": "g", "size": 55}
     assert asked.items() <= answer["query"].items()
-    assert answer["support"]["photos"] == 1
+    assert (answer["version"], answer["support"]["photos"]) == (1, 1)
     assert answer["support"]["effective_samples"] > 0
     assert set(answer["bandwidth"]) >= {"r", "phi"}
     assert answer["units"] == {"r": "half-diagonal", "phi": "radian", "pixel_pitch_um": 6.0}
@@ -78,50 +83,43 @@ def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> 
 
 def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None:
     query = {"r": 0.5, "phi": 2.2, "aperture": 1.4, "size": 21}
-    data = np.array(client.get(f"{lens}/psf.json", params=query).json()["psf"]["data"])
+    answers = [client.get(f"{lens}/psf.{form}", params=query) for form in ("json", "npy", "tiff", "png")]
+    data, png = np.array(answers[0].json()["psf"]["data"]), answers[3]
 
-    npy = np.load(io.BytesIO(client.get(f"{lens}/psf.npy", params=query).content), allow_pickle=False)
-    tiff = client.get(f"{lens}/psf.tiff", params=query)
-    png = client.get(f"{lens}/psf.png", params=query)
-
+    npy = np.load(io.BytesIO(answers[1].content), allow_pickle=False)
     assert npy.dtype == np.float32
     np.testing.assert_allclose(npy, data, atol=1e-7)
-    with tifffile.TiffFile(io.BytesIO(tiff.content)) as file:
+    with tifffile.TiffFile(io.BytesIO(answers[2].content)) as file:
         np.testing.assert_array_equal(file.asarray(), npy)
         assert '"version":1' in file.pages.first.tags["ImageDescription"].value
     picture = np.asarray(Image.open(io.BytesIO(png.content)), dtype=np.float64)
     peak = float(png.headers["x-psf-scale"].partition(";")[0].removeprefix("max="))
     np.testing.assert_allclose(picture / 65535 * peak, data, atol=peak / 65535)
-    assert [r.headers["content-type"] for r in (tiff, png)] == ["image/tiff", "image/png"]
+    assert [r.headers["content-type"] for r in answers[2:]] == ["image/tiff", "image/png"]
     assert 'filename="psf-v1-r0.500-phi2.200-f1.4-g.png"' in png.headers["content-disposition"]
 
 
-@pytest.mark.parametrize(
-    ("accept", "form"),
-    [
-        ("*/*", "json"),
-        ("application/json", "json"),
-        ("image/png", "png"),
-        ("image/tiff;q=0.5, image/png;q=0.2", "tiff"),
-        ("text/html, image/*;q=0.8", "png"),
-        ("application/x-npy", "npy"),
-        ("application/json;q=0, image/png", "png"),
-    ],
-)
-def test_the_format_follows_what_the_caller_likes_best(accept: str, form: str) -> None:
-    assert accepted(accept) == form
+def test_the_format_follows_what_the_caller_likes_best(client: TestClient, lens: str) -> None:
+    for accept, form in {
+        "*/*": "json",
+        "application/json": "json",
+        "image/png": "png",
+        "image/tiff;q=0.5, image/png;q=0.2": "tiff",
+        "text/html, image/*;q=0.8": "png",
+        "application/x-npy": "npy",
+        "application/json;q=0, image/png": "png",
+    }.items():
+        assert accepted(accept) == form
 
-
-def test_a_format_that_nobody_offers_is_not_acceptable(client: TestClient, lens: str) -> None:
-    answer = client.get(f"{lens}/psf?r=0.5", headers={"Accept": "video/mp4"})
-
-    assert (answer.status_code, answer.json()["code"]) == (406, "not_acceptable")
+    for accept in ("video/mp4", "image/png;q=0"):
+        none = client.get(f"{lens}/psf?r=0.5", headers={"Accept": accept})
+        assert refusal(none) == (406, "not_acceptable")
 
 
 def test_an_unchanged_psf_is_not_sent_again_and_a_changed_one_is(
     client: TestClient, steps: Steps, lens: str
 ) -> None:
-    path = f"{lens}/psf?r=0.9&phi=0.59&aperture=1.4"
+    path = f"{lens}/psf?{PLACE}"
     for asked in (f"{lens}/field.png?aperture=1.4&grid=4x3&size=15", path):
         first = client.get(asked)
         tag = {"If-None-Match": first.headers["etag"]}
@@ -131,34 +129,25 @@ def test_an_unchanged_psf_is_not_sent_again_and_a_changed_one_is(
 
     steps.counted(patches=6, width=4.0)
 
-    changed = client.get(path, headers=tag)
-    assert changed.status_code == 200
+    changed = client.get(path, headers=tag)  # the photo is in the very next answer
+    assert (changed.status_code, changed.json()["version"]) == (200, 2)
     assert changed.headers["etag"] != first.headers["etag"]
-
-
-def test_a_new_photo_is_in_the_very_next_answer(client: TestClient, steps: Steps, lens: str) -> None:
-    before = ask(client, lens)
-
-    steps.counted(patches=6, width=4.0)
-
-    after = ask(client, lens)
-    assert (before["version"], after["version"]) == (1, 2)
-    assert np.max(after["psf"]["data"]) < np.max(before["psf"]["data"])
-    assert after["support"]["photos"] == 2
+    assert np.max(changed.json()["psf"]["data"]) < np.max(first.json()["psf"]["data"])
+    assert changed.json()["support"]["photos"] == 2
 
 
 def test_adding_photos_one_by_one_gives_the_model_of_all_at_once(
-    client: TestClient, steps: Steps, store: Store, lens: str
+    client: TestClient, steps: Steps, store: Store, lens: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ask(client, lens)
     steps.counted(patches=6, width=4.0)
-    grown = ask(client, lens)["psf"]["data"]
-
     anew = ModelCache(store, max_bytes=1).get(lens.rpartition("/")[2])
+    monkeypatch.setattr(model_cache, "_fit", None)  # the first is extended, and then remembered
+    grown = [ask(client, lens)["psf"]["data"] for _ in range(2)]
 
     assert anew.state.version == 2
     answer = anew.model.query(FieldPosition(0.9, 0.59), LensSettings(1.4), size=55)
-    np.testing.assert_allclose(grown, answer.kernel, atol=1e-6)
+    np.testing.assert_allclose(grown, [answer.kernel] * 2, atol=1e-6)
 
 
 def test_an_earlier_version_stays_available_until_photos_are_removed(
@@ -168,14 +157,12 @@ def test_an_earlier_version_stays_available_until_photos_are_removed(
     second = steps.counted(patches=6, width=4.0)
 
     pinned = ask(client, lens, version=1)
-    assert pinned["version"] == 1
+    assert (pinned["version"], ask(client, lens)["version"]) == (1, 2)
     np.testing.assert_allclose(pinned["psf"]["data"], first["psf"]["data"], atol=1e-9)
 
     client.patch(f"/v1/photos/{second.public_id}", json={"excluded": True})
-    gone = client.get(f"{lens}/psf?r=0.5&version=1")
-    future = client.get(f"{lens}/psf?r=0.5&version=99")
-    for answer in (gone, future):
-        assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    for version in (1, 99):
+        assert refusal(client.get(f"{lens}/psf?r=0.5&version={version}")) == (409, "conflict")
     assert ask(client, lens)["support"]["photos"] == 1
 
 
@@ -199,21 +186,15 @@ def test_a_bad_question_is_answered_with_the_offending_value(client: TestClient,
     for name, query in (*asked, ("r", {})):
         answer = client.get(f"{lens}/psf", params=query)
 
-        assert (query, answer.status_code) == (query, 422)
-        problem = answer.json()
-        assert problem["code"] == "invalid_parameter"
-        assert name in problem["errors"][0]["field"]
-        assert name in problem["detail"]
-
-
-@pytest.mark.parametrize(("name", "value"), [("focus_distance_m", 0.02), ("pixel_pitch_um", 0.5)])
-def test_the_smallest_of_real_cameras_is_answered(name: str, value: float) -> None:
-    assert getattr(PsfQuery.model_validate({"r": 0.5, name: value}), name) == value
+        assert (query, refusal(answer)) == (query, (422, "invalid_parameter"))
+        assert name in answer.json()["errors"][0]["field"]
+        assert name in answer.json()["detail"]
+    for smallest in ({"focus_distance_m": 0.02}, {"pixel_pitch_um": 0.5}):  # of real cameras
+        assert PsfQuery.model_validate({"r": 0.5, **smallest})
 
 
 def test_phi_is_an_angle_and_comes_round(client: TestClient, lens: str) -> None:
-    there = ask(client, lens, phi=0.59)
-    round_once = ask(client, lens, phi=0.59 + 2 * math.pi)
+    there, round_once = (ask(client, lens, phi=phi) for phi in (0.59, 0.59 + 2 * math.pi))
 
     assert round_once["query"]["phi"] == pytest.approx(0.59)
     np.testing.assert_allclose(round_once["psf"]["data"], there["psf"]["data"], atol=1e-9)
@@ -222,57 +203,47 @@ def test_phi_is_an_angle_and_comes_round(client: TestClient, lens: str) -> None:
 def test_a_lens_without_samples_says_what_to_do(client: TestClient, steps: Steps) -> None:
     photo = steps.receive()
     steps.inspect(photo)
-    lens = f"/v1/lenses/{steps.lens_id(photo)}"
 
     for path in ("psf?r=0.5", "psf.png?r=0.5", "field.png", "lateral-colour"):
-        answer = client.get(f"{lens}/{path}")
-        assert (answer.status_code, answer.json()["code"]) == (409, "no_samples"), path
+        answer = client.get(f"/v1/lenses/{steps.lens_id(photo)}/{path}")
+        assert refusal(answer) == (409, "no_samples"), path
         assert "upload" in answer.json()["detail"]
 
 
 def test_a_strict_question_outside_the_samples_is_refused(client: TestClient, lens: str) -> None:
-    query = {"r": 0.9, "phi": 0.59, "aperture": 128}
-
-    lenient = ask(client, lens, **query)
-    strict = client.get(f"{lens}/psf", params=query | {"strict": True})
-
-    assert lenient["support"]["extrapolated"]
-    assert (strict.status_code, strict.json()["code"]) == (422, "outside_support")
+    assert ask(client, lens, aperture=128)["support"]["extrapolated"]
+    strict = client.get(f"{lens}/psf?r=0.9&phi=0.59&aperture=128&strict=true")
+    assert refusal(strict) == (422, "outside_support")
 
 
-def test_the_field_map_has_a_kernel_for_each_cell(client: TestClient, lens: str) -> None:
-    answer = client.get(f"{lens}/field.png?aperture=1.4&grid=4x3&size=15")
+def test_the_field_map_has_a_kernel_for_each_cell_and_hatches_what_is_not_known(
+    client: TestClient, lens: str
+) -> None:
+    def drawn(aperture: float) -> np.ndarray:
+        answer = client.get(f"{lens}/field.png?aperture={aperture}&grid=4x3&size=15")
+        return np.asarray(Image.open(io.BytesIO(answer.content)))
 
-    picture = np.asarray(Image.open(io.BytesIO(answer.content)))
+    picture, cell = drawn(1.4), drawn(22)[2:17, 2:17]
     assert picture.shape == (3 * 17 + 2, 4 * 17 + 2)
-    assert sum(bool(picture[2 + 17 * k : 17 + 17 * k].max() == 255) for k in range(3)) == 3
-    for grid in ("26x1", "1x0"):
-        refused = client.get(f"{lens}/field.png?aperture=1.4&grid={grid}").json()["detail"]
-        assert refused == f"grid {grid}: columns and rows must lie in 1..25, as in 9x6"
-
-
-def test_the_field_map_hatches_what_is_not_known(client: TestClient, lens: str) -> None:
-    answer = client.get(f"{lens}/field.png?aperture=22&grid=4x3&size=15")
-
-    cell = np.asarray(Image.open(io.BytesIO(answer.content)))[2:17, 2:17]
+    assert [picture[2 + 17 * k : 17 + 17 * k].max() for k in range(3)] == [255] * 3
     assert set(cell.ravel()) == {40, 110}
     np.testing.assert_array_equal(cell, cell.T)  # strokes, not a kernel
     assert (cell[0, :2] == 110).all()
 
 
 def test_the_history_has_one_item_for_each_version(client: TestClient, steps: Steps, store: Store) -> None:
-    first, second = steps.counted(), steps.counted()
-    lens_id = steps.lens_id(first)
-    store.lenses.record_metrics(lens_id, 2, {"error": {"corner": 0.21}, "coverage": {"corner": 4}})
+    photos = [steps.counted(), steps.counted()]
+    path = f"/v1/lenses/{steps.lens_id(photos[0])}/calibrations"
+    metrics = {"error": {"corner": 0.21}, "coverage": {"corner": 4}}
+    store.lenses.record_metrics(steps.lens_id(photos[0]), 2, metrics)
 
-    items = client.get(f"/v1/lenses/{lens_id}/calibrations").json()["items"]
+    items = client.get(path).json()["items"]
 
-    assert [item["version"] for item in items] == [1, 2]
-    assert [item["photo_id"] for item in items] == [first.public_id, second.public_id]
-    assert [item["samples"] for item in items] == [6, 12]
-    assert (items[0]["error"], items[1]["error"]) == (None, {"corner": 0.21})
-    assert items[1]["coverage"] == {"corner": 4}
-    page = client.get(f"/v1/lenses/{lens_id}/calibrations?limit=1").json()
+    told = [[item[name] for name in ("version", "photo_id", "samples", "error")] for item in items]
+    first, second = (photo.public_id for photo in photos)
+    assert told == [[1, first, 6, None], [2, second, 12, metrics["error"]]]
+    assert items[1]["coverage"] == metrics["coverage"]
+    page = client.get(f"{path}?limit=1").json()
     assert client.get(page["next"]).json()["items"][0]["version"] == 2
 
 
@@ -288,19 +259,5 @@ def test_lateral_colour_is_the_middle_of_what_the_photos_show(
 
     shown = client.get(f"/v1/lenses/{steps.lens_id(photos[0])}/lateral-colour").json()
 
-    assert shown["red"] == [0.0, 0.0, 2e-4, 1.0]
-    assert shown["blue"] == [0.0, 0.0, -2e-4, 1.0]
+    assert (shown["red"], shown["blue"]) == ([0.0, 0.0, 2e-4, 1.0], [0.0, 0.0, -2e-4, 1.0])
     assert shown["photos"] == 3
-
-
-def test_a_warm_psf_costs_milliseconds(client: TestClient, lens: str) -> None:
-    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
-    ask(client, lens)
-    lens_id = lens.rpartition("/")[2]
-    seconds = []
-    for _ in range(50):
-        began = time.process_time()
-        services.models.get(lens_id)
-        seconds.append(time.process_time() - began)
-
-    assert statistics.median(seconds) < 0.005  # processor time: other work on the machine does not count

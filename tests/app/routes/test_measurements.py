@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
+from states import Steps, refusal
 
 from app.jobs import tasks
 from app.jobs.answers import SAMPLES, JobFailedError
@@ -28,7 +29,6 @@ from lensmodel.measured import MeasuredPsf
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo
 
-Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
 
 
@@ -75,14 +75,8 @@ class AtTwoPlaces:
 
 
 def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shot = LinearPhoto(
-        planes=np.zeros((3, 60, 80), np.float32),
-        frame=Frame(60, 80),
-        noise=(NoiseModel.white(0.01),) * 3,
-        clip=(1.0, 1.0, 1.0),
-        info=PhotoInfo("dng", 80, 60),
-        encoding=Encoding(),
-    )
+    planes, noise, info = np.zeros((3, 60, 80), np.float32), NoiseModel.white(0.01), PhotoInfo("dng", 80, 60)
+    shot = LinearPhoto(planes, Frame(60, 80), (noise,) * 3, (1.0, 1.0, 1.0), info, Encoding())
     sampling.save_developed(shot, tmp_path / "developed")
     monkeypatch.setattr(tasks.lens_measure, "methods", Registry("way of measuring", {"quick": AtTwoPlaces}))
     settings = {"aperture": 2.8, "focal_mm": None, "focus_m": -1.0}
@@ -106,15 +100,9 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     "changed",
     [
-        {"settings": {"channel": "x"}},
-        {"error": None},
-        {"error": 7.0},
-        {"error": float("nan")},
-        {"r": 2.0},
-        {"weight": 2.0},
-        {"idx": -1},
-        {"idx": float("inf")},
-        {"row": "a"},
+        *({"settings": {"channel": "x"}}, {"r": 2.0}, {"weight": 2.0}, {"row": "a"}),
+        *({"error": error} for error in (None, 7.0, math.nan)),
+        *({"idx": number} for number in (-1, math.inf)),
     ],
 )
 def test_nonsense_of_a_child_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
@@ -127,16 +115,17 @@ def test_a_measurement_without_kernels_is_refused(tmp_path: Path) -> None:
         _measured([place(0)], tmp_path)
 
 
+def send(client: TestClient, steps: Steps, **fields: str) -> tuple[Any, str]:
+    """Send a measurement to a known lens; return the answer and the lens."""
+    lens = steps.lens_id(steps.counted())
+    page = {"file": ("page.png", PNG)}
+    return client.post(f"/v1/lenses/{lens}/measurements", data=fields, files=page), lens
+
+
 def test_a_measurement_is_sent_to_its_lens(client: TestClient, steps: Steps, store: Store) -> None:
-    counted = steps.counted()
-    lens = client.get(f"/v1/photos/{counted.public_id}").json()["lens_id"]
-    answer = client.post(
-        f"/v1/lenses/{lens}/measurements",
-        data={"kind": "target", "aperture": "2.8"},
-        files={"file": ("page.png", PNG)},
-    )
-    assert answer.status_code == 202, answer.text
-    assert answer.json()["kind"] == "target"
+    answer, lens = send(client, steps, kind="target", aperture="2.8")
+
+    assert (answer.status_code, answer.json()["kind"]) == (202, "target"), answer.text
     row = store.photos.get(answer.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.given["lens_id"] == lens
@@ -155,15 +144,15 @@ def test_a_measurement_is_sent_to_its_lens(client: TestClient, steps: Steps, sto
 def test_a_measurement_that_makes_no_sense_is_refused(
     client: TestClient, steps: Steps, fields: dict[str, str], word: str
 ) -> None:
-    counted = steps.counted()
-    lens = client.get(f"/v1/photos/{counted.public_id}").json()["lens_id"]
-    answer = client.post(f"/v1/lenses/{lens}/measurements", data=fields, files={"file": ("page.png", PNG)})
+    answer, _ = send(client, steps, **fields)
+
     assert answer.status_code == 422
     assert word in answer.text
 
 
-def test_a_measurement_of_an_unknown_lens_or_reference_is_a_404(client: TestClient, steps: Steps) -> None:
-    answer = client.post("/v1/lenses/nobody/measurements?kind=target", content=PNG)
-    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_lens")
-    answer = client.post("/v1/photos?kind=pair&reference_id=nobody", content=PNG)
-    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_photo")
+def test_a_measurement_of_an_unknown_lens_or_reference_is_a_404(client: TestClient) -> None:
+    for path, code in (
+        ("lenses/nobody/measurements?kind=target", "unknown_lens"),
+        ("photos?kind=pair&reference_id=nobody", "unknown_photo"),
+    ):
+        assert refusal(client.post(f"/v1/{path}", content=PNG)) == (404, code)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
+from states import TIFF, Steps, refusal, stored
 
 from app.http.dependencies import Call
 from app.routes import jobs
@@ -18,30 +19,36 @@ from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.photos import Photos
 
-Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
-TIFF = b"II*\x00" + bytes(9000)
-
 
 def get(client: TestClient, path: str) -> dict[str, Any]:
-    answer = client.get(path)
+    answer = client.get(f"/v1/{path}")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
 
-@pytest.fixture
-def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
-    """Let a change happen when the watching request has read the job once, however busy the machine is."""
+def change(client: TestClient, photo: Any, **said: Any) -> Any:
+    return client.patch(f"/v1/photos/{photo.public_id}", json=said)
 
-    def arrange(change: Callable[[], object]) -> None:
-        find, pending = jobs.find_job, [change]
+
+Noted = Callable[[Callable[[], object]], list[str]]
+
+
+@pytest.fixture
+def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Noted:
+    """Let a change happen when the watching request has read the job once, and note what it reads."""
+
+    def arrange(change: Callable[[], object]) -> list[str]:
+        find, pending, reads = jobs.find_job, [change], list[str]()
 
         def find_then_change(call: Call, job_id: str) -> JobOut:
             job = find(call, job_id)
+            reads.append(job_id)
             if pending:
                 pending.pop()()
             return job
 
         monkeypatch.setattr(jobs, "find_job", find_then_change)
+        return reads
 
     return arrange
 
@@ -49,32 +56,33 @@ def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], 
 def test_a_counted_photo_shows_its_lens_and_patches(client: TestClient, steps: Steps) -> None:
     photo = steps.counted()
 
-    shown = get(client, f"/v1/photos/{photo.public_id}")
+    shown = get(client, f"photos/{photo.public_id}")
 
-    assert shown["state"] == "counted"
+    assert (shown["state"], shown["lens_id"]) == ("counted", steps.lens_id(photo))
     assert shown["patches"] == {"total": 2, "done": 2, "rejected": 1}
-    assert shown["lens_id"] == steps.lens_id(photo)
     assert shown["links"]["lens"] == f"/v1/lenses/{shown['lens_id']}"
     assert (shown["width"], shown["focal_length_mm"], shown["pixel_pitch_um"]) == (6000, 24.0, 6.0)
-    patches = get(client, f"/v1/photos/{photo.public_id}/patches")["items"]
-    assert [patch["state"] for patch in patches] == ["done", "done", "rejected"]
-    assert patches[2]["reason"] == "flat"
+    patches = get(client, f"photos/{photo.public_id}/patches")["items"]
+    assert [(patch["state"], patch["reason"]) for patch in patches] == [
+        *[("done", None)] * 2,
+        ("rejected", "flat"),
+    ]
 
 
 def test_no_answer_about_a_photo_holds_the_serial(client: TestClient, steps: Steps) -> None:
     photo = steps.receive()
     steps.inspect(photo, serial="SECRET-77")
 
-    assert "SECRET-77" not in client.get(f"/v1/photos/{photo.public_id}").text
-    assert "SECRET-77" not in client.get(f"/v1/jobs/{photo.public_id}").text
+    for kind in ("photos", "jobs"):
+        assert "SECRET-77" not in client.get(f"/v1/{kind}/{photo.public_id}").text
 
 
 def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -> None:
     counted, other = steps.counted(serial="1"), steps.counted(serial="2")
     steps.receive()
 
-    by_lens = get(client, f"/v1/photos?lens_id={steps.lens_id(counted)}")["items"]
-    by_state = get(client, "/v1/photos?state=counted")["items"]
+    by_lens = get(client, f"photos?lens_id={steps.lens_id(counted)}")["items"]
+    by_state = get(client, "photos?state=counted")["items"]
 
     assert [photo["id"] for photo in by_lens] == [counted.public_id]
     assert [photo["id"] for photo in by_state] == [other.public_id, counted.public_id]
@@ -82,92 +90,59 @@ def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -
 
 def test_excluding_a_photo_takes_it_out_of_the_lens_and_back(client: TestClient, steps: Steps) -> None:
     photo = steps.counted()
-    lens = f"/v1/lenses/{steps.lens_id(photo)}"
+    lens = f"lenses/{steps.lens_id(photo)}"
 
-    out = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
-    assert out.json()["state"] == "excluded"
-    assert (get(client, lens)["samples"], get(client, lens)["version"]) == (0, 2)
+    for excluded, state, samples, version in (
+        (True, "excluded", 0, 2),
+        (True, "excluded", 0, 2),  # again: no version of its own
+        (False, "counted", 6, 3),
+    ):
+        answer = change(client, photo, excluded=excluded)
+        known = get(client, lens)
+        assert (answer.status_code, answer.json()["state"]) == (200, state)
+        assert (known["samples"], known["version"]) == (samples, version)
 
-    again = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
-    assert again.status_code == 200
-    assert get(client, lens)["version"] == 2
-
-    back = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": False})
-    assert back.json()["state"] == "counted"
-    assert (get(client, lens)["samples"], get(client, lens)["version"]) == (6, 3)
-
-
-def test_a_photo_that_does_not_count_cannot_be_excluded(client: TestClient, steps: Steps) -> None:
-    answer = client.patch(f"/v1/photos/{steps.receive().public_id}", json={"excluded": True})
-
-    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert refusal(change(client, steps.receive(), excluded=True)) == (409, "conflict")
 
 
-def test_a_photo_that_was_stored_can_still_teach_its_lens(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
-    photo = steps.receive(calibrate=False)
-    steps.inspect(photo)
-    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
-    path = f"/v1/photos/{photo.public_id}"
+def test_a_photo_that_was_stored_can_still_teach_its_lens(client: TestClient, steps: Steps) -> None:
+    photo = stored(steps)
 
-    begun = client.patch(path, json={"calibrate": True, "aperture": 2.8})
+    begun = change(client, photo, calibrate=True, aperture=2.8)
+    again = change(client, photo, calibrate=True)  # nothing begins twice
 
     assert (begun.status_code, begun.json()["state"], begun.json()["calibrate"]) == (200, "received", True)
-    row = store.photos.get(photo.public_id, ANY_OWNER)
-    assert row is not None
-    assert row.epoch == photo.epoch + 1
-    assert row.given["aperture"] == 2.8
-    again = client.patch(path, json={"calibrate": True})  # nothing begins twice
     assert again.status_code == 200
-    row = store.photos.get(photo.public_id, ANY_OWNER)
-    assert row is not None
-    assert row.epoch == photo.epoch + 1
-    assert client.patch(path, json={"calibrate": False}).status_code == 422
+    row = steps.fresh(photo)
+    assert (row.epoch, row.given["aperture"]) == (photo.epoch + 1, 2.8)
+    assert change(client, photo, calibrate=False).status_code == 422
 
 
 def test_a_photo_whose_file_is_gone_cannot_teach(client: TestClient, steps: Steps, store: Store) -> None:
-    photo = steps.receive(calibrate=False)
-    steps.inspect(photo)
-    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+    photo = stored(steps)
     assert store.photos.give_up_file(photo.public_id, ())
 
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json={"calibrate": True})
+    answer = change(client, photo, calibrate=True)
 
-    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert refusal(answer) == (409, "conflict")
     assert "send the same file again" in answer.json()["detail"]
-    assert get(client, f"/v1/photos/{photo.public_id}")["calibrate"] is False
-
-
-def waiting(store: Store, steps: Steps) -> Any:
-    photo = steps.receive()
-    steps.inspect(photo, serial=None)
-    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
-    return photo
-
-
-def test_a_photo_without_a_lens_waits(client: TestClient, steps: Steps, store: Store) -> None:
-    photo = waiting(store, steps)
-
-    job = get(client, f"/v1/jobs/{photo.public_id}")
-
-    assert (job["state"], job["error"]["code"]) == ("waiting", "metadata_missing")
-    assert get(client, f"/v1/photos/{photo.public_id}")["error"]["code"] == "metadata_missing"
+    assert get(client, f"photos/{photo.public_id}")["calibrate"] is False
 
 
 @pytest.mark.parametrize("way", ["lens_id", "lens_serial", "new_lens"])
-def test_naming_the_lens_starts_a_waiting_photo_again(
-    client: TestClient, steps: Steps, store: Store, way: str
+def test_a_photo_without_a_lens_waits_and_starts_again_once_that_is_named(
+    client: TestClient, steps: Steps, way: str
 ) -> None:
-    known = steps.lens_id(steps.counted(serial="123"))
-    photo = waiting(store, steps)
-    body = {"lens_id": known, "lens_serial": "123", "new_lens": {"label": "the scratched one"}}[way]
+    known, photo = steps.lens_id(steps.counted(serial="123")), steps.waiting()
+    job, shown = (get(client, f"{kind}/{photo.public_id}") for kind in ("jobs", "photos"))
+    name = {"lens_id": known, "lens_serial": "123", "new_lens": {"label": "the scratched one"}}[way]
 
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json={way: body})
+    answer = change(client, photo, **{way: name})
 
-    assert answer.json()["state"] == "received"
+    assert job["state"] == "waiting"
+    assert job["error"]["code"] == shown["error"]["code"] == "metadata_missing"
     again = steps.fresh(photo)
-    assert again.epoch == 2
+    assert (answer.json()["state"], again.epoch) == ("received", 2)
     steps.inspect(again, serial=None)
     assert (steps.lens_id(photo) == known) == (way != "new_lens")
 
@@ -175,42 +150,33 @@ def test_naming_the_lens_starts_a_waiting_photo_again(
 def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps, store: Store) -> None:
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky")
-    change = {"aperture": 2.0, "new_lens": {"label": "mine"}, "excluded": True}
 
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json=change)
+    answer = change(client, photo, aperture=2.0, new_lens={"label": "mine"}, excluded=True)
 
-    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
-    assert get(client, "/v1/lenses")["items"] == []
+    assert refusal(answer) == (409, "conflict")
+    assert get(client, "lenses")["items"] == []
     assert (steps.fresh(photo).state, steps.fresh(photo).epoch) == ("failed", 1)
 
 
-def test_a_counted_photo_moves_to_the_lens_that_the_owner_names(client: TestClient, steps: Steps) -> None:
+def test_a_counted_photo_moves_to_another_lens_and_aperture(client: TestClient, steps: Steps) -> None:
     mine, other = steps.counted(serial="1"), steps.counted(serial="2")
 
-    answer = client.patch(f"/v1/photos/{mine.public_id}", json={"lens_id": steps.lens_id(other)})
+    moved = change(client, mine, lens_id=steps.lens_id(other)).json()
+    lens = get(client, f"lenses/{steps.lens_id(other)}")
+    opened = change(client, mine, aperture=2.0).json()
+    renewed = get(client, f"lenses/{steps.lens_id(other)}")
 
-    assert answer.json()["lens_id"] == steps.lens_id(other)
-    assert get(client, answer.json()["links"]["lens"])["photos"] == 2
-
-
-def test_a_corrected_aperture_renews_the_lens(client: TestClient, steps: Steps) -> None:
-    photo = steps.counted()
-
-    answer = client.patch(f"/v1/photos/{photo.public_id}", json={"aperture": 2.0})
-
-    assert answer.json()["aperture"] == 2.0
-    lens = get(client, answer.json()["links"]["lens"])
-    assert (lens["version"], lens["apertures"]) == (2, [2.0])
+    assert (moved["lens_id"], lens["photos"], opened["aperture"]) == (lens["id"], 2, 2.0)
+    assert (renewed["version"], renewed["apertures"]) == (lens["version"] + 1, [1.4, 2.0])
 
 
 def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, settings: Settings) -> None:
-    photo = client.post("/v1/photos", content=TIFF).json()
+    photo = client.post("/v1/photos", content=TIFF).json()["id"]
 
-    assert client.delete(f"/v1/photos/{photo['id']}").status_code == 204
+    deleted = [client.delete(f"/v1/photos/{photo}").status_code for _ in range(2)]
 
-    assert client.get(f"/v1/photos/{photo['id']}").status_code == 404
-    assert client.get(f"/v1/jobs/{photo['id']}").status_code == 404
-    assert client.delete(f"/v1/photos/{photo['id']}").status_code == 404
+    assert deleted == [204, 404]
+    assert [client.get(f"/v1/{kind}/{photo}").status_code for kind in ("photos", "jobs")] == [404, 404]
     assert list((settings.data_dir / "blobs" / "photos").iterdir()) == []
     assert client.post("/v1/photos", content=TIFF).status_code == 202
 
@@ -222,93 +188,55 @@ def test_a_photo_that_is_deleted_while_it_is_sent_is_told_as_it_was_received(
 
     answer = client.post("/v1/photos", content=TIFF)
 
-    assert answer.status_code == 202, answer.text
-    assert answer.json()["state"] == "received"
+    assert (answer.status_code, answer.json()["state"]) == (202, "received")
 
 
 def test_a_job_tells_how_far_it_is(client: TestClient, steps: Steps) -> None:
-    photo = steps.receive()
-    assert get(client, f"/v1/jobs/{photo.public_id}")["state"] == "queued"
-    steps.inspect(photo)
-    steps.plan(photo)
+    photo = steps.planned()
     steps.estimate(photo, (0,))
 
-    job = get(client, f"/v1/jobs/{photo.public_id}")
+    job = get(client, f"jobs/{photo.public_id}")
 
-    assert (job["id"], job["kind"], job["state"], job["stage"]) == (
-        photo.public_id,
-        "photo",
-        "running",
-        "estimating",
-    )
+    told = [job[name] for name in ("id", "kind", "state", "stage")]
+    assert told == [photo.public_id, "photo", "running", "estimating"]
     assert job["progress"] == {"done": 1, "total": 2, "unit": "patches"}
     assert job["eta_seconds"] >= 0
     assert job["links"]["photo"] == f"/v1/photos/{photo.public_id}"
 
 
-def test_a_failed_job_says_why(client: TestClient, steps: Steps, store: Store) -> None:
-    photo = steps.receive()
-    store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky: photograph something with detail")
-
-    job = get(client, f"/v1/jobs/{photo.public_id}")
-
-    assert job["state"] == "failed"
-    assert job["error"]["code"] == "no_usable_patches"
-    assert job["error"]["status"] == 422
-    assert "detail" in job["error"]["detail"]
-    assert job["finished_at"] is not None
-
-
 def test_a_waiting_request_answers_at_the_change(
-    client: TestClient, steps: Steps, store: Store, after_first_read: Callable[[Callable[[], object]], None]
+    client: TestClient, steps: Steps, store: Store, after_first_read: Noted
 ) -> None:
     photo = steps.receive()
     after_first_read(lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting"))
     began = time.monotonic()
 
-    job = get(client, f"/v1/jobs/{photo.public_id}?wait=10")
+    job = get(client, f"jobs/{photo.public_id}?wait=10")
 
     assert job["stage"] == "inspecting"
     assert time.monotonic() - began < 8.0  # it did not wait to the end
 
 
 def test_a_finished_job_does_not_make_anybody_wait(
-    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch, after_first_read: Noted
 ) -> None:
-    photo = steps.counted()
-    find, reads = jobs.find_job, list[str]()
-
-    def find_and_note(call: Call, job_id: str) -> JobOut:
-        reads.append(job_id)
-        return find(call, job_id)
-
-    monkeypatch.setattr(jobs, "find_job", find_and_note)
+    photo, reads = steps.counted(), after_first_read(lambda: None)
     monkeypatch.setattr(jobs, "LOOK_S", 60.0)
 
-    assert get(client, f"/v1/jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
-
+    assert get(client, f"jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
     assert reads == [photo.public_id]
 
 
-def test_cancelling_ends_a_job_once(client: TestClient, steps: Steps) -> None:
-    photo = steps.receive()
-
-    first = client.post(f"/v1/jobs/{photo.public_id}/cancel")
-    second = client.post(f"/v1/jobs/{photo.public_id}/cancel")
-
-    assert (first.status_code, first.json()["state"]) == (202, "cancelled")
-    assert (second.status_code, second.json()["code"]) == (409, "conflict")
-
-
-def test_events_send_each_state_until_the_end(
-    client: TestClient, steps: Steps, store: Store, after_first_read: Callable[[Callable[[], object]], None]
+def test_events_send_each_state_until_the_end_and_nothing_ends_twice(
+    client: TestClient, steps: Steps, store: Store, after_first_read: Noted
 ) -> None:
-    photo = steps.receive()
+    path = f"/v1/jobs/{(photo := steps.receive()).public_id}"
     after_first_read(lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
 
-    text = client.get(f"/v1/jobs/{photo.public_id}/events").text
+    lines = client.get(f"{path}/events").text.splitlines()
 
-    events = [
-        json.loads(line.removeprefix("data: ")) for line in text.splitlines() if line.startswith("data: ")
-    ]
+    events = [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")]
     assert [event["state"] for event in events] == ["queued", "cancelled"]
+    assert refusal(client.post(f"{path}/cancel")) == (409, "conflict")
+    other = client.post(f"/v1/jobs/{steps.receive().public_id}/cancel")
+    assert (other.status_code, other.json()["state"]) == (202, "cancelled")

@@ -352,7 +352,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correction.correct_planes(
         planes,
-        field if unguarded else _Posteriors(field, (1, 3) if developed.info.turns is None else (0,)),
+        field if unguarded else _Posteriors(field, (1, 3) if developed.info.turned else (0,)),
         developed.frame,
         method=solver,
         strength=strength,

@@ -41,7 +41,6 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, StepHook, ignore_step
 from lensmodel.patches import Patch, Selection, Selector
 from lensmodel.photo import LinearPhoto, PhotoMetadata
-from lensmodel.photo.raster import require_known_turn
 
 log = logging.getLogger(__name__)
 
@@ -153,7 +152,7 @@ def find_patches(
 
     An estimator of whole photos chooses its own; for others `selector` scores windows of the green plane.
     """
-    require_known_turn(developed.info)
+    developed.info.require_known_turn()
     method = estimators.resolve(estimator)
     if isinstance(method, PhotoEstimator):
         selection = method.select(developed, count=count)

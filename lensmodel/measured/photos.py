@@ -11,7 +11,6 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.measured import methods, samples_of
 from lensmodel.photo import LinearPhoto, inspect
-from lensmodel.photo.raster import require_known_turn
 
 DEFAULT_SIZE: Final = 31  # pixels: that of an estimate
 
@@ -30,7 +29,7 @@ def samples_of_developed(
     if not photos:
         raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
     metadata = photos[0].info.metadata
-    require_known_turn(photos[0].info)
+    photos[0].info.require_known_turn()
     metadata.require_aperture(settings)
     measured = method.measure(photos, size=size, on_step=on_step)
     return samples_of(measured, method, photos[0], photo_id=photo_id, settings=metadata.settings(settings))

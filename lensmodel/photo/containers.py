@@ -92,7 +92,7 @@ _KINDS: Final[tuple[tuple[int, bytes, FileKind], ...]] = (
     (4, b"ftypcrx ", "raw"),  # Canon CR3
     (0, b"\0MRM", "raw"),  # Minolta
     (0, b"FOVb", "raw"),  # Sigma
-    (0, b"II*\0", "tiff"), (0, b"MM\0*", "tiff"), (0, b"II+\0", "tiff"), (0, b"MM\0+", "tiff"),
+    (0, b"II*\0", "tiff"), (0, b"MM\0*", "tiff"),
     (0, b"\x89PNG\r\n\x1a\n", "png"),
     (0, b"\xff\xd8\xff", "jpeg"),
 )  # fmt: skip
@@ -101,6 +101,7 @@ _REFUSED: Final[tuple[tuple[int, bytes, str], ...]] = (
     (4, b"ftypheic", "HEIC"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavif", "AVIF"),
     (0, b"\xff\x0a", "JPEG XL"), (4, b"JXL ", "JPEG XL"), (4, b"jP  ", "JPEG 2000"),
     (0, b"%PDF", "PDF"), (0, b"v/1\x01", "OpenEXR"), (0, b"PGF", "PGF"),
+    (0, b"II+\0", "BigTIFF"), (0, b"MM\0+", "BigTIFF"),
 )  # fmt: skip
 _READABLE: Final = "give RAW, DNG, TIFF, PNG or JPEG"
 
@@ -344,11 +345,18 @@ _STRIPS: Final = (273, 324), (279, 325)  # tags of the places of strips and of t
 _RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}  # Sony to Pentax: libtiff, tiff.h
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
-# PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3); two kinds of
-# grey, RGB, palette and YCbCr (TIFF 6.0, sections 3 to 6 and 21); what else is said by name.
+# PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3); grey, RGB and
+# YCbCr (TIFF 6.0, sections 4, 6 and 21); what else is said by name.
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
-_READ_COLOURS: Final = {0, 1, 2, 3, 6}
-_OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
+_READ_COLOURS: Final = {1, 2, 6}
+_DEPTHS: Final = {1: {8, 16}, 3: {16, 32, 64}, 4: {8, 16}}  # bits by SampleFormat: integer, floating, unsaid
+_OTHER_COLOURS: Final = {
+    0: "inverted grey",
+    3: "a palette",
+    4: "a mask",
+    5: "CMYK, made for print",
+    **dict.fromkeys((8, 9, 10), "CIE Lab"),
+}
 
 
 def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Header:
@@ -383,7 +391,11 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
             raise UnsupportedFormatError(
                 f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
             )
-        _check_colours(photo)  # first: chroma that is stored for several pixels looks cut off
+        if not _pixels(photo) or not all(photo.keys() & either for either in _STRIPS):
+            raise NotAnImageError(
+                f"the TIFF gives no size ({header.width} x {header.height}) or no strips: it holds no picture"
+            )
+        _check_numbers(photo)  # first: chroma that is stored for several pixels looks cut off
         _check_strips(photo, len(buffer))
         icc = _block(photo, _ICC)
         return replace(header, directory=place, icc=icc, icc_lost=_ICC in photo and icc is None)
@@ -450,34 +462,31 @@ def _strips(tags: Tags, file_bytes: int) -> tuple[tuple[int, ...], tuple[int, ..
 
 def _check_strips(tags: Tags, file_bytes: int) -> None:
     """Refuse a picture whose strips or tiles do not lie in the file."""
-    width, height = tags.integer(256), tags.integer(257)
-    if width <= 0 or height <= 0 or not all(tags.keys() & either for either in _STRIPS):
-        raise NotAnImageError(
-            f"the TIFF gives no size ({width} x {height}), or no strips: it holds no picture"
-        )
     starts, lengths, inside = _strips(tags, file_bytes)
     if not starts or len(starts) != len(lengths) or not inside:
         raise TruncatedImageError(
             f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
             "damaged; copy it again from the camera or card"
         )
-    stored = width * height * tags.integer(277, 1) * max(tags.integer(258, 1), 1) / 8
+    stored = _pixels(tags) * tags.integer(277, 1) * tags.integer(258, 1) / 8
     if tags.integer(259, 1) == 1 and sum(lengths) < 0.999 * stored:
         raise TruncatedImageError(
             f"the TIFF holds {sum(lengths)} bytes of pixels where {stored:.0f} are needed"
         )
 
 
-def _check_colours(tags: Tags) -> None:
-    """Refuse numbers that stand for other things than light of three colours, before they are stored."""
-    kind, samples = tags.integer(262, 1), tags.integer(277, 1)
+def _check_numbers(tags: Tags) -> None:
+    """Refuse numbers that are not read, or stand for other things than light, before they are stored."""
+    kind, samples, bits = tags.integer(262, 1), tags.integer(277, 1), tags.integer(258, 1)
     if kind not in _READ_COLOURS:
         named = _OTHER_COLOURS.get(kind, f"kind {kind}")
         raise UnsupportedFormatError(f"the TIFF's colours are {named}; convert it to RGB")
     if samples > 4 or (kind == 2 and samples < 3):
         raise UnsupportedFormatError(f"a picture of {samples} channels is no photo; give RGB")
-    if tags.integer(339, 1) not in {1, 3, 4}:
-        raise UnsupportedFormatError("the TIFF's numbers are signed or complex; save it with 8 or 16 bits")
+    if bits not in _DEPTHS.get(tags.integer(339, 1), ()):
+        raise UnsupportedFormatError(
+            f"the TIFF's numbers have {bits} bits, or are signed or complex; save it with 8 or 16 bits"
+        )
     if kind == 6 and tags.integer(259, 1) not in _JPEG:
         raise UnsupportedFormatError("the TIFF's colours are YCbCr that is no JPEG; convert it to RGB")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +25,7 @@ from lensmodel.photo.containers import check_size, opened_header
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.raster import ORIENTATION, develop_raster, read_pixels, turns_to_sensor
+from lensmodel.photo.raster import develop_raster, read_pixels
 from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw
 from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PhotoMetadata, remarks_log
 
@@ -74,10 +73,10 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
         )
-    turns = turns_to_sensor(path, header, metadata) if raw is None else 0
-    if turns:
-        width, height, metadata = height, width, replace(metadata, orientation=ORIENTATION[turns])
-    return PhotoInfo(header.kind, width, height, metadata, said.is_centred(metadata), turns)
+    # no camera stores a picture higher than wide and says that it lies
+    upright = raw is None and height > width and metadata.orientation == 1
+    turned = upright and metadata.camera_model is not None
+    return PhotoInfo(header.kind, width, height, metadata, said.is_centred(metadata), turned)
 
 
 def develop(

@@ -24,7 +24,7 @@ import numpy as np
 
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import MAX_BLOCK_BYTES, opened_header, png_chunks
-from lensmodel.photo.tiff import EXIF, GPS, MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, TiffReader, Value
+from lensmodel.photo.tiff import ENTRY, EXIF, GPS, MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, TiffReader, Value
 from lensmodel.photo.values import Limits
 
 # Bounds against files made to cost time (chosen): Exif blocks, of which a photo has one and each preview;
@@ -119,10 +119,10 @@ def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
 def _directory(buffer: Buffer, reader: TiffReader, offset: int) -> Iterator[Overwrite]:
     """Yield what empties a GPS directory: its values that lie elsewhere, then its tags."""
     tags, _ = reader.directory(offset)
-    start, head_size, entry_size = reader.base + offset, *((8, 20) if reader.big else (2, 12))
-    head = bytes(buffer[start : start + head_size]) if tags else b""
+    start = reader.base + offset
+    head = bytes(buffer[start : start + 2]) if tags else b""
     count = int.from_bytes(head, "little" if reader.order == "<" else "big")
-    end = start + head_size + count * entry_size
+    end = start + 2 + count * ENTRY
     if not 0 < count <= MAX_TAGS or end > len(buffer):
         return
     for entry in tags.values():

@@ -6,7 +6,7 @@ than `MAX_VALUE_BYTES`. A directory that is damaged half-way gives what came bef
 Written here rather than by an image library: those that write 16 bits a colour write no EXIF directory, and
 doubles, as others write, are empty tags to some readers.
 
-Source: "TIFF Revision 6.0", Aldus, 1992, section 2; "The BigTIFF file format", 2004.
+Source: "TIFF Revision 6.0", Aldus, 1992, section 2.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ Buffer: TypeAlias = bytes | mmap.mmap
 # 150; directories, of which they write a dozen; and bytes of a value.
 MAX_ENTRIES, MAX_DIRECTORIES, MAX_VALUE_BYTES = 1024, 64, 16 << 20
 
+ENTRY: Final = 12  # bytes of an entry of a directory
+
 # Tags that point to directories: Exif 3.0, section 4.6.3, and TIFF/EP.
 EXIF, GPS, SUB_DIRECTORIES = 0x8769, 0x8825, 0x014A
 
 # Types of TIFF 6.0, section 2.
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 
-# Type -> format of `struct`: TIFF 6.0, section 2, and from 16 on BigTIFF; 13 is an offset of a directory.
+# Type -> format of `struct`: TIFF 6.0, section 2; 13 is an offset of a directory.
 _FORMATS: Final[Mapping[int, str]] = {
     1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h",
-    9: "i", 10: "ii", 11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q",
+    9: "i", 10: "ii", 11: "f", 12: "d", 13: "I",
 }  # fmt: skip
 _SIZES: Final = {kind: struct.calcsize("=" + code) for kind, code in _FORMATS.items()}
-_VERSIONS: Final = {42, 43, 0x55, 0x4F52, 0x5352}  # TIFF, BigTIFF, Panasonic RW2, and two of Olympus ORF
+_VERSIONS: Final = {42, 0x55, 0x4F52, 0x5352}  # TIFF, Panasonic RW2, and two of Olympus ORF
 _MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG; as a distance, infinity
 
 
@@ -97,7 +99,7 @@ class Tags(dict[int, Tag]):
 
     def integers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[int, ...]:
         """The first `most` values where they are whole numbers by their type; others give none."""
-        whole = tag in self and _FORMATS[self[tag].kind] in "BHIbhiQq"
+        whole = tag in self and _FORMATS[self[tag].kind] in "BHIbhi"
         return tuple(int(value) for value in self.numbers(tag, most)) if whole else ()
 
     def integer(self, tag: int, default: int = 0) -> int:
@@ -122,42 +124,34 @@ class TiffReader:
     base: int  # where the structure starts in the buffer
     order: str  # byte order
     first: int  # offset of the first directory from `base`
-    big: bool = False  # BigTIFF: 64-bit offsets
 
     @classmethod
     def open(cls, buffer: Buffer, base: int = 0) -> TiffReader | None:
         """Read the header at `base`; `None` if it is no TIFF structure."""
-        head = bytes(buffer[base : base + 16])
+        head = bytes(buffer[base : base + 8])
         order = {b"II": "<", b"MM": ">"}.get(head[:2])
         if order is None or len(head) < 8:
             return None
-        version = struct.unpack(order + "H", head[2:4])[0]
-        big = version == 43
-        if version not in _VERSIONS or (big and len(head) < 16):
-            return None
-        first = struct.unpack(order + "Q", head[8:16]) if big else struct.unpack(order + "I", head[4:8])
-        return cls(buffer, base, order, first[0], big)
+        version, first = struct.unpack(order + "HI", head[2:])
+        return cls(buffer, base, order, first) if version in _VERSIONS else None
 
     def directory(self, offset: int) -> tuple[Tags, int]:
         """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""
-        head_size, entry_size, word = (8, 20, "Q") if self.big else (2, 12, "I")
-        word_size, start, tags = struct.calcsize("=" + word), self.base + offset, Tags()
-        head = bytes(self.buffer[start : start + head_size]) if offset > 0 and start > 0 else b""
-        if len(head) < head_size:
+        start, tags = self.base + offset, Tags()
+        head = bytes(self.buffer[start : start + 2]) if offset > 0 and start > 0 else b""
+        if len(head) < 2:
             return tags, 0
-        count, at = struct.unpack(self.order + ("Q" if self.big else "H"), head)[0], start + head_size
-        table = bytes(self.buffer[at : at + entry_size * min(count, MAX_ENTRIES)])
-        entries = struct.Struct(f"{self.order}HH{word}{word_size}s")
-        for number, kind, values, raw in entries.iter_unpack(table[: len(table) // entry_size * entry_size]):
+        count, at = struct.unpack(self.order + "H", head)[0], start + 2
+        table = bytes(self.buffer[at : at + ENTRY * min(count, MAX_ENTRIES)])
+        entries = struct.iter_unpack(self.order + "HHII", table[: len(table) // ENTRY * ENTRY])
+        for number, kind, values, far in entries:
             if kind in _FORMATS:
-                inside = values * _SIZES[kind] <= word_size
-                far = self.base + struct.unpack(self.order + word, raw)[0]
-                place = at + 4 + word_size if inside else far
+                place = at + 8 if values * _SIZES[kind] <= 4 else self.base + far
                 tags.setdefault(number, Tag(kind, values, place, self.order, self.buffer))
-            at += entry_size
-        tail = bytes(self.buffer[at : at + word_size])
-        complete = len(table) == count * entry_size and len(tail) == word_size
-        return tags, struct.unpack(self.order + word, tail)[0] if complete else 0
+            at += ENTRY
+        tail = bytes(self.buffer[at : at + 4])
+        complete = len(table) == count * ENTRY and len(tail) == 4
+        return tags, struct.unpack(self.order + "I", tail)[0] if complete else 0
 
     def chain(self) -> Iterator[tuple[int, Tags]]:
         """Yield place and tags of the directories linked from the first one; a loop ends the chain."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
 
-from lensmodel.core.errors import MetadataMissingError
+from lensmodel.core.errors import MetadataMissingError, TurnedPixelsError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import BayerPattern, LensSettings, NoiseModel, Planes
 
@@ -151,9 +151,8 @@ class PhotoInfo:
         What the file says.
     centred : bool
         Whether it shows the middle of its sensor, or all of it; false for what a program has cut.
-    turns : int or None
-        Quarter turns, counter-clockwise, from the stored pixels to those of the sensor: not 0 where a program
-        has turned them; None where nothing tells which way it did.
+    turned : bool
+        Whether a program has turned its pixels upright: nothing tells which way.
     """
 
     kind: FileKind
@@ -161,7 +160,15 @@ class PhotoInfo:
     height: int
     metadata: PhotoMetadata = PhotoMetadata()
     centred: bool = True
-    turns: int | None = 0
+    turned: bool = False
+
+    def require_known_turn(self) -> None:
+        """Refuse to learn from a photo of which nobody can tell how it lay on the sensor."""
+        if self.turned:
+            raise TurnedPixelsError(
+                "a program has turned its pixels upright, and nothing tells which way: no place of it is "
+                "known on the sensor; give the file as the camera wrote it"
+            )
 
 
 @dataclass(frozen=True, slots=True)

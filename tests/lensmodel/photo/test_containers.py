@@ -18,10 +18,10 @@ from lensmodel import photo
 from lensmodel.core.errors import NotAnImageError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
-from lensmodel.photo.tiff import laid_out, longs, shorts, text
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 RNG = np.random.default_rng(5)
+COLOURS = RNG.integers(0, 65535, (3, 256), dtype=np.uint16)
 PIXELS = np.kron(RNG.integers(20, 230, (12, 16, 3), dtype=np.uint8), np.ones((4, 4, 1), np.uint8))
 
 
@@ -108,6 +108,11 @@ def test_what_the_photos_own_directory_says_goes_before_the_previews(tmp_path: P
         (np.zeros((48, 64, 6), np.uint8), {"photometric": "rgb", "planarconfig": "contig"}, "6 channels"),
         (np.zeros((48, 64), np.int16), {"photometric": "minisblack"}, "signed"),
         (np.zeros((48, 64), np.complex64), {"photometric": "minisblack"}, "complex"),
+        (np.zeros((48, 64), np.uint32), {"photometric": "minisblack"}, "32 bits"),
+        (np.zeros((48, 64), bool), {"photometric": "minisblack"}, "1 bits"),
+        (np.zeros((48, 64), np.uint8), {"photometric": "miniswhite"}, "inverted"),
+        (np.zeros((48, 64), np.uint8), {"photometric": "palette", "colormap": COLOURS}, "palette"),
+        (np.zeros((48, 64), np.uint8), {"bigtiff": True}, "BigTIFF"),
     ],
 )
 def test_a_tiff_that_could_only_fail_is_refused_before_it_is_stored(
@@ -139,22 +144,6 @@ def test_ycbcr_that_no_jpeg_decoder_converts_is_refused_and_that_of_a_jpeg_is_re
     with Image.open(tmp_path / "x.tif") as image:
         truth = np.asarray(image.convert("RGB"))
     assert np.abs(numbers(tmp_path / "x.tif").astype(int) - truth).max() <= 1
-
-
-@pytest.mark.parametrize("bits", [1, 2, 4, 8])
-def test_a_palette_of_any_depth_is_applied(bits: int, tmp_path: Path) -> None:
-    colours = RNG.integers(0, 255, (2**bits, 3), dtype=np.uint8)
-    indices = np.kron(RNG.integers(0, 2**bits, (12, 16)), np.ones((4, 4), int))
-    packed = np.packbits(
-        ((indices[..., None] >> np.arange(bits)[::-1]) & 1).reshape(48, 64 * bits).astype(np.uint8), axis=1
-    )
-    tags = {256: longs(64), 257: longs(48), 258: shorts(bits), 259: shorts(1), 262: shorts(3), 277: shorts(1)}
-    table = shorts(*(colours.T.astype(int) * 257).ravel())
-    tags |= {273: longs(0), 278: longs(48), 279: longs(packed.size), 320: table}
-    tags[273] = longs(len(laid_out(tags, {})))
-    (tmp_path / "x.tif").write_bytes(laid_out(tags, {}) + packed.tobytes())
-
-    assert (numbers(tmp_path / "x.tif") == colours[indices]).all()
 
 
 def test_a_quad_bayer_mosaic_is_refused_by_its_pattern_and_nothing_is_printed() -> None:
@@ -299,18 +288,6 @@ def test_what_stands_beside_a_jpeg_costs_nothing_while_it_is_decoded(case: str, 
 
     assert developed.planes.shape == (3, 48, 64)
     assert most < 4 * size + (16 << 20)
-
-
-def test_a_turned_jpeg_is_looked_at_within_the_same_bounds(tmp_path: Path) -> None:
-    block = b"Exif\0\0" + laid_out({0x0110: text("T-1"), 0x0112: shorts(1)}, {})
-    upright = np.ascontiguousarray(np.rot90(PIXELS))
-    Image.fromarray(upright).save(tmp_path / "x.jpg", exif=block)
-    data = (tmp_path / "x.jpg").read_bytes()
-    (tmp_path / "x.jpg").write_bytes(data[:2] + HOSTILE["list of pictures"] + data[2:])
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert photo.inspect(tmp_path / "x.jpg").turns is None
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "P", "1"])

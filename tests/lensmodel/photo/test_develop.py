@@ -289,25 +289,6 @@ def test_transparency_said_in_other_ways_is_told_too(tmp_path: Path, mode: str) 
     assert bool(photo.develop(tmp_path / "x.png").remarks) == (mode != "opaque")
 
 
-def test_palettes_are_applied(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
-    image = Image.fromarray(pixels).quantize(16)
-    image.save(tmp_path / "x.png")
-    truth = srgb_to_linear(np.moveaxis(np.asarray(image.convert("RGB")), -1, 0) / 255)
-
-    agree(photo.develop(tmp_path / "x.png").planes, truth, atol=1e-6)
-
-
-def test_one_bit_is_black_and_white(tmp_path: Path) -> None:
-    bits = np.random.default_rng(0).integers(0, 2, (40, 64)).astype(bool)
-    Image.fromarray(bits).save(tmp_path / "x.png")
-    tifffile.imwrite(tmp_path / "x.tif", bits, photometric="minisblack")
-    tifffile.imwrite(tmp_path / "inverted.tif", ~bits, photometric="miniswhite")
-
-    for name in ("x.png", "x.tif", "inverted.tif"):
-        assert (photo.develop(tmp_path / name).planes[1] == bits).all(), name
-
-
 def test_float_tiffs_are_linear_light(tmp_path: Path) -> None:
     pixels = np.stack([textured(40, 60, k) for k in range(3)], axis=-1).astype(np.float32)
     pixels[0, 0] = np.nan

@@ -15,12 +15,10 @@ from lensmodel.cli import files, options
 from lensmodel.cli.console import Display, PacedProgress
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.files import write_atomically
 from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
 from lensmodel.measured import photos as measuring
-from lensmodel.measured.edges import chart_edges
-from lensmodel.photo import LinearPhoto, PhotoInfo, develop
+from lensmodel.photo import develop
 
 KINDS: Final = ("target", "pair", "points", "edges")
 # What comes before the first place, by the way of measuring
@@ -30,7 +28,6 @@ PREPARING: Final = {
     "points": "finding the points",
     "edges": "finding the edges",
 }
-EDGE_FILES: Final = ("edges.pdf", "edges.png", "edges.csv")
 PAPERS: Final = ("a2", "a3", "a4", "letter", "tabloid")
 # Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
 USUAL_DETAIL: Final = 4000
@@ -61,16 +58,7 @@ def measure(
             "--replace", help="Drop what was learned blindly at the same aperture and focal length."
         ),
     ] = False,
-    show: Annotated[
-        Path | None,
-        typer.Option(
-            "--show",
-            metavar="DIR",
-            help="With edges: write to this folder which edges were measured: edges.pdf, .png and .csv.",
-        ),
-    ] = None,
     any_lens: options.AnyLens = False,
-    force: options.Force = False,
     json_output: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = 0,
@@ -85,14 +73,11 @@ def measure(
 
     - points: stars, or pinholes in front of a lamp; not saturated.
 
-    - edges: a chart of dark squares or a checkerboard, turned by 5 degrees. With --show each edge can be
-    looked at: its place on the chart, its profile and its SFR curve.
+    - edges: a chart of dark squares or a checkerboard, turned by 5 degrees.
 
     Examples:
 
         lensmodel measure target page.dng --profile my-24mm.lensprofile
-
-        lensmodel measure edges chart.dng --profile my-24mm.lensprofile --show edges
 
         lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
 
@@ -100,10 +85,6 @@ def measure(
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     target = files.named(profile)
-    if show is not None:
-        if kind != "edges" or len(photos) != 1:
-            raise UsageError("--show is for the edges of one photo: lensmodel measure edges PHOTO --show DIR")
-        files.refuse_existing(*(show / name for name in EDGE_FILES), force=force)
     paths = files.photos(photos)
     files.refuse_photo(target, paths)
     with files.as_usage():
@@ -124,7 +105,7 @@ def measure(
                 on_step=on_step,
             )
             try:
-                result = _added(calibration, group, method, show)
+                result = _added(calibration, group, method)
             except (LensModelError, OSError) as error:
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
@@ -158,19 +139,18 @@ def _show_step(
 
 
 def _added(
-    calibration: Calibration, group: Sequence[Path], method: Callable[..., list[PsfSample]], show: Path | None
+    calibration: Calibration, group: Sequence[Path], method: Callable[..., list[PsfSample]]
 ) -> dict[str, Any]:
     """Measure on the photos of one measurement and add to the lens; say what became of it."""
     samples: list[PsfSample] = []
 
     def measured(key: str, admit: Admit) -> list[PsfSample]:
-        photos = _developed(group, show, lambda info: admit(info.metadata))
+        first = develop(group[0], on_info=lambda info: admit(info.metadata))
+        photos = [first, *map(develop, group[1:])]
         samples.extend(method(photos, photo_id=key))
         return samples
 
     if calibration.add(group[0], measured) is None:
-        if show is not None:
-            _developed(group, show)
         return {"state": "known"}
     green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
     return {
@@ -180,25 +160,6 @@ def _added(
         "estimator": samples[0].estimator,
         "error": green[len(green) // 2],
     }
-
-
-def _developed(
-    group: Sequence[Path], show: Path | None, on_info: Callable[[PhotoInfo], None] | None = None
-) -> list[LinearPhoto]:
-    """Develop the photos of a measurement; write to a folder which edges are seen on the first."""
-    photos = [develop(group[0], on_info=on_info), *map(develop, group[1:])]
-    if show is not None:
-        # matplotlib, an extra
-        from lensmodel.report.chart_edges import edge_pages, edges_csv, in_reading_order  # noqa: PLC0415
-        from lensmodel.report.plots import to_pdf, to_png  # noqa: PLC0415 - as above
-
-        edges = in_reading_order(chart_edges(photos[0]))
-        pages = edge_pages(photos[0], edges)
-        show.mkdir(parents=True, exist_ok=True)
-        contents = (to_pdf(pages), to_png(pages[0]), edges_csv(photos[0], edges).encode())
-        for name, content in zip(EDGE_FILES, contents, strict=True):
-            write_atomically(show / name, content)
-    return photos
 
 
 def target(
@@ -238,7 +199,7 @@ def target(
 
     Exit status: 0 written, 1 failed, 2 wrong usage.
     """
-    # take long, as above
+    # takes long
     from lensmodel.measured import DETAILS, TargetPage, print_chart, print_target  # noqa: PLC0415
 
     shown = Display.of(context, quiet=quiet, verbose=verbose)

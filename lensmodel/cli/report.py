@@ -37,8 +37,7 @@ from lensmodel.report.tables import to_csv
 
 Aperture = Annotated[float | None, options.aperture_option("f-number; default: the widest that a photo had.")]
 
-FORMS: Final = (".html", ".pdf", ".png", ".csv", ".json")
-COMPARED: Final = "comparison.pdf"
+FORMS: Final = (".pdf", ".png", ".csv", ".json")
 
 
 def report(
@@ -56,9 +55,7 @@ def report(
     aperture: Aperture = None,
     against: Annotated[
         Path | None,
-        typer.Option(
-            "--against", metavar="FILE", help="Profile of another copy to compare with; needs --output."
-        ),
+        typer.Option("--against", metavar="FILE", help="Profile of another copy to compare with."),
     ] = None,
     photo: Annotated[
         list[Path] | None,
@@ -81,11 +78,11 @@ def report(
 
         lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
 
-        lensmodel report my-24mm.lensprofile -o my-24mm.html
+        lensmodel report my-24mm.lensprofile -o my-24mm.pdf
 
         lensmodel report my-24mm.lensprofile --photo one.dng -o with-lateral-colour
 
-        lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile -o both
+        lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile
 
         lensmodel report my-24mm.lensprofile --json
 
@@ -93,10 +90,6 @@ def report(
     """
     shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
     targets = _targets(output)
-    if against is not None:
-        if output is None or output in targets:
-            raise UsageError("--against needs a folder after --output: it adds a file of its own")
-        files.refuse_existing(output / COMPARED, force=force)
     if photo and output is None:
         raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
@@ -107,11 +100,11 @@ def report(
             for target in targets:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
-            if against is not None:
-                write_comparison(output, found, measured(against, aperture, [], whole=True))
-    shown.document(found)
+    compared = None if against is None else compare(found, measured(against, aperture, [], whole=False))
+    shown.document(found if compared is None else to_json(found) | {"comparison": compared})
     at = found.tested[0].at or "unknown aperture"
     lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
+    lines += [] if compared is None else [f"- {compared}"]
     shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
@@ -150,12 +143,9 @@ def _targets(output: Path | None) -> tuple[Path, ...]:
 
 def _written(found: LensReport, form: str) -> bytes:
     """A report in one of `FORMS`."""
-    from lensmodel.report.html import to_html  # noqa: PLC0415 - matplotlib, an extra
-    from lensmodel.report.plots import pages, to_pdf, to_png  # noqa: PLC0415 - as above
+    from lensmodel.report.plots import pages, to_pdf, to_png  # noqa: PLC0415 - matplotlib, an extra
 
     match form:
-        case ".html":
-            return to_html(found)
         case ".pdf":
             return to_pdf(pages(found))
         case ".png":
@@ -164,13 +154,6 @@ def _written(found: LensReport, form: str) -> bytes:
             return to_csv(found).encode()
         case _:
             return json.dumps(to_json(found), indent=1).encode()
-
-
-def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
-    """Write two reports beside each other."""
-    from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
-
-    write_atomically(folder / COMPARED, to_pdf([comparison_page(compare(one, two))]))
 
 
 def export(

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import places_of
 from lensmodel.core.types import ZONES, Channel, FieldPosition, LensSettings, StepHook, Zone, ignore_step
@@ -167,13 +166,6 @@ class Spot:
         return float(low), float(high)
 
     @property
-    def give_or_take(self) -> float:
-        """Half of the range of MTF50 over the figure, the larger of both directions."""
-        ranges = np.minimum([self.tangential_range, self.sagittal_range], NYQUIST)
-        figures = np.clip([self.tangential, self.sagittal], 1e-6, NYQUIST)
-        return float((np.ptp(ranges, axis=1) / 2.0 / figures).max())
-
-    @property
     def words(self) -> str:
         """Both figures with their ranges, never one of the two."""
         figures = SensorGeometry()
@@ -241,13 +233,16 @@ class LensReport:
     lateral: LateralColourCurve | None  # None where no photo showed it
     # what else stands on the page: camera, serial, names of photos
     details: Mapping[str, str] = field(default_factory=dict)
-    size_px: tuple[int, int] | None = None  # width and height of its photos, where they are known
     measured: bool = False  # whether photos of charts, targets or points alone tell of the lens
 
-    def at(self, aperture: float | None, channel: Channel = "g") -> ApertureReport:
-        """Return what was found at an aperture that was tested; the widest for None or another one."""
-        own = [one for one in self.tested if one.settings.channel == channel]
-        return next((one for one in own if one.settings.aperture == aperture), own[0])
+    @property
+    def green(self) -> tuple[ApertureReport, ...]:
+        """What was found in green, in which a lens is judged."""
+        return tuple(one for one in self.tested if one.settings.channel == "g")
+
+    def at(self, aperture: float | None) -> ApertureReport:
+        """Return what was found in green at an aperture; at the widest for None or one not tested."""
+        return next((one for one in self.green if one.settings.aperture == aperture), self.green[0])
 
     @property
     def apertures(self) -> tuple[float | None, ...]:
@@ -260,14 +255,7 @@ class LensReport:
         parts = [_counted(self.photos, "photo"), f"blur measured at {_counted(self.places, 'place')}"]
         if (pitch := self.sensor.pixel_pitch_um) is not None:
             parts.append(f"pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm")
-        if self.size_px is not None:
-            parts.append(f"photos of {self.size_px[0]} x {self.size_px[1]} pixels")
         return ", ".join(parts)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What it rests on, a line each."""
-        return (self.facts, *(f"{name}: {words}" for name, words in self.details.items()))
 
     @property
     def advice(self) -> str:
@@ -277,8 +265,7 @@ class LensReport:
                 "Nothing is known beyond the outermost places that were measured: what you photograph to "
                 "measure, let it fill the frame."
             )
-        green = [one for one in self.tested if one.settings.channel == self.tested[0].settings.channel]
-        spots = [(spot, one) for one in green for spot in (*one.spots, *one.sides)]
+        spots = [(spot, one) for one in self.green for spot in (*one.spots, *one.sides)]
         least, tested = max(spots, key=lambda pair: pair[0].predicted_error)
         if least.predicted_error < _WELL_KNOWN:
             return "The lens is well known by now; another photo would add little."
@@ -341,94 +328,58 @@ def lens_report(
     details: Mapping[str, str] | None = None,
     on_step: StepHook = ignore_step,
 ) -> LensReport:
-    """Report on a lens at the apertures that its photos had.
+    """Report on a lens at the apertures of its photos, or at those that are given.
 
-    Parameters
-    ----------
-    model : LensModel
-    name : str
-        Of the lens.
-    aspect : float, optional
-        Width over height of its photos; by default that of common sensors which its samples fill best.
-    height_px : int, optional
-        Height of its photos in pixels; by default what the samples and the aspect come to.
-    lateral : sequence of LateralColour
-        What its photos show of lateral colour.
-    channels : sequence of {"r", "g", "b"}
-    apertures : sequence of float, optional
-        f-numbers instead of those of the photos.
-    rows : int
-        Of the maps.
-    size : int
-        Odd side of the kernels in pixels.
-    details : mapping of str to str, optional
-        Shown on the page as they are.
-    on_step : StepHook
-        Called after each aperture and colour.
-
-    Raises
-    ------
-    InvalidInputError
-        If `size` is even or out of range.
+    Unless they are given, the aspect (width over height) of its photos and their height in pixels are what
+    its samples come to. `lateral` is what its photos show of lateral colour, `rows` counts those of the maps,
+    `size` is the odd side of the kernels in pixels, `details` are shown as they are.
     """
-    if not 3 <= size <= 255 or size % 2 == 0:
-        raise InvalidInputError(f"size must be odd and lie in 3..255, got {size}")
     aspect = filled_aspect(model) if aspect is None else aspect
-    numbers = list(apertures) if apertures is not None else _chosen(model)
-    wanted = [LensSettings(aperture=n) for n in numbers] or [widest(model)]
+    cols = max(3, round(rows * aspect))
+    center = FieldPosition(0.0, 0.0)
+    named = [(place_in_words(at), at) for at in (*grid(rows, cols, aspect), center, *corner_places(aspect))]
+    named += [(f"the {direction_in_words(at.phi)}", at) for at in side_places(aspect)]
+    outside = _outside_chart(model, [at for _, at in named])
+    measured = all(is_measured(sample) for sample in model.samples)
+    pitch = _shared(sample.pixel_pitch_um for sample in model.samples)
+    numbers = _chosen(model) if apertures is None else apertures
+    wanted = [LensSettings(aperture=n) for n in numbers] or [LensSettings()]
     questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
     tested = []
     for settings in questions:
-        tested.append(_tested(model, settings, rows, aspect, size))
+        spots = [
+            _spot(words, at, model.query(at, settings, size), outside=bool(beyond), measured=measured)
+            for (words, at), beyond in zip(named, outside, strict=True)
+        ]
+        tested.append(
+            ApertureReport(
+                settings=settings,
+                aspect=aspect,
+                rows=rows,
+                cols=cols,
+                map=tuple(replace(spot, kernel=()) for spot in spots[: rows * cols]),
+                radii=RADII,
+                curves=_curves(model, settings, aspect, size, _frequencies(pitch)),
+                spots=tuple(spots[rows * cols : -4]),
+                sides=tuple(spots[-4:]),
+                centring=centring(model, settings),
+            )
+        )
         on_step(len(tested), len(questions))
-    # by their half diagonals, where the samples know and agree
     half = _shared(s.half_diagonal_px for s in model.samples)
-    guessed = None if half is None else round(2.0 * half / math.hypot(max(aspect, 1.0 / aspect), 1.0))
+    if height_px is None and half is not None:
+        height_px = round(2.0 * half / math.hypot(max(aspect, 1.0 / aspect), 1.0))
     return LensReport(
         name=name,
         verdict=verdict(tested[0], _best(tested)),
         photos=len({s.photo for s in model.samples}),
         places=places_of(model.samples),
-        sensor=SensorGeometry(_pitch(model), height_px or guessed),
+        sensor=SensorGeometry(pitch, height_px),
         tested=tuple(tested),
         lateral=_lateral(lateral),
         details=dict(details or {}),
-        size_px=None if height_px is None else (round(height_px * aspect), height_px),
-        measured=_measured(model),
+        measured=measured,
     )
-
-
-def _tested(model: LensModel, settings: LensSettings, rows: int, aspect: float, size: int) -> ApertureReport:
-    cols = max(3, round(rows * aspect))
-    mapped = grid(rows, cols, aspect)
-    count, named = len(mapped), (FieldPosition(0.0, 0.0), *corner_places(aspect))
-    places = (*mapped, *named, *side_places(aspect))
-    words = [place_in_words(place) for place in (*mapped, *named)]
-    words += [f"the {direction_in_words(place.phi)}" for place in side_places(aspect)]
-    spots = [
-        _spot(model, name, place, settings, size, outside=bool(outside))
-        for name, place, outside in zip(words, places, _outside_chart(model, places), strict=True)
-    ]
-    return ApertureReport(
-        settings=settings,
-        aspect=aspect,
-        rows=rows,
-        cols=cols,
-        map=tuple(replace(spot, kernel=()) for spot in spots[:count]),
-        radii=RADII,
-        curves=_curves(model, settings, aspect, size),
-        spots=tuple(spots[count : count + 5]),
-        sides=tuple(spots[count + 5 :]),
-        centring=centring(model, settings),
-    )
-
-
-def _measured(model: LensModel) -> bool:
-    return all(is_measured(sample) for sample in model.samples)
-
-
-def _pitch(model: LensModel) -> float | None:
-    return _shared(sample.pixel_pitch_um for sample in model.samples)
 
 
 def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray[np.bool_]:
@@ -446,15 +397,13 @@ def _outside_chart(model: LensModel, places: Sequence[FieldPosition]) -> NDArray
     return np.asarray(hull.find_simplex(np.array([place.xy for place in places])) < 0)
 
 
-def _spot(
-    model: LensModel, words: str, place: FieldPosition, settings: LensSettings, size: int, *, outside: bool
-) -> Spot:
-    answer, measured = model.query(place, settings, size), _measured(model)
+def _spot(words: str, at: FieldPosition, answer: PsfAnswer, *, outside: bool, measured: bool) -> Spot:
+    """What an answer says of its place."""
     error = float(answer.predicted_error)
-    (t, t_range), (s, s_range) = (_mtf50(answer, place.phi + turn, measured) for turn in (0.0, math.pi / 2.0))
+    (t, t_range), (s, s_range) = (_mtf50(answer, at.phi + turn, measured) for turn in (0.0, math.pi / 2.0))
     unknown = bool(answer.extrapolated or outside or not (measured or error < UNKNOWN))
     kernel = tuple(tuple(row) for row in answer.kernel.round(7).tolist())
-    return Spot(words, place, t, s, t_range, s_range, error, unknown, kernel)
+    return Spot(words, at, t, s, t_range, s_range, error, unknown, kernel)
 
 
 def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Range]:
@@ -474,9 +423,14 @@ def _mtf50(answer: PsfAnswer, angle: float, measured: bool) -> tuple[float, Rang
     return min(value, NYQUIST), (min(between[0], NYQUIST), min(between[1], NYQUIST))
 
 
-def _curves(model: LensModel, settings: LensSettings, aspect: float, size: int) -> tuple[Curve, ...]:
-    """Contrast over the radius, mean over the places of a radius."""
-    wanted = _frequencies(_pitch(model))
+def _curves(
+    model: LensModel,
+    settings: LensSettings,
+    aspect: float,
+    size: int,
+    wanted: Sequence[tuple[float, float | None]],
+) -> tuple[Curve, ...]:
+    """Contrast at wanted frequencies over the radius, mean over the places of a radius."""
     frequencies = [f for f, _ in wanted]
     rings = [ring(r, _RING, aspect) for r in RADII]
     kernels = iter(model.kernels([place for places in rings for place in places], settings, size))
@@ -547,9 +501,9 @@ def _chosen(model: LensModel) -> list[float]:
 
 def _best(tested: Sequence[ApertureReport]) -> float | None:
     """Aperture with the largest mean MTF50 over the picture; None where one was tested."""
-    own = [one for one in tested if one.settings.channel == tested[0].settings.channel]
-    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in own}
-    return max(means, key=lambda n: (means[n], -(n or 0.0))) if len(own) > 1 else None
+    green = [one for one in tested if one.settings.channel == "g"]
+    means = {one.settings.aperture: float(np.mean([spot.mean for spot in one.map])) for one in green}
+    return max(means, key=lambda n: (means[n], -(n or 0.0))) if len(means) > 1 else None
 
 
 def _shared(values: Iterable[float | None]) -> float | None:
@@ -595,34 +549,14 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """Two copies of a lens side by side, each at the first aperture of its report."""
-
-    first: LensReport
-    second: LensReport
-
-    @property
-    def changes(self) -> dict[Zone, float]:
-        """Difference of MTF50 over the first, from the centre outwards."""
-        one, two = self.first.tested[0].zones, self.second.tested[0].zones
-        return {zone: (two[zone] - one[zone]) / one[zone] for zone in ZONES}
-
-    @property
-    def verdict(self) -> str:
-        """The difference as one sentence."""
-        *some, last = (_change_in_words(zone, share) for zone, share in self.changes.items())
-        return f"Compared with {self.first.name}, {self.second.name} is {', '.join(some)} and {last}."
-
-
-def _change_in_words(zone: Zone, share: float) -> str:
-    if abs(share) < _ALIKE:
-        return f"about the same {_ZONE_WORDS[zone]}"
-    return f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'} {_ZONE_WORDS[zone]}"
-
-
-def compare(first: LensReport, second: LensReport) -> Comparison:
-    """Compare two copies; those of one name are numbered."""
-    if first.name == second.name:
-        first, second = replace(first, name=f"{first.name} (1)"), replace(second, name=f"{second.name} (2)")
-    return Comparison(first, second)
+def compare(first: LensReport, second: LensReport) -> str:
+    """Say in which zones the second copy is sharper or softer, each at the first aperture of its report."""
+    one, two = first.tested[0].zones, second.tested[0].zones
+    changes = []
+    for zone, where in _ZONE_WORDS.items():
+        share = two[zone] / one[zone] - 1.0
+        how = f"{abs(share):.0%} {'sharper' if share > 0 else 'softer'}"
+        changes.append(f"{'about the same' if abs(share) < _ALIKE else how} {where}")
+    numbers = (" (1)", " (2)") if first.name == second.name else ("", "")
+    names = [report.name + number for report, number in zip((first, second), numbers, strict=True)]
+    return f"Compared with {names[0]}, {names[1]} is {', '.join(changes[:-1])} and {changes[-1]}."

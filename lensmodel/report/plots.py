@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Channel
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
-    Comparison,
-    Curve,
     LateralColourCurve,
     LensReport,
     Unit,
@@ -44,7 +41,6 @@ except ModuleNotFoundError as error:
 _SHARPNESS: Final = LinearSegmentedColormap.from_list(
     "sharpness", [(0.0, "#7f1d1d"), (0.35, "#fdf6e3"), (0.7, "#0b6e99"), (1.0, "#083d56")]
 )
-_CHANGES: Final = LinearSegmentedColormap.from_list("changes", ["#7f1d1d", "#fdf6e3", "#0b6e99"])
 _BLACK, _GREY = "#191a1c", "#55585d"
 _INKS: Final = ("#0b6e99", "#b45309", "#15803d", "#7e22ce")
 _CHANNELS: Final[dict[Channel, tuple[str, str]]] = {
@@ -113,30 +109,32 @@ Panel = tuple[str, Callable[[Place], None]]  # Title of a drawing, and what draw
 
 def charts(report: LensReport, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
     """All charts of one aperture, those over apertures and of lateral colour last."""
-    return [_chart(panel) for panel in _panels(report, report.at(aperture), unit)]
-
-
-def overview(report: LensReport) -> list[Chart]:
-    """The charts of the first page: the map of sharpness, and what becomes of a point."""
-    return [_chart(panel) for panel in _simple(report)]
+    drawn = []
+    with mpl.rc_context(_STYLE):
+        for title, draw in _panels(report, report.at(aperture), unit):
+            figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
+            _draw(figure, title, draw)
+            figure.savefig(out, format="svg", metadata={"Date": None})
+            drawn.append(Chart(title, out.getvalue()))
+    return drawn
 
 
 def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
-    drawn = [_photographer(report)]
-    for number in report.apertures:
-        found = report.at(number)
-        at = f", {found.at}" if found.at else ""
-        panels = [*_panels(report, found, "c/px"), (f"MTF50 by place{at}", _on(_table, report, found))]
-        drawn += [_page(report.name, "", panels[k : k + _A_PAGE]) for k in range(0, len(panels), _A_PAGE)]
+    with mpl.rc_context(_STYLE):
+        drawn = [_photographer(report)]
+        for number in report.apertures:
+            found = report.at(number)
+            panels = [
+                *_panels(report, found, "c/px"),
+                (f"MTF50 by place{_at(found)}", _on(_table, report, found)),
+            ]
+            for first in range(0, len(panels), _A_PAGE):
+                figure = Figure(figsize=_PAGE)
+                top = _written(figure, 0.97, report.name, 15.0, weight="bold")
+                _fill(figure, panels[first : first + _A_PAGE], [1.0] * _A_PAGE, 0.02, top)
+                drawn.append(figure)
     return drawn
-
-
-def comparison_page(comparison: Comparison) -> Figure:
-    """Draw a comparison on one page."""
-    sides = (comparison.first, comparison.second)
-    words = [comparison.verdict, *(f"{side.name}: {side.facts}" for side in sides)]
-    return _page(" and ".join(side.name for side in sides), "\n".join(words), _compared(comparison))
 
 
 def to_pdf(figures: Iterable[Figure]) -> bytes:
@@ -160,26 +158,14 @@ def to_png(figure: Figure) -> bytes:
 # --- what stands where --------------------------------------------------------------------------
 
 
-def _simple(report: LensReport) -> list[Panel]:
-    """What a photographer is shown."""
-    found = report.tested[0]
-    at = f", {found.at}" if found.at else ""
-    hatched = " (hatched: not known)" if found.unknown_share else ""
-    return [
-        (f"Sharpness over the picture{at}: MTF50, mean of T and S{hatched}", _on(_overview, found)),
-        ("What becomes of a point of light in the centre and the corners", lambda on: _points(on, found)),
-    ]
-
-
 def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel]:
     """What a tester is shown of one aperture."""
-    at = f", {found.at}" if found.at else ""
+    at = _at(found)
     panels: list[Panel] = [
         (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.factor(unit) or 1.0)),
-        (f"How far off MTF50 may be, in percent{at}", _on(_error_map, found)),
         (
             f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
-            _on(_contrast, [(curve.name, found, curve) for curve in found.curves]),
+            _on(_contrast, found),
         ),
         (f"Contrast by colour{at}", _on(_colours, report, found.settings.aperture)),
         (f"Centring{at}", _on(_side_softer, found)),
@@ -191,74 +177,44 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
     return panels
 
 
-def _compared(comparison: Comparison) -> list[Panel]:
-    """Two lenses beside each other, at the lowest and the highest frequency that both have."""
-    first, second = comparison.first, comparison.second
-    one, two = first.tested[0], second.tested[0]
-    shared = [(a, b) for a in one.curves for b in two.curves if a.name == b.name]
-    pairs = shared or [(one.curves[0], two.curves[0])]
-    panels: list[Panel] = [
-        (
-            f"Contrast of {detail} detail, {a.name}",
-            _on(_contrast, [(first.name, one, a), (second.name, two, b)]),
-        )
-        for detail, (a, b) in (("coarse", pairs[0]), ("fine", pairs[-1]))
-    ]
-    if (one.rows, one.cols) == (two.rows, two.cols):
-        panels.append(("Difference of MTF50, cycles/pixel", _on(_difference, comparison)))
-    return panels
-
-
 def _on(draw: Callable[..., None], *given: Any) -> Callable[[Place], None]:  # noqa: ANN401 - what it draws
     """A drawing on the only axes of its place."""
     return lambda place: draw(place.add_subplot(), *given)
 
 
-def _chart(panel: Panel) -> Chart:
-    """One panel as a figure of its own."""
-    with mpl.rc_context(_STYLE):
-        figure, out = Figure(figsize=_CHART, layout="constrained"), io.BytesIO()
-        _titled(figure, panel)
-        figure.savefig(out, format="svg", metadata={"Date": None})
-    return Chart(panel[0], out.getvalue())
+def _at(found: ApertureReport) -> str:
+    return f", {found.at}" if found.at else ""
 
 
-def _titled(place: Place, panel: Panel) -> None:
-    title, draw = panel
+def _draw(place: Place, title: str, draw: Callable[[Place], None]) -> None:
     place.suptitle(title, x=0.01, ha="left", fontsize=10.0)
     draw(place)
 
 
-def _page(title: str, words: str, panels: Sequence[Panel]) -> Figure:
-    """Panels below each other, as many to a page whatever their number."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_PAGE)
-        top = _written(figure, 0.97, title, 15.0, weight="bold")
-        top = _written(figure, top, words, 8.5, _GREY)
-        figure.set_layout_engine("constrained", rect=(0.06, 0.02, 0.88, top - 0.03))
-        for place, panel in zip(_parts(figure, [1.0] * _A_PAGE), panels, strict=False):
-            _titled(place, panel)
-    return figure
+def _fill(figure: Figure, panels: Sequence[Panel], heights: Sequence[float], low: float, top: float) -> None:
+    """Draw panels below each other on a part of a page, of relative heights."""
+    figure.set_layout_engine("constrained", rect=(0.06, low, 0.88, top - low - 0.02), h_pad=0.08)
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
+    for place, panel in zip(parts, panels, strict=False):
+        _draw(place, *panel)
 
 
 def _photographer(report: LensReport) -> Figure:
     """Verdict, map, what a point becomes in the centre and the corners, and what would help."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=_PAGE)
-        top = _written(figure, 0.97, report.name, 15.0, weight="bold")
-        top = _written(figure, top, report.verdict, 11.0)
-        below = _written(figure, 0.25, EXPLAINED, 9.0)
-        below = _written(figure, below, report.advice, 11.0)
-        _written(figure, below, "\n".join(report.notes), 8.5, _GREY)
-        figure.set_layout_engine("constrained", rect=(0.06, 0.26, 0.88, top - 0.28), h_pad=0.08)
-        for place, panel in zip(_parts(figure, [2.6, 1.0]), _simple(report), strict=True):
-            _titled(place, panel)
+    figure, found = Figure(figsize=_PAGE), report.tested[0]
+    top = _written(figure, 0.97, report.name, 15.0, weight="bold")
+    top = _written(figure, top, report.verdict, 11.0)
+    below = _written(figure, 0.25, EXPLAINED, 9.0)
+    below = _written(figure, below, report.advice, 11.0)
+    notes = [report.facts, *(f"{name}: {words}" for name, words in report.details.items())]
+    _written(figure, below, "\n".join(notes), 8.5, _GREY)
+    hatched = " (hatched: not known)" if found.unknown_share else ""
+    panels: list[Panel] = [
+        (f"Sharpness over the picture{_at(found)}: MTF50, mean of T and S{hatched}", _on(_overview, found)),
+        ("What becomes of a point of light in the centre and the corners", lambda on: _points(on, found)),
+    ]
+    _fill(figure, panels, [2.6, 1.0], 0.26, top)
     return figure
-
-
-def _parts(figure: Figure, heights: Sequence[float]) -> list[Place]:
-    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
-    return list(parts)
 
 
 def _written(
@@ -276,7 +232,7 @@ def _written(
 
 def _overview(ax: Axes, found: ApertureReport) -> None:
     """Mean MTF50 over the picture, with a scale in words."""
-    image = _sharpness_map(ax, found, [spot.mean for spot in found.map])
+    image = _map(ax, found, [spot.mean for spot in found.map])
     scale = ax.figure.colorbar(image, ax=ax, location="bottom", fraction=0.05, aspect=50)
     scale.set_ticks([0.02, 0.25, 0.43], labels=["soft", ".25", "as sharp as a sensor can show"])
 
@@ -284,8 +240,8 @@ def _overview(ax: Axes, found: ApertureReport) -> None:
 def _maps(place: Place, found: ApertureReport, factor: float) -> None:
     """Tangential and sagittal MTF50 on one scale."""
     axes = place.subplots(1, 2)
-    _sharpness_map(axes[0], found, [spot.tangential for spot in found.map], factor)
-    image = _sharpness_map(axes[1], found, [spot.sagittal for spot in found.map], factor)
+    _map(axes[0], found, [spot.tangential for spot in found.map], factor)
+    image = _map(axes[1], found, [spot.sagittal for spot in found.map], factor)
     axes[0].set_xlabel("tangential (T)")
     axes[1].set_xlabel("sagittal (S)")
     scale = place.colorbar(image, ax=axes, location="bottom", fraction=0.05, aspect=50)
@@ -294,59 +250,26 @@ def _maps(place: Place, found: ApertureReport, factor: float) -> None:
     scale.set_ticks(ticks, labels=[_number(tick, factor) for tick in ticks])
 
 
-def _sharpness_map(
-    ax: Axes, found: ApertureReport, values: Sequence[float], factor: float = 1.0
-) -> AxesImage:
-    """MTF50 at each place."""
-    words = [(">" if v >= NYQUIST else "") + _number(min(v, NYQUIST), factor) for v in values]
-    return _map(ax, found, np.clip(values, 0.0, NYQUIST), words, _SHARPNESS, (0.0, NYQUIST))
-
-
-def _error_map(ax: Axes, found: ApertureReport) -> None:
-    """By how much MTF50 may be off at each place, in percent; no figure where it is beyond Nyquist's."""
-    shares = np.array([spot.give_or_take for spot in found.map])
-    shown = [min(spot.tangential, spot.sagittal) < NYQUIST for spot in found.map]
-    words = [f"{100.0 * share:.0f}" if told else "" for share, told in zip(shares, shown, strict=True)]
-    _map(ax, found, np.minimum(shares, 1.0), words, "Greys", (0.0, 1.0))
-
-
-def _difference(ax: Axes, comparison: Comparison) -> None:
-    """MTF50 of the second less that of the first."""
-    one, two = ([spot.mean for spot in one.tested[0].map] for one in (comparison.first, comparison.second))
-    values = np.subtract(two, one)
-    top = max(0.02, float(np.abs(values).max()))
-    words = [f"{v:+.2f}" for v in values]
-    _map(ax, comparison.first.tested[0], values, words, _CHANGES, (-top, top), hatched=False)
-    ax.set_xlabel(f"MTF50, cycles/pixel; blue: {comparison.second.name} is sharper")
-
-
-def _map(
-    ax: Axes,
-    found: ApertureReport,
-    values: NDArray[np.floating],
-    words: Sequence[str],
-    colours: LinearSegmentedColormap | str,
-    ends: tuple[float, float],
-    *,
-    hatched: bool = True,
-) -> AxesImage:
-    """Draw a value at each place of a report as a cell with its figure; hatched where too little is known."""
+def _map(ax: Axes, found: ApertureReport, values: Sequence[float], factor: float = 1.0) -> AxesImage:
+    """Draw MTF50 at each place of a report as a cell with its figure; hatched where too little is known."""
     ax.grid(visible=False)
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
+    shown = np.clip(values, 0.0, NYQUIST)
     image = ax.imshow(
-        np.asarray(values).reshape(found.rows, found.cols), cmap=colours, vmin=ends[0], vmax=ends[1],
+        shown.reshape(found.rows, found.cols), cmap=_SHARPNESS, vmin=0.0, vmax=NYQUIST,
         extent=(0.0, found.aspect, 0.0, 1.0),
     )  # fmt: skip
     wide, high = found.aspect / found.cols, 1.0 / found.rows
-    for i, (word, value, spot) in enumerate(zip(words, values, found.map, strict=True)):
+    for i, (value, spot) in enumerate(zip(shown, found.map, strict=True)):
         row, col = divmod(i, found.cols)
         left, low, pale = col * wide, 1.0 - (row + 1) * high, True
-        if hatched and spot.unknown:
+        if spot.unknown:
             ax.add_patch(Rectangle((left, low), wide, high, **_HATCHED))
         else:
             pale = np.dot(image.to_rgba(value)[:3], _LUMA) > _PALE
-        ax.text(left + wide / 2, low + high / 2, word, color=_BLACK if pale else "#ffffff", **_IN_CELL)
+        word, ink = (">" if value >= NYQUIST else "") + _number(value, factor), _BLACK if pale else "#ffffff"
+        ax.text(left + wide / 2, low + high / 2, word, color=ink, **_IN_CELL)
     return image
 
 
@@ -376,11 +299,11 @@ def _points(place: Place, found: ApertureReport) -> None:
         ax.grid(visible=False)
 
 
-def _contrast(ax: Axes, curves: Sequence[tuple[str, ApertureReport, Curve]]) -> None:
-    """Contrast over the radius by name: sagittal solid, tangential dashed."""
-    for ink, (name, found, curve) in zip(_INKS, curves, strict=False):
-        ax.plot(found.radii, curve.sagittal, color=ink, ls="-", label=f"{name} S")
-        ax.plot(found.radii, curve.tangential, color=ink, ls="--", label=f"{name} T")
+def _contrast(ax: Axes, found: ApertureReport) -> None:
+    """Contrast over the radius by frequency: sagittal solid, tangential dashed."""
+    for ink, curve in zip(_INKS, found.curves, strict=False):
+        ax.plot(found.radii, curve.sagittal, color=ink, ls="-", label=f"{curve.name} S")
+        ax.plot(found.radii, curve.tangential, color=ink, ls="--", label=f"{curve.name} T")
     _radial(ax, "contrast", 1.0)
 
 
@@ -435,7 +358,7 @@ def _table(ax: Axes, report: LensReport, found: ApertureReport) -> None:
 
 def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
     """MTF50 of the centre and of each corner by aperture."""
-    known = [one for one in report.tested if one.settings.channel == "g" and one.at]
+    known = [one for one in report.green if one.at]
     factor = report.sensor.factor(unit) or 1.0
     for k, spot in enumerate(known[0].spots):
         values = [factor * one.spots[k].mean for one in known]

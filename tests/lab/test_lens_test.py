@@ -3,8 +3,6 @@ truth."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import replace
 from functools import cache
@@ -20,7 +18,6 @@ from lensmodel.measured.edges import SlantedEdges, chart_edges, squares_of
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality import find_edges, tangential_sagittal_mtf50
 from lensmodel.quality.edge import direction_of
-from lensmodel.report.chart_edges import edge_pages, edges_csv, in_reading_order
 from lensmodel.simulate import Aberrations, SimulatedCamera, SimulatedLens, photograph, write_photo
 
 CAMERA = SimulatedCamera(height=1000, width=1500)
@@ -127,25 +124,3 @@ def test_an_edge_between_the_two_directions_is_neither() -> None:
     assert direction_of(place.phi + math.pi / 2 + 0.1, place) == "sagittal"
     assert direction_of(place.phi + math.radians(30.0), place) == "oblique"
     assert direction_of(0.0, replace(place, phi=math.radians(-5.0))) == "tangential"
-
-
-def test_each_edge_can_be_looked_at(chart: tuple[LinearPhoto, tuple[Square, ...]]) -> None:
-    photo, _ = chart
-    edges = in_reading_order(chart_edges(photo))
-
-    heights, steps = np.array([edge.middle for edge in edges]).T
-    down, right = np.diff(heights), np.diff(steps)
-    assert (right > 0).sum() >= len(edges) - 15  # of five rows of squares with edges at three heights
-    assert (down[right > 0] < 32).all()  # the chart leans up to the right
-
-    rows = list(csv.DictReader(io.StringIO(edges_csv(photo, edges))))
-    drawn = edge_pages(photo, edges)
-
-    assert len(rows) == len(edges)
-    assert {row["direction"] for row in rows} == {"tangential", "sagittal", "oblique"}
-    assert float(rows[7]["mtf50_c_px"]) == pytest.approx(edges[7].response.mtf50, abs=1e-4)
-    assert len(drawn[0].axes[0].patches) == len(edges)  # a box on the chart for each
-    curves = [
-        line for page in drawn[1:] for axes in page.axes for line in axes.lines if len(line.get_xdata()) > 2
-    ]
-    assert len(curves) == 2 * len(edges)  # profile and SFR

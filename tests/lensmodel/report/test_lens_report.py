@@ -1,4 +1,4 @@
-"""The report: its figures against true kernels, its verdict, its files, and two of them beside each other."""
+"""The report: its figures against true kernels, its verdict, its files, and two copies compared."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import math
 import re
 from dataclasses import replace
 from functools import cache
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -33,10 +32,9 @@ from lensmodel.report import (
     sharpness,
 )
 from lensmodel.report.centring import Asymmetry, Centring
-from lensmodel.report.html import to_html
 from lensmodel.report.lens_report import UNKNOWN, SensorGeometry
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
-from lensmodel.report.plots import EXPLAINED, charts, comparison_page, overview, pages, to_pdf, to_png
+from lensmodel.report.plots import charts, pages, to_pdf, to_png
 from lensmodel.report.tables import place_table, to_csv
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
@@ -101,12 +99,10 @@ def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() ->
     assert SensorGeometry().words(0.2, "lp/mm") == "unknown"
 
 
-def test_facts_count_each_place_once_and_name_a_size_only_where_it_is_known(soft: LensReport) -> None:
+def test_facts_count_each_place_once(soft: LensReport) -> None:
     assert soft.facts.startswith("3 photos, blur measured at 72 places, ")  # in three colours
-    assert soft.facts.endswith(", photos of 6000 x 4000 pixels")
     one = lens_report(LensModel.fit(samples(1), QUICK), "", rows=1, size=SIZE, channels=("g",))
     assert one.facts.startswith("1 photo, blur measured at 24 places")
-    assert "photos of" not in one.facts
 
 
 @pytest.mark.parametrize(
@@ -188,7 +184,7 @@ def test_beyond_the_outermost_square_of_a_chart_nothing_is_known() -> None:
         for spot in (*found.spots, *found.sides)
         if spot.unknown
     }
-    assert charts(report, None)[1].svg.count(b"url(#h") == unknown.sum()  # hatched
+    assert charts(report, None)[0].svg.count(b"url(#h") == 2 * unknown.sum()  # hatched, in T and in S
     page = pages(report)[0]
     page.draw_without_rendering()
     titles = [ax.title for ax in page.axes if "not known" in ax.get_title()]
@@ -251,9 +247,7 @@ def test_a_point_within_a_pixel_is_reported_as_at_least_nyquist() -> None:
 
     assert "very sharp in the centre" in found.verdict
     assert "at least .500" in place_table(found)[1][0][2]
-    maps, errors = charts(found, None)[:2]
-    assert ">.50" in maps.svg.decode().replace("&gt;", ">")
-    assert not [text for text in ET.fromstring(errors.svg).itertext() if text.strip().isdigit()]
+    assert ">.50" in charts(found, None)[0].svg.decode().replace("&gt;", ">")
     rows = [row for row in csv.DictReader(io.StringIO(to_csv(found))) if row["quantity"] == "MTF50"]
     assert {(row["value"], row["low"], row["high"]) for row in rows} == {("0.5", "0.5", "0.5")}
 
@@ -302,37 +296,13 @@ def test_the_csv_says_whether_the_lens_is_centred(soft: LensReport) -> None:
     assert [float(coma[name]) for name in columns] == pytest.approx([0.1, 0.0, 0.26, -0.4], rel=1e-5)
 
 
-def test_the_page_has_a_dark_scheme_and_prints_on_white(soft: LensReport) -> None:
-    page = to_html(soft).decode()
-
-    assert "color-scheme: light dark" in page
-    assert "@media screen and (prefers-color-scheme: dark) { figure { filter: invert(" in page
-    assert "@media print { :root { color-scheme: light; }" in page
-
-
 def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensReport) -> None:
     first, second = to_pdf(pages(soft)), to_pdf(pages(soft))
     assert first.startswith(b"%PDF-")
     assert first.count(b"/Type /Page ") + first.count(b"/Type /Page\n") == 3
     assert first == second  # no time of day in it
-    page = to_html(soft).decode()
-    assert f"<p>{soft.verdict}</p>" in page
-    assert EXPLAINED in page  # what T, S and MTF50 mean
-    assert page.count("<img ") == 7  # two for photographers, five for testers
-    assert "MTF50 by place" in page
     with Image.open(io.BytesIO(to_png(pages(soft)[0]))) as picture:
         assert picture.size[0] > 1000
-
-
-def test_the_error_stands_beside_the_maps_and_the_worst_corner_among_the_points(soft: LensReport) -> None:
-    points = " ".join(ET.fromstring(overview(soft)[1].svg).itertext())
-    maps, errors = charts(soft, None)[:2]
-
-    assert soft.tested[0].worst.side in points
-    assert errors.title == "How far off MTF50 may be, in percent, f/2.8"
-    figures = [float(text) for text in ET.fromstring(errors.svg).itertext() if text.strip().isdigit()]
-    assert figures == [round(100.0 * spot.give_or_take) for spot in soft.tested[0].map]
-    assert "tangential" in " ".join(ET.fromstring(maps.svg).itertext())
 
 
 def test_scales_of_maps_have_round_ticks(soft: LensReport) -> None:
@@ -352,18 +322,14 @@ def test_maps_are_in_the_unit_that_was_asked_for(soft: LensReport) -> None:
 
 
 def test_two_copies_are_compared(soft: LensReport) -> None:
-    sharp = report_of(corner=1.0, spread=0.02)
+    sharp = replace(report_of(corner=1.0, spread=0.02), name="Another lens")
 
-    found = compare(soft, replace(sharp, name="Another lens"))
-
-    assert found.changes["corner"] > 0.3
-    assert "sharper in the corners" in found.verdict
-    same = compare(soft, soft)
-    assert same.verdict.startswith("Compared with A lens (1), A lens (2) is about the same in the centre")
-    assert to_pdf([comparison_page(found)]).startswith(b"%PDF-")
-    # a name as long as makers give leaves room for the chart: matplotlib would warn
-    long = compare(*[replace(soft, name="Simulated Optics Simulated Astigmatism 85mm f/2")] * 2)
-    assert to_pdf([comparison_page(long)]).startswith(b"%PDF-")
+    share = sharp.tested[0].zones["corner"] / soft.tested[0].zones["corner"] - 1.0
+    assert share > 0.3
+    assert compare(soft, sharp).endswith(f"{share:.0%} sharper in the corners.")
+    assert compare(soft, soft).startswith(
+        "Compared with A lens (1), A lens (2) is about the same in the centre"
+    )
 
 
 def test_apertures_are_tested_each_and_the_best_is_named() -> None:
@@ -437,11 +403,6 @@ def test_grids_run_row_by_row_from_the_top_left() -> None:
 def test_places_out_of_range_are_refused(make: object) -> None:
     with pytest.raises(InvalidInputError):
         make()  # type: ignore[operator]  # a callable, by the list above
-
-
-def test_an_even_side_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="got 4"):
-        lens_report(LensModel.fit(samples(1), QUICK), "A lens", size=4)
 
 
 def test_angles_are_named_counter_clockwise_from_the_right_and_places_by_zone_and_side() -> None:

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.core.psf import WING_LEVEL, PsfSample, rms_width
 from lensmodel.core.types import LensSettings
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel
@@ -47,9 +47,7 @@ _COMATIC: Final = 0.15  # third moment over width cubed, in the middle: a shorte
 _UNSURE: Final = 0.4  # sides that may differ by more, error and all, are not called alike (chosen)
 # One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)
 _CHANCE: Final = 0.01
-_WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
 _Array = NDArray[np.float64]
-_Fit = Callable[[NDArray[np.bool_]], _Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +85,9 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
     if len(samples) < _FEWEST:
         few = f"{len(samples)} sample{'' if len(samples) == 1 else 's'}"
         return Centring("unknown", f"{few} cannot tell whether the lens is centred; it takes {_FEWEST}")
-    r = np.array([s.position.r for s in samples])
-    phi = np.array([s.position.phi for s in samples])
-    h = np.stack([r * np.cos(phi), r * np.sin(phi)], axis=1)  # (right, up)
-    widths = [math.sqrt(float(np.trace(second_moments(s.kernel, _WING))) / 2) for s in samples]
+    h = np.array([s.position.xy for s in samples])  # (right, up)
+    r = np.hypot(*h.T)
+    widths = [rms_width(s.kernel) for s in samples]
     photos = np.unique([s.photo for s in samples], return_inverse=True)[1]
     root = np.sqrt(np.array([s.weight for s in samples]))[:, None]
     slope = np.concatenate([h, np.stack([r ** (2 * k) for k in range(3)], axis=1)], axis=1)
@@ -107,23 +104,19 @@ def centring(model: LensModel, settings: LensSettings) -> Centring:
 
 
 def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
-    """Samples near the settings, none of photos that do not count."""
+    """Samples of the colour near the aperture, none of photos that do not count."""
 
     def near(sample: PsfSample) -> bool:
-        own, a, b = sample.settings, sample.settings.stops, settings.stops
-        if own.channel != settings.channel or sample.weight <= 0 or sample.photo in model.settings.excluded:
-            return False
-        if a is not None and b is not None and abs(a - b) > _NEAR_STOPS:
-            return False
-        both = own.focal_mm and settings.focal_mm
-        return not both or abs(math.log2(own.focal_mm / settings.focal_mm)) <= 0.25  # type: ignore[operator]
+        own, asked = sample.settings.stops, settings.stops
+        return own is None or asked is None or abs(own - asked) <= _NEAR_STOPS
 
-    return [sample for sample in model.samples if near(sample)]
+    counted = [s for s in model.samples if s.weight > 0 and s.photo not in model.settings.excluded]
+    return [s for s in counted if s.settings.channel == settings.channel and near(s)]
 
 
 def _third_moment(sample: PsfSample) -> _Array:
     """<|x|^2 x> / w^3 as (right, up), about the centre of mass, wings below a hundredth cut."""
-    kernel = np.where(sample.kernel > _WING * sample.kernel.max(), sample.kernel, 0.0)
+    kernel = np.where(sample.kernel > WING_LEVEL * sample.kernel.max(), sample.kernel, 0.0)
     kernel = kernel / kernel.sum()
     down, right = np.indices(kernel.shape) - kernel.shape[0] // 2
     up, right = (kernel * down).sum() - down, right - (kernel * right).sum()
@@ -152,7 +145,7 @@ def _asymmetry(design: _Array, value: _Array, photos: NDArray[np.intp]) -> Asymm
     return Asymmetry(length, direction, error, significant=length > limit * error)
 
 
-def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
+def _jackknife(fit: Callable[[NDArray[np.bool_]], _Array], groups: NDArray[np.intp]) -> tuple[float, int]:
     """Standard error of a component and the degrees of freedom, leaving out one group at a time."""
     names = np.unique(groups)
     others = np.array([fit(groups != name) for name in names])
@@ -173,23 +166,20 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int, *, measured
     if coma is not None and coma.significant and coma.amount > _COMATIC:
         tails = direction_in_words(coma.direction)
         signs.append(f"points in the middle of the picture have tails towards the {tails}")
+    sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
+    figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
+    verdict: Literal["centred", "decentred", "unknown"] = "unknown"
     if signs and photos == 1:
         text = (
             f"perhaps decentred: {'; '.join(signs)}; one photo cannot tell this from a subject at a slant; "
-            "a second one can"
         )
-        return Centring("unknown", text, softer, coma)
-    if signs:
-        return Centring("decentred", f"decentred: {'; '.join(signs)}", softer, coma)
-    sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
-    figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
+        text += "a second one can"
+    elif signs:
+        verdict, text = "decentred", f"decentred: {'; '.join(signs)}"
     # a subject at a slant may hide a fault as it may feign one; a chart was photographed straight on
-    if sides + spread <= _UNSURE and (photos > 1 or measured):
-        return Centring(
-            "centred", f"well centred within what {photographs} can tell: {figures}", softer, coma
-        )
-    if spread >= 1.0:  # such figures mean nothing
-        figures = "its samples differ too much from photo to photo"
-    return Centring(
-        "unknown", f"{photographs} cannot tell whether the lens is centred: {figures}", softer, coma
-    )
+    elif sides + spread <= _UNSURE and (photos > 1 or measured):
+        verdict, text = "centred", f"well centred within what {photographs} can tell: {figures}"
+    else:
+        told = figures if spread < 1.0 else "its samples differ too much from photo to photo"
+        text = f"{photographs} cannot tell whether the lens is centred: {told}"
+    return Centring(verdict, text, softer, coma)

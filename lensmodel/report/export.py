@@ -12,7 +12,6 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Final
 
 import numpy as np
@@ -68,13 +67,17 @@ def psf_grid(
 def to_fits(psfs: PsfGrid) -> bytes:
     """FITS, 32-bit float: a cube (place, row, col), or an image for a single place, as Siril loads it.
 
-    Notes
-    -----
-    Rows are stored from the bottom, as is the custom of the format, and ROWORDER says so. The
-    extension POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error.
-    Source: "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
+    Rows are stored from the bottom, as is the custom of the format, and ROWORDER says so. The extension
+    POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error. Source:
+    "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
     """
-    fits = _astropy_fits()
+    try:  # imported when it is wanted: most people never write FITS, and it takes half a second
+        fits = importlib.import_module("astropy.io.fits")
+    except ImportError as error:
+        raise InvalidInputError(
+            "writing FITS needs astropy; install it with `pip install '.[fits]'` in this program's folder, "
+            "or export npz instead"
+        ) from error
     cube = psfs.kernels[:, ::-1, :]
     primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
     header = primary.header
@@ -144,14 +147,3 @@ exporters: Registry[bytes] = Registry("export format", {"fits": to_fits, "json":
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     """Write a grid in a format; the file appears complete or not at all."""
     write_atomically(Path(path), exporters.create(file_format, psfs=psfs))
-
-
-def _astropy_fits() -> ModuleType:
-    # imported when it is wanted: most people never write FITS, and it takes half a second
-    try:
-        return importlib.import_module("astropy.io.fits")
-    except ImportError as error:
-        raise InvalidInputError(
-            "writing FITS needs astropy; install it with `pip install '.[fits]'` in this program's folder, "
-            "or export npz instead"
-        ) from error

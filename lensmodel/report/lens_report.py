@@ -90,25 +90,18 @@ class SensorGeometry:
     pixel_pitch_um: float | None = None  # micrometres from pixel to pixel
     height_px: int | None = None  # pixels of the shorter side of the picture
 
-    def factor(self, unit: Unit) -> float | None:
-        """What cycles/pixel are multiplied with: LP/PH = H f, lp/mm = 1000 f / p; None where unknown."""
-        if unit == "lp/mm":
-            return None if self.pixel_pitch_um is None else 1000.0 / self.pixel_pitch_um
-        if unit == "lp/ph":
-            return None if self.height_px is None else float(self.height_px)
-        return 1.0
-
     @property
-    def units(self) -> tuple[Unit, ...]:
-        """The units that are known."""
-        return tuple(unit for unit in UNIT_NAMES if self.factor(unit) is not None)
+    def units(self) -> dict[Unit, float]:
+        """Factors of cycles/pixel in the units that are known: LP/PH = H f, lp/mm = 1000 f / p."""
+        height, pitch = self.height_px, self.pixel_pitch_um
+        factors: dict[Unit, float | None] = {
+            "c/px": 1.0, "lp/ph": height and float(height), "lp/mm": pitch and 1000.0 / pitch
+        }  # fmt: skip
+        return {unit: factor for unit, factor in factors.items() if factor}
 
     def words(self, frequency: float, unit: Unit = "c/px", between: Range | None = None) -> str:
         """Write a frequency given in cycles/pixel, with its range; beyond Nyquist's only "at least" it."""
-        factor = self.factor(unit)
-        if factor is None:
-            return "unknown"
-        value = min(frequency, NYQUIST) * factor
+        value = min(frequency, NYQUIST) * self.units[unit]
         digits = f"{value:.3f}".removeprefix("0") if unit == "c/px" else f"{value:.0f}"
         words = f"at least {digits}" if frequency >= NYQUIST else digits
         if between is None or between[0] >= NYQUIST:
@@ -137,22 +130,22 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """What the lens makes of a point at one place: MTF50 in cycles/pixel, and the kernel's rows."""
+    """What the lens makes of a point at one place: MTF50, at most the Nyquist frequency, and the kernel."""
 
     place: str
     position: FieldPosition
-    tangential: float  # the Nyquist frequency, .5, means at least that
+    tangential: float  # the Nyquist frequency means at least that
     sagittal: float
     tangential_range: Range
     sagittal_range: Range
     predicted_error: float  # expected relative L2 of the kernel
     unknown: bool  # whether too little is known of the place to call this the lens
-    kernel: tuple[tuple[float, ...], ...] = ()  # left out of the places of a map
+    kernel: tuple[tuple[float, ...], ...] = ()  # its rows, left out of the places of a map
 
     @property
     def mean(self) -> float:
-        """Mean of both MTF50, neither beyond what a sensor shows."""
-        return (min(self.tangential, NYQUIST) + min(self.sagittal, NYQUIST)) / 2.0
+        """Mean of both MTF50."""
+        return (self.tangential + self.sagittal) / 2.0
 
     @property
     def side(self) -> str:
@@ -162,15 +155,21 @@ class Spot:
     @property
     def mean_range(self) -> Range:
         """Between what the mean is expected."""
-        low, high = np.minimum([self.tangential_range, self.sagittal_range], NYQUIST).mean(axis=0)
-        return float(low), float(high)
+        (t_low, t_high), (s_low, s_high) = self.tangential_range, self.sagittal_range
+        return (t_low + s_low) / 2.0, (t_high + s_high) / 2.0
+
+    @property
+    def directions(self) -> tuple[tuple[str, float, Range], ...]:
+        """Both directions with figure and range."""
+        tangential = "tangential", self.tangential, self.tangential_range
+        return tangential, ("sagittal", self.sagittal, self.sagittal_range)
 
     @property
     def words(self) -> str:
         """Both figures with their ranges, never one of the two."""
-        figures = SensorGeometry()
-        tangential = figures.words(self.tangential, "c/px", self.tangential_range)
-        return f"T {tangential}, S {figures.words(self.sagittal, 'c/px', self.sagittal_range)}"
+        words = SensorGeometry().words
+        tangential = words(self.tangential, between=self.tangential_range)
+        return f"T {tangential}, S {words(self.sagittal, between=self.sagittal_range)}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,17 +66,12 @@ def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:
 
 def corner_places(aspect: float) -> tuple[FieldPosition, ...]:
     """The four corners, upper left first, as far out as samples reach."""
-    width, height = half_sides(aspect)
-    corner = math.atan2(height, width)
-    return tuple(FieldPosition(0.9, phi) for phi in (math.pi - corner, corner, corner - math.pi, -corner))
+    angle = math.atan(1.0 / aspect)
+    return tuple(FieldPosition(0.9, phi) for phi in (math.pi - angle, angle, angle - math.pi, -angle))
 
 
 def side_places(aspect: float) -> tuple[FieldPosition, ...]:
     """Left, right, top and bottom, four fifths of the way to the edge."""
     width, height = half_sides(aspect)
-    return (
-        FieldPosition(0.8 * width, math.pi),
-        FieldPosition(0.8 * width, 0.0),
-        FieldPosition(0.8 * height, math.pi / 2),
-        FieldPosition(0.8 * height, -math.pi / 2),
-    )
+    sides = ((width, math.pi), (width, 0.0), (height, math.pi / 2), (height, -math.pi / 2))
+    return tuple(FieldPosition(0.8 * half, phi) for half, phi in sides)

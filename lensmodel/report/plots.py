@@ -162,7 +162,7 @@ def _panels(report: LensReport, found: ApertureReport, unit: Unit) -> list[Panel
     """What a tester is shown of one aperture."""
     at = _at(found)
     panels: list[Panel] = [
-        (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.factor(unit) or 1.0)),
+        (f"MTF50 in {_UNITS[unit]}{at}", lambda on: _maps(on, found, report.sensor.units.get(unit, 1.0))),
         (
             f"Contrast from the centre to the corner{at}: sagittal (S) solid, tangential (T) dashed",
             _on(_contrast, found),
@@ -359,7 +359,7 @@ def _table(ax: Axes, report: LensReport, found: ApertureReport) -> None:
 def _over_apertures(ax: Axes, report: LensReport, unit: Unit) -> None:
     """MTF50 of the centre and of each corner by aperture."""
     known = [one for one in report.green if one.at]
-    factor = report.sensor.factor(unit) or 1.0
+    factor = report.sensor.units.get(unit, 1.0)
     for k, spot in enumerate(known[0].spots):
         values = [factor * one.spots[k].mean for one in known]
         ax.plot(values, "o-", label=spot.side, lw=2.5 if k == 0 else 1.2)

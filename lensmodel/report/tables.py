@@ -20,21 +20,14 @@ _Row: TypeAlias = dict[str, str | float | None]
 
 def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
     """Return head and rows of tangential and sagittal MTF50 by aperture and place, in each known unit."""
-    units = report.sensor.units
+    words, units = report.sensor.words, report.sensor.units
     head = ["Aperture", "Place", *(f"{side}, {UNIT_NAMES[unit]}" for unit in units for side in "TS")]
     rows = []
     for aperture in report.apertures:
         found = report.at(aperture)
         for spot in (found.spots[0], *found.sides, *found.spots[1:]):
-            figures = [
-                report.sensor.words(value, unit, between)
-                for unit in units
-                for value, between in (
-                    (spot.tangential, spot.tangential_range),
-                    (spot.sagittal, spot.sagittal_range),
-                )
-            ]
             place = spot.place.removeprefix("the ") + (" (not known)" if spot.unknown else "")
+            figures = [words(value, unit, between) for unit in units for _, value, between in spot.directions]
             rows.append([found.at or "unknown", place, *figures])
     return head, rows
 
@@ -69,10 +62,7 @@ def _rows(found: ApertureReport) -> Iterator[_Row]:
     for own, spot in spots:
         own |= {"r": spot.position.r, "phi": spot.position.phi, "unit": "c/px", "unknown": int(spot.unknown)}
         own |= {"predicted_error": spot.predicted_error}
-        for direction, value, (low, high) in (
-            ("tangential", spot.tangential, spot.tangential_range),
-            ("sagittal", spot.sagittal, spot.sagittal_range),
-        ):
+        for direction, value, (low, high) in spot.directions:
             yield own | {"direction": direction, "value": value, "low": low, "high": high}
     for curve in found.curves:
         own = known | {"quantity": "MTF", "frequency_c_px": curve.frequency, "frequency_lp_mm": curve.lp_mm}

@@ -77,16 +77,16 @@ def locate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         if mapped[6:14] == CIFF:
             return {"location": "none"}
-        traces = find_location(mapped)
-    if traces.overwrites:
+        overwrites, complete = find_location(mapped)
+    if overwrites:
         shutil.copyfile(path, cleaned)
         with cleaned.open("r+b") as copy:
-            for overwrite in traces.overwrites:
-                copy.seek(overwrite.start)
-                copy.write(overwrite.data)
-    if not traces.complete:
+            for start, data in overwrites:
+                copy.seek(start)
+                copy.write(data)
+    if not complete:
         return {"location": "unknown"}
-    return {"location": "removed" if traces.overwrites else "none"}
+    return {"location": "removed" if overwrites else "none"}
 
 
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:

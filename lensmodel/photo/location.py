@@ -15,10 +15,9 @@ import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -43,24 +42,15 @@ _PACKED: Final = re.compile(rb"Raw profile type |XML:com\.adobe\.xmp\x00\x01")
 _HIDDEN: Final = b"prVt"  # type of a chunk that every reader skips: ancillary, private, safe to copy
 
 
-@dataclass(frozen=True, slots=True)
-class Overwrite:
+class Overwrite(NamedTuple):
     """Bytes to be written over others of the same number."""
 
     start: int
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class LocationTraces:
-    """Where a file says where it was taken."""
-
-    overwrites: tuple[Overwrite, ...]  # what removes it; empty where the file says nothing
-    complete: bool  # false where the file holds more than was looked at, as hostile ones may
-
-
-def find_location(buffer: Buffer) -> LocationTraces:
-    """Find what a photo file says of the place where it was taken.
+def find_location(buffer: Buffer) -> tuple[list[Overwrite], bool]:
+    """Find what removes the place where a photo was taken, and whether all of the file was looked at.
 
     Not found: names of places in IPTC blocks and maker notes, and anything inside compressed blocks other
     than those of PNG.
@@ -83,7 +73,7 @@ def find_location(buffer: Buffer) -> LocationTraces:
         spans.append(Overwrite(start, b" " * (end - start)))
     spans = [span for span in spans if bytes(buffer[span.start : span.start + len(span.data)]) != span.data]
     complete = len(blocks) <= MAX_BLOCKS and len(words) <= MAX_WORDS
-    return LocationTraces(tuple(_with_checksums(buffer, chunks, spans)), complete)
+    return _with_checksums(buffer, chunks, spans), complete
 
 
 def gps_directory(path: Path) -> dict[int, Value]:

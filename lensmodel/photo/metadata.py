@@ -1,17 +1,18 @@
-"""What a file says about camera, lens and exposure: read from EXIF, maker note and XMP, and written as EXIF.
-
-CRW files, which are older than all three, name their camera here; LibRaw tells the rest.
+"""What a file says about camera, lens and exposure: read from EXIF, maker note and XMP, and written again.
 
 The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
 one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
 Maker notes are read only for what EXIF leaves out; one that does not look as expected gives nothing.
 
-Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; for maker notes, which no maker documents, ExifTool's tag
-tables (P. Harvey), checked against files of these cameras.
+Sources: CIPA DC-008-2023 (Exif 3.0), section 4.6; ISO 16684-1:2019, sections 7 and 8 (XMP); Adobe, "XMP
+Specification Part 2", 2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`); for maker notes, which no
+maker documents, ExifTool's tag tables (P. Harvey), checked against files of these cameras.
 """
 
 from __future__ import annotations
 
+import io
+import logging
 import math
 import re
 import struct
@@ -19,11 +20,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
+from xml.etree import ElementTree as ET
+from xml.sax.saxutils import escape, quoteattr
 
 from lensmodel.photo.containers import Header
 from lensmodel.photo.tiff import EXIF, UNDEFINED, Tag, Tags, TiffReader, Value, rationals, shorts, text
 from lensmodel.photo.values import SOFTWARE, LensIdentity, PhotoMetadata, SerialSource
-from lensmodel.photo.xmp import read_xmp
+
+log = logging.getLogger(__name__)
 
 _PLACEHOLDER: Final = re.compile(
     r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
@@ -68,7 +72,7 @@ class Said:
     header: Header
     tags: Tags  # of IFD0 and the EXIF directory together; the latter win
     xmp: Mapping[str, str]
-    note: _MakerNote
+    note: PhotoMetadata  # what the maker note adds to EXIF
 
     @classmethod
     def of(cls, header: Header) -> Said:
@@ -82,11 +86,11 @@ class Said:
             if 0x927C in main:
                 note_in = reader
             tags = Tags({**main, **tags})
-        note = _maker_note(tags.text(0x010F) or "", tags[0x927C], note_in) if note_in else _MakerNote()
+        note = _maker_note(tags.text(0x010F) or "", tags[0x927C], note_in) if note_in else PhotoMetadata()
         return cls(header, tags, read_xmp(header.xmp), note)
 
     def metadata(self) -> PhotoMetadata:
-        """Put it together; what cannot be read is unknown."""
+        """Put it together; what cannot be read is unknown, and of a CRW file LibRaw tells the rest."""
         tags, xmp, note = self.tags, self.xmp, self.note
         if self.header.camera is not None:
             return PhotoMetadata(self.header.camera[0], self.header.camera[1] or None)
@@ -98,8 +102,7 @@ class Said:
         if not speed or speed >= 65535:
             speed = tags.number(0x8832) or tags.number(0x8831) or speed
         turned = tags.number(0x0112)
-        stars = _quotient(xmp.get("xmp:Rating"))  # -1 is rejected; the tag is Windows's
-        stars = tags.number(0x4746) if stars is None else stars
+        stars = _first_within(-1, 5, _quotient(xmp.get("xmp:Rating")), tags.number(0x4746))  # -1 is rejected
         return PhotoMetadata(
             camera_maker=tags.text(0x010F) or xmp.get("tiff:Make"),
             camera_model=tags.text(0x0110) or xmp.get("tiff:Model"),
@@ -119,10 +122,10 @@ class Said:
             taken_at=self._taken_at(),
             orientation=int(turned) if turned is not None and 1 <= turned <= 8 else 1,
             pixel_pitch_um=self._pixel_pitch_um(),
-            artist=tags.text(0x013B) or ", ".join(_lines(xmp.get("dc:creator"))) or self._wide_text(0x9C9D),
+            artist=tags.text(0x013B) or ", ".join(xmp.get("dc:creator", "").splitlines()) or None,
             copyright=tags.text(0x8298) or xmp.get("dc:rights"),
-            rating=int(stars) if stars is not None and -1 <= stars <= 5 else None,
-            keywords=tuple(_lines(xmp.get("dc:subject")) or _lines(self._wide_text(0x9C9E), ";")),
+            rating=None if stars is None else int(stars),
+            keywords=tuple(xmp.get("dc:subject", "").splitlines()),
         )
 
     def is_centred(self, metadata: PhotoMetadata) -> bool:
@@ -154,10 +157,6 @@ class Said:
         """How much of the picture is enlarged from the middle of the sensor: DigitalZoomRatio."""
         return _first_within(1.0, 20.0, self.tags.number(0xA404)) or 1.0
 
-    def _wide_text(self, tag: int) -> str | None:
-        """Text in two bytes a sign, as Windows writes it."""
-        return self.tags.raw(tag).decode("utf-16-le", "replace").strip("\0 ") or None
-
     def _taken_at(self) -> datetime | None:
         for tag in (0x9003, 0x9004, 0x0132):
             try:
@@ -169,11 +168,11 @@ class Said:
     def _lens(self) -> LensIdentity:
         tags, xmp = self.tags, self.xmp
         makers = tags.text(0xA433), xmp.get("exifEX:LensMake")
-        models = tags.text(0xA434), self.note.lens_model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
+        models = tags.text(0xA434), self.note.lens.model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
         return LensIdentity(_first(is_placeholder, *makers), _first(names_no_lens, *models), *self._serial())
 
     def _serial(self) -> tuple[str | None, SerialSource]:
-        declared, noted = self.tags.text(0xA435), self.note.lens_serial
+        declared, noted = self.tags.text(0xA435), self.note.lens.serial
         # A camera that fills the EXIF tag with zeros has looked and found no serial; what its maker
         # note holds beside it (seen: 1c00000000) is no serial either.
         sources: tuple[tuple[str | None, SerialSource], ...] = (
@@ -231,10 +230,6 @@ def _is_width_of_sensor(width_mm: float) -> bool:
     return any(low <= width_mm <= high for low, high in _SENSORS_MM)
 
 
-def _lines(text: str | None, separator: str = "\n") -> list[str]:
-    return [word for part in (text or "").split(separator) if (word := part.strip())]
-
-
 def _quotient(text: str | None) -> float | None:
     """Value of an XMP rational such as "71/10"."""
     over, _, under = (text or "").partition("/")
@@ -255,18 +250,7 @@ def _first(refused: Callable[[str], bool], *candidates: str | None) -> str | Non
 # --- maker notes --------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _MakerNote:
-    """What a maker note adds to EXIF; `None` is unknown."""
-
-    lens_model: str | None = None
-    lens_serial: str | None = None
-    body_serial: str | None = None
-    focus_m: float | None = None
-    iso: float | None = None
-
-
-def _maker_note(maker: str, note: Tag, reader: TiffReader) -> _MakerNote:
+def _maker_note(maker: str, note: Tag, reader: TiffReader) -> PhotoMetadata:
     """Read the maker note of EXIF tag 0x927C by its first bytes, or the maker's name."""
     buffer, start = reader.buffer, note.offset
     head, at = bytes(buffer[start : start + 16]), start - reader.base
@@ -275,21 +259,21 @@ def _maker_note(maker: str, note: Tag, reader: TiffReader) -> _MakerNote:
     if head.startswith((b"OLYMPUS\0", b"OM SYSTEM\0\0\0")):
         first = 12 if head[:8] == b"OLYMPUS\0" else 16
         order = {b"II": "<", b"MM": ">"}.get(head[first - 4 : first - 2])
-        return _olympus(TiffReader(buffer, start, order, first), first) if order else _MakerNote()
+        return _olympus(TiffReader(buffer, start, order, first), first) if order else PhotoMetadata()
     if head.startswith(b"Panasonic\0\0\0"):
         tags = reader.directory(at + 12)[0]
-        return _MakerNote(lens_model=tags.text(0x0051), lens_serial=tags.text(0x0052))
+        return PhotoMetadata(lens=LensIdentity(model=tags.text(0x0051), serial=tags.text(0x0052)))
     if maker.lower().startswith("canon"):
         return _canon(note, reader)
     inner = TiffReader.open(buffer, start + 10) if head.startswith(b"Nikon\0\x02") else None
     if inner or (maker.lower().startswith("nikon") and not head.startswith(b"Nikon\0")):
         tags = (inner.directory(inner.first) if inner else reader.directory(at))[0]
         speed = [*tags.numbers(0x0002, 2), 0.0, 0.0][1]
-        return _MakerNote(body_serial=tags.text(0x001D), iso=speed or None)
-    return _MakerNote()
+        return PhotoMetadata(body_serial=tags.text(0x001D), iso=speed or None)
+    return PhotoMetadata()
 
 
-def _canon(note: Tag, reader: TiffReader) -> _MakerNote:
+def _canon(note: Tag, reader: TiffReader) -> PhotoMetadata:
     # Canon ends its notes with a TIFF header of its own byte order whose offset is the note's original place:
     # a program may have moved the note without rewriting its offsets.
     if footer := TiffReader.open(reader.buffer, note.offset + note.size - 8):
@@ -304,14 +288,11 @@ def _canon(note: Tag, reader: TiffReader) -> _MakerNote:
         far, near = struct.unpack(tags[tag].order + "HH", raw) if len(raw) == 4 else (0, 0)
         if focus_m is None and far >= near > 0:
             focus_m = math.inf if far == 65535 else math.sqrt(far * near) / 100.0
-    return _MakerNote(
-        lens_model=tags.text(0x0095),
-        lens_serial=serial.hex() if len(serial) == 5 and any(serial[1:]) else None,
-        focus_m=focus_m,
-    )
+    known = serial.hex() if len(serial) == 5 and any(serial[1:]) else None
+    return PhotoMetadata(lens=LensIdentity(model=tags.text(0x0095), serial=known), focus_m=focus_m)
 
 
-def _olympus(reader: TiffReader, first: int) -> _MakerNote:
+def _olympus(reader: TiffReader, first: int) -> PhotoMetadata:
     tags, parts = reader.directory(first)[0], list[Tags]()
     for pointer in (0x2010, 0x2050):  # equipment and focus, given by a pointer or, in older notes, in place
         in_place = pointer in tags and tags[pointer].count != 1
@@ -320,12 +301,96 @@ def _olympus(reader: TiffReader, first: int) -> _MakerNote:
     equipment, focus = parts
     # Millimetres over 1 in some models, centimetres over 10 in others: the numerator is in mm.
     millimetres = int.from_bytes(focus.raw(0x0305)[:4], "little" if reader.order == "<" else "big")
-    return _MakerNote(
-        lens_model=equipment.text(0x0203),
-        lens_serial=equipment.text(0x0202),
+    return PhotoMetadata(
+        lens=LensIdentity(model=equipment.text(0x0203), serial=equipment.text(0x0202)),
         body_serial=equipment.text(0x0101),
         focus_m=(math.inf if millimetres == 0xFFFFFFFF else millimetres / 1000.0) or None,
     )
+
+
+# --- XMP ----------------------------------------------------------------------------------------
+
+MAX_XMP_BYTES: Final = 1 << 20  # against files made to fill the memory; real ones are some kilobytes
+_MOST_OF_A_LIST: Final = 16_384  # characters (chosen): some hundred keywords
+_RDF: Final = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
+_SPACES: Final[Mapping[str, str]] = {
+    "http://ns.adobe.com/exif/1.0/aux/": "aux",
+    "http://ns.adobe.com/camera-raw-settings/1.0/": "crs",
+    "http://purl.org/dc/elements/1.1/": "dc",
+    "http://ns.adobe.com/exif/1.0/": "exif",
+    "http://cipa.jp/exif/1.0/": "exifEX",
+    "http://ns.adobe.com/tiff/1.0/": "tiff",
+    "http://ns.adobe.com/xap/1.0/": "xmp",
+    "http://ns.adobe.com/xap/1.0/mm/": "xmpMM",
+    "http://ns.adobe.com/xap/1.0/sType/ResourceEvent#": "stEvt",
+    _RDF: "rdf",
+}
+
+
+def read_xmp(packet: bytes | None) -> Mapping[str, str]:
+    """Read the properties of a packet by prefix and name: of a list the first, of authors and keywords all.
+
+    A packet that is damaged gives what came before the damage, one with a document type, the door to entity
+    expansion, nothing: metadata that cannot be read are unknown, and no reason to refuse the photo.
+    """
+    if not packet or len(packet) > MAX_XMP_BYTES or b"<!DOCTYPE" in packet.replace(b"\0", b""):
+        return {}
+    elements, properties = list[ET.Element](), dict[str, str]()
+    try:
+        for _, element in ET.iterparse(io.BytesIO(packet.strip(b"\0 \r\n")), events=["start"]):  # noqa: S314  no entities: see above
+            elements.append(element)  # their texts come later
+    except (ET.ParseError, ValueError) as damage:
+        log.info("an XMP packet is damaged: %s", damage)
+    name = ""
+    for element in elements:
+        # The items of a list belong to the property around it: <exif:ISO><Seq><li>100.
+        name = name if element.tag.startswith("{" + _RDF) else element.tag
+        for qualified, value in [*element.items(), (name, element.text or "")]:
+            space, _, local = qualified.removeprefix("{").rpartition("}")
+            said, key = value.strip()[:1024], f"{_SPACES.get(space)}:{local}"
+            if not said or space not in _SPACES:
+                continue
+            before = properties.setdefault(key, said)
+            if key in {"dc:creator", "dc:subject"} and before is not said and len(before) < _MOST_OF_A_LIST:
+                properties[key] = f"{before}\n{said}"
+    return properties
+
+
+_PACKET: Final = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF{spaces}>
+<rdf:Description rdf:about=""{properties}>
+{lists}
+</rdf:Description></rdf:RDF></x:xmpmeta>
+<?xpacket end="r"?>"""
+_CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
+"""What XML has no way to write; cameras put it into names."""
+
+
+def xmp_packet(metadata: PhotoMetadata, description: str, lens: str = "") -> bytes:
+    """Return what EXIF has no tags for, and what was done; `lens` is what its owner calls it."""
+
+    def attributes(values: Mapping[str, object]) -> str:
+        known = {name: str(value) for name, value in values.items() if value is not None}
+        return "".join(f" {name}={quoteattr(value.translate(_CHARACTERS))}" for name, value in known.items())
+
+    done = {"stEvt:action": "filtered", "stEvt:softwareAgent": SOFTWARE, "stEvt:parameters": description}
+    lists = [f"<xmpMM:History><rdf:Seq><rdf:li{attributes(done)}/></rdf:Seq></xmpMM:History>"]
+    for name, kind, items in (
+        ("dc:rights", "Alt", [metadata.copyright]),
+        ("dc:creator", "Seq", [metadata.artist]),
+        ("dc:subject", "Bag", metadata.keywords),
+        ("dc:description", "Alt", [description]),
+    ):
+        default = ' xml:lang="x-default"' if kind == "Alt" else ""
+        texts = [escape(item.translate(_CHARACTERS)) for item in items if item]
+        written = "".join(f"<rdf:li{default}>{item}</rdf:li>" for item in texts)
+        if written:
+            lists.append(f"<{name}><rdf:{kind}>{written}</rdf:{kind}></{name}>")
+    named = lens or metadata.lens.model
+    known = {"xmp:CreatorTool": SOFTWARE, "xmp:Rating": metadata.rating, "aux:Lens": named}
+    spaces = attributes({f"xmlns:{prefix}": space for space, prefix in _SPACES.items()})
+    packet = _PACKET.format(spaces=spaces, properties=attributes(known), lists="\n".join(lists))
+    return packet.encode()
 
 
 # --- as EXIF tags of a written file -------------------------------------------------------------
@@ -333,7 +398,6 @@ def _olympus(reader: TiffReader, first: int) -> _MakerNote:
 
 def main_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value | None]:
     """Tags of the main directory; names of people are UTF-8, as most programs read them."""
-    stars = metadata.rating
     return {
         0x010E: text(description),
         0x010F: text(metadata.camera_maker),
@@ -343,7 +407,6 @@ def main_tags(metadata: PhotoMetadata, description: str = "") -> dict[int, Value
         0x0132: _date(metadata.taken_at),
         0x013B: text(metadata.artist, "utf-8"),
         0x8298: text(metadata.copyright, "utf-8"),
-        0x4746: None if stars is None or stars < 0 else shorts(stars),
     }
 
 

@@ -15,8 +15,8 @@ import rawpy
 from lensmodel.core.errors import LensModelError, RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
-from lensmodel.photo import opcodes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3
+from lensmodel.photo.dng import Opcode, demosaiced, packed_opcodes, read_opcodes
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
@@ -90,13 +90,13 @@ def develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
     """
     header, mosaic = said.header, Mosaic.of(raw)
     # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
-    kept, lost = [] if header.coarseness else opcodes.read(header.opcodes_2), list[opcodes.Opcode]()
+    kept, lost = [] if header.coarseness else read_opcodes(header.opcodes_2), list[Opcode]()
     white, clip, defects = int(raw.white_level), (1.0, 1.0, 1.0), 0
     sensor_noise, cfa, stated = None, None, header.white
     if mosaic is not None:
         white, clip = mosaic.saturation()
         sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
-        kept, lost = opcodes.demosaiced(kept, cfa)
+        kept, lost = demosaiced(kept, cfa)
         defects = mosaic.repair()
     balance, own_balance = _white_balance(raw)
     planes = _developed(raw, white, balance, stated)
@@ -117,8 +117,8 @@ def develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
             to_srgb=matrix3(to_srgb),
             xyz_to_camera=matrix3(xyz_to_camera),
             baseline_exposure=said.baseline_exposure(),
-            opcodes_2=opcodes.written(kept),
-            opcodes_3=opcodes.written(opcodes.read(header.opcodes_3)),
+            opcodes_2=packed_opcodes(kept),
+            opcodes_3=packed_opcodes(read_opcodes(header.opcodes_3)),
         ),
         sensor_noise=sensor_noise,
         coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1]),

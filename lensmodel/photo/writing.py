@@ -17,7 +17,6 @@ from PIL import Image
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import Planes
-from lensmodel.photo import opcodes
 from lensmodel.photo.colour import (
     D65_TO_D50,
     SRGB_TO_XYZ_D65,
@@ -31,11 +30,10 @@ from lensmodel.photo.colour import (
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.dng import dng_tags
-from lensmodel.photo.metadata import exif_tags, main_tags
+from lensmodel.photo.dng import dng_tags, read_opcodes
+from lensmodel.photo.metadata import exif_tags, main_tags, xmp_packet
 from lensmodel.photo.tiff import BYTE, EXIF, GPS, UNDEFINED, Written, laid_out, shorts, write_strip
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
-from lensmodel.photo.xmp import xmp_packet
 
 _ROWS: Final = 256  # rows that are encoded at a time: bounds the memory of the conversion
 
@@ -121,7 +119,7 @@ def write_image(
 
 def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFormat) -> None:
     """Tell what of the photo a file of this format does not hold."""
-    steps = [step.name for block in (encoding.opcodes_2, encoding.opcodes_3) for step in opcodes.read(block)]
+    steps = [step.name for block in (encoding.opcodes_2, encoding.opcodes_3) for step in read_opcodes(block)]
     if steps and output != "dng":
         remarks_log.warning(
             "%s: the corrections that the DNG leaves to raw converters (%s) are not in it; only DNG output "

@@ -6,7 +6,7 @@ import itertools
 import shutil
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from datetime import timedelta
 from functools import partial
@@ -33,6 +33,7 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 
+BODY = {"width": 6000, "height": 4000, "pixel_pitch_um": 6.0}
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
 
@@ -74,12 +75,17 @@ class Steps:
         return photo
 
     def inspect(
-        self, photo: PhotoRow, *, serial: str | None = "123", aperture: float | None = 1.4, **body: Any
+        self,
+        photo: PhotoRow,
+        *,
+        serial: str | None = "123",
+        aperture: float | None = 1.4,
+        body: Mapping[str, Any] = BODY,
     ) -> None:
         self.store.photos.set_state(photo.public_id, ("received",), "inspecting")
         name = LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none")
-        header = {"width": 6000, "height": 4000, "focal_mm": 24.0, "focus_m": None, "pixel_pitch_um": 6.0}
-        self.store.photos.record_inspection(photo.public_id, name, **header | body, aperture=aperture)
+        header = {"aperture": aperture, "focal_mm": 24.0, "focus_m": None}
+        self.store.photos.record_inspection(photo.public_id, name, **header, **body)
 
     def plan(self, photo: PhotoRow, count: int = 2) -> None:
         self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
@@ -88,9 +94,9 @@ class Steps:
         self.store.photos.plan_patches(photo.public_id, photo.epoch, patches, [window(0, 0, reason="flat")])
         self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
 
-    def planned(self, count: int = 2, **header: Any) -> PhotoRow:
+    def planned(self, count: int = 2, *, filename: str = "", **header: Any) -> PhotoRow:
         """Bring a photo so far that its patches can be estimated."""
-        photo = self.receive()
+        photo = self.receive(filename=filename)
         self.inspect(photo, **header)
         self.plan(photo, count)
         return photo
@@ -107,18 +113,8 @@ class Steps:
         ]
         return self.store.photos.add_samples(photo.public_id, photo.epoch, samples)
 
-    def counted(
-        self,
-        *,
-        patches: int = 2,
-        width: float = 1.0,
-        size: int = 15,
-        filename: str = "",
-        **header: Any,
-    ) -> PhotoRow:
-        photo = self.receive(filename=filename)
-        self.inspect(photo, **header)
-        self.plan(photo, patches)
+    def counted(self, *, patches: int = 2, width: float = 1.0, size: int = 15, **header: Any) -> PhotoRow:
+        photo = self.planned(patches, **header)
         self.estimate(photo, range(patches), width=width, size=size)
         assert self.store.photos.finish(photo.public_id, photo.epoch) is not None
         return self.fresh(photo)

@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from deadline import Deadline
+from deadline import until
+from quick_tasks import CELLS
 from sqlalchemy import func, select
 
 from app.runtime.settings import Settings
@@ -21,7 +22,16 @@ from app.store import Store
 from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
 
 STAND_INS = Path(__file__).parent / "stand_ins"
-CELLS, CHANNELS = 8, 3  # of each photo, in the tasks of `stand_ins/quick_tasks.py`
+CHANNELS = 3
+
+
+WORKER = [sys.executable, str(STAND_INS / "stand_in_worker.py")]
+
+
+def quick(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return what the environment of a worker needs besides, so that its tasks are quick."""
+    path = os.pathsep.join([str(STAND_INS), environment.get("PYTHONPATH", "")])
+    return {"PYTHONPATH": path, "LENSMODEL_TASKS": "quick_tasks"}
 
 
 class Crew:
@@ -29,20 +39,22 @@ class Crew:
 
     def __init__(self, settings: Settings, log: Path, extra: Mapping[str, str] | None = None) -> None:
         self.log = log
-        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
-        self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | dict(extra or {})
+        self._environment = os.environ | environment(settings) | quick(os.environ) | dict(extra or {})
         self.processes: list[subprocess.Popen[bytes]] = []
 
     def hire(self) -> subprocess.Popen[bytes]:
         with self.log.open("a") as log:
             process = subprocess.Popen(
-                [sys.executable, str(STAND_INS / "quick_worker.py")],
+                WORKER,
                 env=self._environment,
                 stderr=log,
                 start_new_session=True,
             )
         self.processes.append(process)
         return process
+
+    def until(self, condition: Callable[[], object], within_s: float = 180.0) -> None:
+        until(condition, self.log, within_s)
 
     def kill(self, process: subprocess.Popen[bytes], *, group: bool = False) -> None:
         """Kill a worker; with `group` its children too, which else notice."""
@@ -81,14 +93,6 @@ def _unlocked(path: Path) -> bool:
 def databases(settings: Settings) -> list[Path]:
     """Return the files of the tables and of the jobs."""
     return [settings.data_dir / name for name in ("app.db", "jobs.db")]
-
-
-def until(condition: Callable[[], object], log: Path | None = None, within_s: float = 180.0) -> None:
-    """Wait for something, for some seconds of an idle machine."""
-    deadline = Deadline(within_s)
-    while not condition():
-        assert not deadline.passed(), "it never happened" if log is None else log.read_text()[-4000:]
-        time.sleep(0.05)
 
 
 def states(store: Store) -> list[str]:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+Found = TypeVar("Found")
 
 
 def slowness() -> float:
@@ -28,3 +33,12 @@ class Deadline:
         self._left -= (now - self._asked) / slowness()
         self._asked = now
         return self._left <= 0.0
+
+
+def until(condition: Callable[[], Found], log: Path | None = None, within_s: float = 180.0) -> Found:
+    """Wait for something, for some seconds of an idle machine; return it. Else show the end of a log."""
+    deadline = Deadline(within_s)
+    while not (found := condition()):
+        assert not deadline.passed(), "it never happened" if log is None else log.read_text()[-4000:]
+        time.sleep(0.05)
+    return found

@@ -18,7 +18,7 @@ from typing import Any
 import httpx2
 import numpy as np
 import uvicorn
-from deadline import Deadline, stretched
+from deadline import Deadline, stretched, until
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -45,10 +45,10 @@ PROGRAM = [sys.executable, "-m", "lensmodel"]
 OWN_ACCOUNT = {"LENS_TASK_USER": "none"}
 """Tasks with the account of the tests find the loops that were compiled before: each other service that is
 started by root compiles them anew, half a minute of it, into a folder of its own."""
-STAND_INS = Path(__file__).with_name("stand_ins")
-LIGHT = [sys.executable, str(STAND_INS / "light_service.py")]
+STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_ins") / "service.py")]
+LIGHT = [*STAND_IN, "light_tasks"]
 """The same whose workers estimate nothing."""
-BRIEF = [sys.executable, str(STAND_INS / "brief_service.py")]
+BRIEF = [*STAND_IN, "brief_tasks"]
 """The same whose workers report on lenses in brief."""
 FINAL = {"succeeded", "failed", "cancelled"}
 SHAPE, SMALL = (320, 448), (224, 320)
@@ -71,7 +71,7 @@ class Service:
 
     def start(self) -> None:
         """Start, or start again, and wait until it is ready."""
-        if self.process is not None and self.process.stdout is not None:
+        if self.process is not None:
             self.process.stdout.close()  # of a service that ended by itself
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
@@ -81,37 +81,29 @@ class Service:
                 stderr=log,
                 text=True,
             )
-        assert self.process.stdout is not None
         said = self.process.stdout.readline()
         assert "runs at" in said, self.log.read_text()[-4000:]
         self.http.base_url = httpx2.URL(self.info()["url"])
-        deadline = Deadline(PATIENCE_S)
-        while self.http.get("/readyz").status_code != 200:
-            assert not deadline.passed(), self.log.read_text()[-4000:]
-            time.sleep(0.1)
+        until(lambda: self.http.get("/readyz").status_code == 200, self.log, PATIENCE_S)
 
     def stop(self) -> int:
         """Stop as Ctrl-C does; return the exit status."""
-        assert self.process is not None
         self.process.send_signal(signal.SIGTERM)
         status = self.process.wait(stretched(30))
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        self.process.stdout.close()
         return status
 
     def close(self) -> None:
         """Leave nothing behind."""
         self.http.close()
-        if self.process is not None and self.process.poll() is None:
+        if self.process is not None:
             self.process.kill()
             self.process.wait()
-        if self.process is not None and self.process.stdout is not None:
             self.process.stdout.close()
 
     def info(self) -> dict[str, Any]:
         """Return the address and the processes."""
-        found: dict[str, Any] = json.loads((self.data / "service.json").read_text())
-        return found
+        return json.loads((self.data / "service.json").read_text())
 
     def get(self, path: str, status: int = 200, **options: Any) -> Any:
         """Return the JSON of an address."""
@@ -124,8 +116,7 @@ class Service:
         with path.open("rb") as file:
             answer = self.http.post("/v1/photos", files={"file": (path.name, file)}, data=fields)
         assert answer.status_code == status, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
+        return answer.json()
 
     def job(self, job_id: str, until: Callable[[dict[str, Any]], object] | None = None) -> dict[str, Any]:
         """Return a job once it ended, or once `until` holds, which it must before the end."""
@@ -143,8 +134,7 @@ class Service:
         photo = self.upload(path, 202, **fields)
         job = self.job(photo["id"])
         assert job["state"] == "succeeded", job
-        found: dict[str, Any] = self.get(f"/v1/photos/{photo['id']}")
-        return found
+        return self.get(f"/v1/photos/{photo['id']}")
 
 
 @contextmanager
@@ -175,13 +165,9 @@ def served(settings: Settings) -> Iterator[int]:
         listener.close()
 
 
+@cache
 def scene(seed: int, height: int = SHAPE[0], width: int = SHAPE[1]) -> NDArray[np.float64]:
     """Rectangles of all sizes over each other, not to be changed: sharp edges everywhere, and no period."""
-    return _drawn(seed, height, width)
-
-
-@cache
-def _drawn(seed: int, height: int, width: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     rows, cols = np.mgrid[0:height, 0:width]
     picture = np.full((height, width), 0.4)

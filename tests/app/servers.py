@@ -11,13 +11,13 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
 import httpx2
 import pytest
+from deadline import until
 
 NETWORK = "10.77.0.0/16"
 """Of the hosts that tests make: any private network that nobody uses here."""
@@ -26,15 +26,23 @@ ACCOUNT = "postgres"
 """The server refuses to run as root; Debian's package brings this account."""
 
 
+SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
 def free_port() -> int:
     with contextlib.closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+        return probe.getsockname()[1]
 
 
-SMALL_LOG = ("--wal-segsize=1",)
-"""MiB of each file of its log: small, so that a full disk is felt at once."""
+def environment_of_s3(address: str) -> dict[str, str]:
+    return {
+        "AWS_ENDPOINT_URL": f"http://{address}",
+        "AWS_ALLOW_HTTP": "true",
+        "AWS_REGION": "us-east-1",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+    }
 
 
 class Postgres:
@@ -42,21 +50,14 @@ class Postgres:
 
     def __init__(self, programs: Path, folder: Path, addresses: str = "127.0.0.1") -> None:
         self._programs, self._folder, self.port = programs, folder, free_port()
-        self._addresses = addresses
+        self._addresses, self._data = addresses, folder / "data"
         self._as = {"user": ACCOUNT} if os.geteuid() == 0 else {}
         if self._as:
             shutil.chown(folder, ACCOUNT)
-        self._run(
-            "initdb",
-            "--auth=trust",
-            "--username=lens",
-            "--no-sync",
-            *SMALL_LOG,
-            "--pgdata",
-            str(folder / "data"),
-        )
-
-        with (folder / "data" / "pg_hba.conf").open("a") as rules:
+        # small files of its log, so that a full disk is felt at once
+        options = ("--auth=trust", "--username=lens", "--no-sync", "--wal-segsize=1")
+        self._run("initdb", *options, "--pgdata", str(self._data))
+        with (self._data / "pg_hba.conf").open("a") as rules:
             rules.write(f"host all all {NETWORK} trust\n")
 
     def url(self, name: str, host: str = "127.0.0.1") -> str:
@@ -64,13 +65,12 @@ class Postgres:
 
     def start(self) -> None:
         options = f"-p {self.port} -h {self._addresses} -k {self._folder} -c fsync=off"
-        data, log = str(self._folder / "data"), str(self._folder / "log")
-        self._run("pg_ctl", "-D", data, "-l", log, "-w", "-t", "120", "-o", options, "start")
+        self._control("-l", str(self._folder / "log"), "-w", "-t", "120", "-o", options, "start")
 
     def start_if_down(self) -> None:
         """Start it where it ended itself, as on a full disk; one that recovers is waited for."""
         try:
-            self._run("pg_ctl", "-D", str(self._folder / "data"), "status")
+            self._control("status")
         except subprocess.CalledProcessError:
             self.start()
 
@@ -80,17 +80,14 @@ class Postgres:
 
     def stop(self) -> None:
         """Cut all connections off, as a crash of the server does."""
-        self._run("pg_ctl", "-D", str(self._folder / "data"), "-m", "immediate", "-w", "stop")
+        self._control("-m", "immediate", "-w", "stop")
+
+    def _control(self, *arguments: str) -> None:
+        self._run("pg_ctl", "-D", str(self._data), *arguments)
 
     def _run(self, program: str, *arguments: str) -> None:
-        subprocess.run(
-            [str(self._programs / program), *arguments],
-            check=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            cwd=self._folder,
-            **self._as,  # type: ignore[call-overload]  # no user, or a name
-        )
+        command = [str(self._programs / program), *arguments]
+        subprocess.run(command, check=True, cwd=self._folder, **self._as, **SILENT)
 
 
 class Moto:
@@ -98,31 +95,18 @@ class Moto:
 
     def __init__(self, bucket: str, address: str = "127.0.0.1") -> None:
         self.port = free_port()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "moto.server", "-H", address, "-p", str(self.port)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        end = time.monotonic() + 120.0
-        while True:
+        command = [sys.executable, "-m", "moto.server", "-H", address, "-p", str(self.port)]
+        self.process = subprocess.Popen(command, **SILENT)
+
+        def begun() -> bool:
             with contextlib.suppress(httpx2.HTTPError):
-                httpx2.put(f"http://127.0.0.1:{self.port}/{bucket}", timeout=5.0).raise_for_status()
-                return
-            assert time.monotonic() < end, "moto does not start"
-            time.sleep(0.2)
+                return httpx2.put(f"http://127.0.0.1:{self.port}/{bucket}", timeout=5.0).is_success
+            return False
 
-    @property
-    def environment(self) -> dict[str, str]:
-        return self.environment_at("127.0.0.1")
+        until(begun)
 
-    def environment_at(self, host: str) -> dict[str, str]:
-        return {
-            "AWS_ENDPOINT_URL": f"http://{host}:{self.port}",
-            "AWS_ALLOW_HTTP": "true",
-            "AWS_REGION": "us-east-1",
-            "AWS_ACCESS_KEY_ID": "test",
-            "AWS_SECRET_ACCESS_KEY": "test",
-        }
+    def environment(self, host: str = "127.0.0.1") -> dict[str, str]:
+        return environment_of_s3(f"{host}:{self.port}")
 
     @contextlib.contextmanager
     def hanging(self) -> Iterator[None]:
@@ -157,29 +141,21 @@ def moto(bucket: str, address: str = "127.0.0.1") -> Iterator[Moto]:
         server.close()
 
 
-def programs_of_postgres() -> Path | None:
-    installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
-    return installed[-1].parent if installed else None
-
-
 @contextlib.contextmanager
 def postgres(addresses: str = "127.0.0.1", folder: Path | None = None) -> Iterator[Postgres]:
     """Give a running server, in an empty folder if one is named; skip the test where none is installed."""
-    programs = programs_of_postgres()
-    if programs is None:
+    installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    if not installed:
         missing("PostgreSQL is not installed (Debian: apt-get install postgresql)")
-    made = folder is None
-    folder = folder or Path(tempfile.mkdtemp(prefix="lensmodel-pg-"))  # short: a socket lies in it
-    try:
-        server = Postgres(programs, folder, addresses)
+    with tempfile.TemporaryDirectory(prefix="lensmodel-pg-") as own:  # short: a socket lies in it
+        server = Postgres(installed[-1].parent, folder or Path(own), addresses)
         server.start()
         server.create("app", "jobs")
-        yield server
-        with contextlib.suppress(subprocess.CalledProcessError):
-            server.stop()
-    finally:
-        if made:
-            shutil.rmtree(folder, ignore_errors=True)
+        try:
+            yield server
+        finally:
+            with contextlib.suppress(subprocess.CalledProcessError):
+                server.stop()
 
 
 def main() -> None:
@@ -189,11 +165,8 @@ def main() -> None:
     """
     bucket = sys.argv[1]
     with postgres() as server, moto(bucket) as store:
-        values = {
-            "LENS_DATABASE_URL": server.url("app"),
-            "LENS_STORAGE_URL": f"s3://{bucket}",
-            **store.environment,
-        }
+        ours = {"LENS_DATABASE_URL": server.url("app"), "LENS_STORAGE_URL": f"s3://{bucket}"}
+        values = ours | store.environment()
         print(*(f"{name}={value}" for name, value in values.items()), sep="\n", flush=True)  # noqa: T201
         sys.stdin.read()
 

@@ -9,7 +9,6 @@ there. All but the erasure of the account, after which nothing would be. Needs t
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -18,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+import programs
 from running import LIGHT, Service, running, write_photo
 
 HERE = Path(__file__).resolve().parent
@@ -47,10 +46,7 @@ def things(service: Service, folder: Path) -> tuple[dict[str, list[str]], list[s
 
 def main() -> int:
     """Run for the time that was asked for; return the status of schemathesis."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=0)
-    wishes = parser.parse_args()
+    wishes = programs.wishes(__doc__, minutes=10.0, seed=0)
     with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "data", LIGHT) as service:
         ids, spare = things(service, Path(folder))
         profile = Path(folder) / "known.lensprofile"

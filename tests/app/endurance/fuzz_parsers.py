@@ -10,8 +10,8 @@ own modules is built upon (coverage by `sys.settrace`).
 
 from __future__ import annotations
 
-import argparse
 import asyncio
+import itertools
 import json
 import random
 import sys
@@ -25,6 +25,7 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+import programs
 from PIL import Image
 from starlette.requests import Request
 
@@ -77,12 +78,8 @@ def write_seeds(folder: Path) -> None:
     """Write a small valid file of each kind."""
     rng = np.random.default_rng(0)
     mosaic = rng.integers(512, 9000, (96, 128), dtype=np.uint16)
-    metadata = PhotoMetadata(
-        camera_maker="Test",
-        camera_model="T-1",
-        lens=LensIdentity("Test", "50mm", "1", "exif"),
-        aperture=2.0,
-    )
+    lens = LensIdentity("Test", "50mm", "1", "exif")
+    metadata = PhotoMetadata(camera_maker="Test", camera_model="T-1", lens=lens, aperture=2.0)
     write_bayer_dng(folder / "a.dng", mosaic, black=512, white=15512, metadata=metadata)
     picture = Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
     exif = Image.Exif()
@@ -93,9 +90,8 @@ def write_seeds(folder: Path) -> None:
         PsfSample(gaussian(15, np.eye(2)), FieldPosition(r, 0.3), LensSettings(2.8, 35.0), photo="x")
         for r in (0.1, 0.5, 0.9)
     ]
-    save_profile(
-        folder / "a.lensprofile", LensProfile(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
-    )
+    profile = LensProfile(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
+    save_profile(folder / "a.lensprofile", profile)
     (folder / "encoded").write_bytes(b"\x00" + rng.bytes(1024))
     (folder / "multipart").write_bytes(
         b'--lens\r\nContent-Disposition: form-data; name="aperture"\r\n\r\n2.8\r\n'
@@ -142,44 +138,46 @@ class Lines:
         name = frame.f_code.co_filename
         if "lensmodel" not in name and "/app/" not in name:
             return None
-        if event == "line":
-            place = (name, frame.f_lineno)
-            if place not in self.known:
-                self.known.add(place)
-                self.fresh = True
+        place = (name, frame.f_lineno)
+        if event == "line" and place not in self.known:
+            self.known.add(place)
+            self.fresh = True
         return self.trace
+
+
+def fault_of(reader: Reader, path: Path, lines: Lines) -> str:
+    """Let a reader read a file; return what went wrong, empty if nothing did."""
+    began, lines.fresh = time.monotonic(), False
+    sys.settrace(lines.trace)
+    try:
+        reader(path)
+    except LensModelError:
+        pass
+    except Exception:  # noqa: BLE001 - whatever else it is, is what we look for
+        return traceback.format_exc()
+    finally:
+        sys.settrace(None)
+    took = time.monotonic() - began
+    return f"took {took:.0f} s" if took > SLOW_S else ""
 
 
 def rounds(minutes: float, seed: int, keep: Path) -> Iterator[tuple[str, Path, str]]:
     """Feed for some minutes; give each fault as reader, file and reason; print a summary at the end."""
-    rng = random.Random(seed)
-    lines, done = Lines(), Counter[str]()
+    rng, lines, done = random.Random(seed), Lines(), Counter[str]()
     with tempfile.TemporaryDirectory() as scratch:
         seeds = Path(scratch)
         write_seeds(seeds)
         pools = {name: [(seeds / file).read_bytes()] for name, (file, _) in READERS.items()}
         every = [pool[0] for pool in pools.values()]
+        names = itertools.cycle(READERS)
         end = time.monotonic() + 60.0 * minutes
-        names = list(READERS)
         while time.monotonic() < end:
-            name = names[sum(done.values()) % len(names)]
+            name = next(names)
             file, reader = READERS[name]
             data = damaged(rng.choice(pools[name]), every, rng)
             path = seeds / f"try-{file}"
             path.write_bytes(data)
-            began, reason = time.monotonic(), ""
-            lines.fresh = False
-            sys.settrace(lines.trace)
-            try:
-                reader(path)
-            except LensModelError:
-                pass
-            except Exception:  # noqa: BLE001 - whatever else it is, is what we look for
-                reason = traceback.format_exc()
-            finally:
-                sys.settrace(None)
-            if time.monotonic() - began > SLOW_S:
-                reason = f"took {time.monotonic() - began:.0f} s"
+            reason = fault_of(reader, path, lines)
             done[name] += 1
             if lines.fresh:
                 pools[name] = [pools[name][0], *pools[name][1:][-POOL:], data]
@@ -193,11 +191,7 @@ def rounds(minutes: float, seed: int, keep: Path) -> Iterator[tuple[str, Path, s
 
 def main() -> int:
     """Run for the time that was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, default=Path("bench-output/fuzz"))
-    wishes = parser.parse_args()
+    wishes = programs.wishes(__doc__, minutes=10.0, seed=0, keep=Path("bench-output/fuzz"))
     faults = Counter[str]()
     for name, path, reason in rounds(wishes.minutes, wishes.seed, wishes.keep):
         last = reason.strip().splitlines()[-1]

@@ -11,7 +11,6 @@ must level off too: they are printed every tenth of the time. At the end everyth
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -23,10 +22,13 @@ import tempfile
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx2
+import programs
+from running import LIGHT, Service, running, write_photo
 from sqlalchemy import func, select
 
 from app.blobs.storage import Storage
@@ -35,22 +37,8 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.tables import PhotoRow, SampleRow
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from running import LIGHT, Service, running, write_photo
-
 SCENES = 6
 PATIENCE_S = 600.0
-COLUMNS = (
-    "minute",
-    "answers",
-    "rss_mb",
-    "open_files",
-    "files",
-    "photos",
-    "samples",
-    "psf_p50_ms",
-    "psf_p99_ms",
-)
 
 
 class Load:
@@ -65,7 +53,7 @@ class Load:
         self.psf_ms: deque[float] = deque(maxlen=2000)
         self.known: deque[str] = deque()
 
-    def run(self, deed: Any, pause_s: float) -> None:
+    def run(self, deed: Callable[[httpx2.Client], None], pause_s: float) -> None:
         """Do one thing again and again until the end."""
         with httpx2.Client(timeout=60.0) as http:
             while not self.stop.is_set():
@@ -105,13 +93,11 @@ class Load:
     def change(self, http: httpx2.Client) -> None:
         """Cancel, retry, exclude or include some photo."""
         photo = self.rng.choice(list(self.known))
-        deed = self.rng.randrange(4)
-        if deed == 0:
-            self.ask(http, "POST", f"/v1/jobs/{photo}/cancel")
-        elif deed == 1:
-            self.ask(http, "POST", f"/v1/jobs/{photo}/retry")
+        deed = self.rng.choice(["cancel", "retry", True, False])
+        if isinstance(deed, str):
+            self.ask(http, "POST", f"/v1/jobs/{photo}/{deed}")
         else:
-            self.ask(http, "PATCH", f"/v1/photos/{photo}", json={"excluded": deed == 2})
+            self.ask(http, "PATCH", f"/v1/photos/{photo}", json={"excluded": deed})
 
     def correct(self, http: httpx2.Client) -> None:
         """Ask for the correction of some photo."""
@@ -124,70 +110,70 @@ class Load:
         with contextlib.suppress(OSError, ValueError, TypeError):  # between two lives
             os.kill(self.service.info()[name], signal.SIGKILL)
             self.answers[f"killed {'worker' if name == 'worker_pid' else 'api'}"] += 1
-        assert self.service.process is not None
         self.service.process.wait()
         self.service.start()
 
+    def measured(self, store: Store, minute: float) -> dict[str, Any]:
+        """Return one row of the table."""
+        memory, handles = 0, 0
+        for pid in self.service.info().values():
+            with contextlib.suppress(OSError, ValueError, StopIteration):
+                status = Path(f"/proc/{int(pid)}/status").read_text().splitlines()
+                memory += int(next(line for line in status if line.startswith("VmRSS")).split()[1])
+                handles += len(list(Path(f"/proc/{int(pid)}/fd").iterdir()))
+        times = sorted(self.psf_ms) or [0.0]
+        self.psf_ms.clear()
+        with store.database.reading() as session:
+            rows = {table: session.scalar(select(func.count(table.id))) for table in (PhotoRow, SampleRow)}
+        return {
+            "minute": round(minute, 1),
+            "answers": sum(self.answers.values()),
+            "rss_mb": memory // 1024,
+            "open_files": handles,
+            "files": sum(1 for _ in self.service.data.rglob("*")),
+            "photos": rows[PhotoRow],
+            "samples": rows[SampleRow],
+            "psf_p50_ms": round(statistics.median(times), 1),
+            "psf_p99_ms": round(times[int(0.99 * (len(times) - 1))], 1),
+        }
 
-def measured(load: Load, store: Store, minute: float) -> dict[str, Any]:
-    """Return one row of the table."""
-    memory, handles = 0, 0
-    for pid in load.service.info().values():
-        with contextlib.suppress(OSError, ValueError, StopIteration):
-            status = Path(f"/proc/{int(pid)}/status").read_text().splitlines()
-            memory += int(next(line for line in status if line.startswith("VmRSS")).split()[1])
-            handles += len(list(Path(f"/proc/{int(pid)}/fd").iterdir()))
-    times = sorted(load.psf_ms) or [0.0]
-    load.psf_ms.clear()
-    with store.database.reading() as session:
-        photos, samples = (
-            session.scalar(select(func.count()).select_from(table)) for table in (PhotoRow, SampleRow)
-        )
-    numbers = (
-        *(round(minute, 1), sum(load.answers.values()), memory // 1024, handles),
-        *(sum(1 for _ in load.service.data.rglob("*")), photos, samples),
-        *(round(statistics.median(times), 1), round(times[int(0.99 * (len(times) - 1))], 1)),
-    )
-    return dict(zip(COLUMNS, numbers, strict=True))
+    def last(self, store: Store, minutes: float, kill_every_s: float) -> None:
+        """Go on for some minutes; print what there is every tenth of them."""
+        began, killed, printed = time.monotonic(), time.monotonic(), 0
+        while (now := time.monotonic()) - began < 60 * minutes:
+            if now - killed > kill_every_s:
+                killed = now
+                self.kill()
+            if now - began > printed * 6 * minutes:
+                row = self.measured(store, (now - began) / 60)
+                if not printed:
+                    print(" ".join(f"{name:>10}" for name in row), flush=True)
+                print(" ".join(f"{value:>10}" for value in row.values()), flush=True)
+                printed += 1
+            time.sleep(1.0)
 
 
 def main() -> int:
     """Run for the time that was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--photos", type=int, default=40)
-    parser.add_argument("--kill-every", type=float, default=60.0, metavar="SECONDS")
-    parser.add_argument("--seed", type=int, default=0)
-    wishes = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
+    wanted = programs.wishes(__doc__, minutes=60.0, photos=40, kill_every=60.0, seed=0)
+    with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "data", LIGHT) as service:
         scenes = [write_photo(Path(folder) / f"{k}.dng", k).read_bytes() for k in range(SCENES)]
-        with running(Path(folder) / "data", LIGHT) as service:
-            settings = Settings(data_dir=service.data, min_free_mb=0)
-            store = Store(settings)
-            load = Load(service, scenes, wishes.photos, wishes.seed)
-            deeds = [(load.upload, 12.0), (load.query, 0.1), (load.change, 4.0), (load.correct, 10.0)]
-            threads = [threading.Thread(target=load.run, args=deed) for deed in deeds]
-            for thread in threads:
-                thread.start()
-            began, killed, table = time.monotonic(), time.monotonic(), []
-            print(" ".join(f"{name:>10}" for name in COLUMNS), flush=True)
-            while time.monotonic() - began < 60 * wishes.minutes:
-                time.sleep(1.0)
-                if time.monotonic() - killed > wishes.kill_every:
-                    killed = time.monotonic()
-                    load.kill()
-                if time.monotonic() - began > len(table) * 6 * wishes.minutes:
-                    table.append(measured(load, store, (time.monotonic() - began) / 60))
-                    print(" ".join(f"{value:>10}" for value in table[-1].values()), flush=True)
-            load.stop.set()
-            for thread in threads:
-                thread.join()
-            end = time.monotonic() + PATIENCE_S
-            while any(store.jobs.load()[0].values()) and time.monotonic() < end:
-                time.sleep(1.0)
-            unsettled = sum(store.jobs.load()[0].values())
-            findings = examine(settings, store, Storage(settings.storage))
-            store.close()
+        settings = Settings(data_dir=service.data, min_free_mb=0)
+        store = Store(settings)
+        load = Load(service, scenes, wanted.photos, wanted.seed)
+        deeds = [(load.upload, 12.0), (load.query, 0.1), (load.change, 4.0), (load.correct, 10.0)]
+        threads = [threading.Thread(target=load.run, args=deed) for deed in deeds]
+        for thread in threads:
+            thread.start()
+        load.last(store, wanted.minutes, wanted.kill_every)
+        load.stop.set()
+        for thread in threads:
+            thread.join()
+        end = time.monotonic() + PATIENCE_S
+        while (unsettled := sum(store.jobs.load()[0].values())) and time.monotonic() < end:
+            time.sleep(1.0)
+        findings = examine(settings, store, Storage(settings.storage))
+        store.close()
     print(json.dumps({"answers": dict(load.answers), "unfinished": unsettled, "faults": load.faults[:5]}))
     print("\n".join(f"{finding.check}: {finding.subject}: {finding.says}" for finding in findings))
     print(f"{len(load.faults)} answers of 500, {unsettled} jobs left, {len(findings)} findings")

@@ -12,7 +12,6 @@ exact numbers of photos, samples and versions. Disks are filled where this may m
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import random
@@ -28,30 +27,28 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
+from unittest import mock
 
+import programs
+from crew import CELLS, CHANNELS, Crew, databases, pause, states
+from deadline import stretched
 from obstore.exceptions import BaseError
+from servers import Postgres, moto, postgres
+from small_disk import kept_full, small_disk
 from sqlalchemy import exc, func, select
+from uploads import send
 
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-
-from crew import CELLS, CHANNELS, Crew, databases, pause, states  # noqa: E402 - of the tests of the service
-from deadline import stretched  # noqa: E402
-from servers import Postgres, moto, postgres  # noqa: E402
-from small_disk import kept_full, small_disk  # noqa: E402
-from uploads import receive  # noqa: E402
-
-from app.blobs.storage import Storage  # noqa: E402
-from app.errors import BusyError  # noqa: E402
-from app.runtime.doctor import examine  # noqa: E402
-from app.runtime.settings import Settings  # noqa: E402
-from app.store import Store  # noqa: E402
-from app.store.database import new_id, upgrade  # noqa: E402
-from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow  # noqa: E402
+from app.blobs.storage import Storage
+from app.errors import BusyError
+from app.runtime.doctor import examine
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.database import upgrade
+from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 
 OWNERS = ("one", "two")
-PHOTO = b"a photo"
+Spell: TypeAlias = Callable[[], contextlib.AbstractContextManager[None]]
 
 
 @dataclass(frozen=True)
@@ -76,15 +73,12 @@ class Victims(Crew):
         self.kill(chance.choice(self.processes), group=chance.random() < 0.5)
         self.hire()
 
-    @contextlib.contextmanager
-    def paused(self, chance: random.Random, files: list[Path]) -> Iterator[None]:
+    def pause_one(self, chance: random.Random, files: list[Path], for_s: float) -> None:
         """Pause one of them, outside of transactions: with the lock of a file it would stop all of them."""
         pid = chance.choice(self.processes).pid
         pause(pid, files)
-        try:
-            yield
-        finally:
-            os.kill(pid, signal.SIGCONT)
+        time.sleep(for_s)
+        os.kill(pid, signal.SIGCONT)
 
     def replace_the_dead(self) -> None:
         """Hire for those that ended themselves: fenced, or without their database for a lease."""
@@ -123,9 +117,6 @@ def cramped(server: Postgres, disk: Path) -> Iterator[None]:
     server.start_if_down()
 
 
-Spell: TypeAlias = Callable[[], contextlib.AbstractContextManager[None]]
-
-
 @dataclass(frozen=True)
 class Installation:
     """Settings, what the environment of workers holds besides, and what outages and full disks can be."""
@@ -141,11 +132,13 @@ def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
     with contextlib.ExitStack() as stack:
         disk = folder / "disk"
         disk.mkdir()
-        small = stack.enter_context(small_disk(disk, 128))
-        common = {"data_dir": disk / "data", "lease_seconds": 4.0, "worker_slots": 2}
-        full: list[Spell] = [lambda: kept_full(disk)] if small else []
+        common: dict[str, Any] = {"data_dir": disk / "data", "lease_seconds": 4.0, "worker_slots": 2}
+        common["min_free_mb"] = 0
+        full: list[Spell] = []
+        if stack.enter_context(small_disk(disk, 128)):
+            full.append(lambda: kept_full(disk))
         if not servers:
-            settings = Settings(**common, min_free_mb=0)  # type: ignore[arg-type]  # checked by pydantic
+            settings = Settings(**common)
             yield Installation(settings, {}, [lambda: folder_away(settings)], full)
             return
         cluster = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmodel-pg-")))
@@ -153,73 +146,97 @@ def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
         server = stack.enter_context(postgres(folder=cluster))
         if small:
             full.append(lambda: cramped(server, cluster))
-        store = stack.enter_context(moto("torture"))
-        stack.enter_context(in_environment(store.environment))
-        settings = Settings(
-            **common,  # type: ignore[arg-type]  # checked by pydantic
-            min_free_mb=0,
-            database_url=server.url("app"),
-            storage_url="s3://torture",
-            storage_seconds=3.0,
-        )
-        yield Installation(settings, store.environment, [lambda: crashed(server), store.hanging], full)
+        s3 = stack.enter_context(moto("torture"))
+        stack.enter_context(mock.patch.dict(os.environ, s3.environment()))
+        addresses = {"database_url": server.url("app"), "storage_url": "s3://torture"}
+        settings = Settings(**common, **addresses, storage_seconds=3.0)
+        yield Installation(settings, s3.environment(), [lambda: crashed(server), s3.hanging], full)
 
 
-@contextlib.contextmanager
-def in_environment(values: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+class Torture:
+    """One installation, and what is done to it."""
 
+    def __init__(self, given: Installation, log: Path, chance: random.Random, plan: Plan) -> None:
+        self.given, self.chance, self.plan = given, chance, plan
+        self.settings = given.settings
+        self.settings.data_dir.mkdir(parents=True)
+        self.store, self.storage = Store(self.settings), Storage(self.settings.storage)
+        upgrade(self.store.database)
+        self.crew, self.ended = Victims(self.settings, log, given.extra), threading.Event()
 
-def send_late(
-    store: Store, storage: Storage, number: int, chance: random.Random, ended: threading.Event
-) -> None:
-    """Send a photo whose upload takes so long that it is due for deletion, until one is accepted."""
-    while not ended.is_set():
-        try:
-            send(store, storage, number, within=timedelta(hours=-2), pause_s=chance.uniform(0.0, 1.0))
-        except (BusyError, exc.DBAPIError, BaseError, OSError):
-            time.sleep(0.2)
+    def close(self) -> None:
+        self.ended.set()
+        self.crew.close()
+        self.store.close()
+
+    def send(self, number: int, **how: Any) -> None:
+        send(self.store, self.storage, number, owner=OWNERS[number % len(OWNERS)], **how)
+
+    def send_late(self, numbers: range, chance: random.Random) -> None:
+        """Send photos whose uploads take so long that they are due for deletion, until each is accepted."""
+        for number in numbers:
+            while not self.ended.is_set():
+                try:
+                    self.send(number, within=timedelta(hours=-2), pause_s=chance.uniform(0.0, 1.0))
+                except (BusyError, exc.DBAPIError, BaseError, OSError):
+                    time.sleep(0.2)
+                else:
+                    break
+
+    def do(self, deed: str, files: list[Path]) -> None:
+        """Let one thing happen."""
+        crew, chance = self.crew, self.chance
+        time.sleep(chance.uniform(0.2, 1.5))
+        if deed == "kill":
+            crew.lose_one(chance)
+        elif deed == "pause":
+            crew.pause_one(chance, files, self.settings.lease_seconds + 2.0)
+        elif deed == "outage":
+            with chance.choice(self.given.outages)():
+                time.sleep(chance.uniform(1.0, 5.0))
         else:
-            return
+            with chance.choice(self.given.full_disks)():
+                time.sleep(chance.uniform(0.5, 2.5))
+                crew.lose_one(chance)  # the next one starts without room
+                time.sleep(chance.uniform(0.5, 2.5))
+        crew.replace_the_dead()
 
+    def settle(self, is_all_sent: Callable[[], bool]) -> None:
+        """Wait until all photos are counted."""
+        end = time.monotonic() + stretched(self.plan.patience_s)
+        while not is_all_sent() or set(states(self.store)) != {"counted"}:
+            self.crew.replace_the_dead()
+            now = set(states(self.store))
+            assert not now & {"failed", "cancelled", "needs_lens"}, f"{self.said()}\n{self.faults()}"
+            assert time.monotonic() < end, f"{states(self.store)}\n{self.crew.log.read_text()[-4000:]}"
+            time.sleep(0.2)
 
-def send(
-    store: Store,
-    storage: Storage,
-    number: int,
-    *,
-    within: timedelta = timedelta(minutes=1),
-    pause_s: float = 0.0,
-) -> None:
-    public_id = new_id()
-    store.photos.expect(f"photos/{public_id}/", within=within)
-    storage.put(f"photos/{public_id}/original", PHOTO)
-    time.sleep(pause_s)
-    receive(
-        store, public_id, owner=OWNERS[number % len(OWNERS)], sha256=f"{number:064x}", byte_size=len(PHOTO)
-    )
+    def said(self) -> list[str]:
+        """Return how photos are, with the reasons of those that ended."""
+        with self.store.database.reading() as session:
+            rows = session.execute(select(PhotoRow.state, PhotoRow.error_code, PhotoRow.error_detail))
+            return [" ".join(filter(None, row)) for row in rows]
 
+    def faults(self) -> str:
+        """Return what the last two tasks printed that crashed, tracebacks and all."""
+        parts = re.split(r"(?m)^.* ERROR .* app\.sandbox\.runner: ", self.crew.log.read_text())[1:]
+        return "\n".join(part[:1500] for part in parts[-2:])
 
-def said(store: Store) -> list[str]:
-    """Return how photos are, with the reasons of those that ended."""
-    with store.database.reading() as session:
-        rows = session.execute(select(PhotoRow.state, PhotoRow.error_code, PhotoRow.error_detail))
-        return [" ".join(filter(None, row)) for row in rows]
-
-
-def faults(log: Path) -> str:
-    """Return what the last two tasks printed that crashed, tracebacks and all."""
-    parts = re.split(r"^.* ERROR .* app\.sandbox\.runner: ", log.read_text(), flags=re.MULTILINE)[1:]
-    return "\n".join(part[:1500] for part in parts[-2:])
+    def check(self) -> None:
+        findings = examine(self.settings, self.store, self.storage, deep=False)
+        assert not [finding for finding in findings if finding.check != "work"], findings
+        with self.store.database.reading() as session:
+            samples = session.scalar(select(func.count()).select_from(SampleRow))
+            photos = session.scalar(select(func.count()).select_from(PhotoRow))
+            lenses = session.execute(
+                select(OwnerRow.name, LensRow.version, LensRow.photo_count, LensRow.sample_count)
+                .join(LensRow, LensRow.owner_id == OwnerRow.id)
+                .order_by(OwnerRow.name)
+            ).all()
+        each = self.plan.photos // len(OWNERS)
+        assert (photos, samples) == (self.plan.photos, self.plan.photos * CELLS * CHANNELS), lenses
+        found = [tuple(lens) for lens in lenses]
+        assert found == [(owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS], found
 
 
 def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None) -> str:
@@ -231,101 +248,42 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         If anything was lost, counted twice, or seen by another owner.
     """
     plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
-    ended = threading.Event()
     with contextlib.ExitStack() as stack:
         given = stack.enter_context(installation(folder, servers=servers))
-        settings = given.settings
-        settings.data_dir.mkdir(parents=True)
-        store, storage = Store(settings), Storage(settings.storage)
-        upgrade(store.database)
-        crew = Victims(settings, folder / "workers.log", given.extra)
-        full_disks = plan.full_disks if given.full_disks else 0
-        try:
-            for number in range(plan.photos - plan.late):
-                send(store, storage, number)
-            numbers = range(plan.photos - plan.late, plan.photos)
-            chances = [random.Random(chance.random()) for _ in numbers]
-            each = zip(numbers, chances, strict=True)
-            late = stack.enter_context(ThreadPoolExecutor(1)).submit(
-                lambda: [send_late(store, storage, *one, ended) for one in each]
-            )
-            for _ in range(plan.workers):
-                crew.hire()
-            deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
-            deeds += ["pause"] * plan.pauses
-            files = [] if servers else databases(settings)
-            chance.shuffle(deeds)
-            for deed in deeds:
-                time.sleep(chance.uniform(0.2, 1.5))
-                if deed == "kill":
-                    crew.lose_one(chance)
-                elif deed == "pause":
-                    with crew.paused(chance, files):
-                        time.sleep(settings.lease_seconds + 2.0)
-                elif deed == "outage":
-                    with chance.choice(given.outages)():
-                        time.sleep(chance.uniform(1.0, 5.0))
-                else:
-                    with chance.choice(given.full_disks)():
-                        time.sleep(chance.uniform(0.5, 2.5))
-                        crew.lose_one(chance)  # the next one starts without room
-                        time.sleep(chance.uniform(0.5, 2.5))
-                crew.replace_the_dead()
-            end = time.monotonic() + stretched(plan.patience_s)
-            while not late.done() or (now := set(states(store))) != {"counted"}:
-                now = set(states(store))
-                crew.replace_the_dead()
-                assert not now & {"failed", "cancelled", "needs_lens"}, f"{said(store)}\n{faults(crew.log)}"
-                assert time.monotonic() < end, f"{states(store)}\n{crew.log.read_text()[-4000:]}"
-                time.sleep(0.2)
-            late.result()  # what it did not foresee
-            check(settings, store, storage, plan)
-        finally:
-            ended.set()
-            crew.close()
-            store.close()
+        late_thread = stack.enter_context(ThreadPoolExecutor(1))
+        work = stack.enter_context(contextlib.closing(Torture(given, folder / "workers.log", chance, plan)))
+        on_time, full_disks = plan.photos - plan.late, plan.full_disks if given.full_disks else 0
+        for number in range(on_time):
+            work.send(number)
+        late = late_thread.submit(work.send_late, range(on_time, plan.photos), random.Random(chance.random()))
+        for _ in range(plan.workers):
+            work.crew.hire()
+        deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
+        deeds += ["pause"] * plan.pauses
+        chance.shuffle(deeds)
+        for deed in deeds:
+            work.do(deed, [] if servers else databases(given.settings))
+        work.settle(late.done)
+        late.result()  # what it did not foresee
+        work.check()
     return (
         f"seed {seed}: {plan.photos} of {plan.photos} photos counted once, "
         f"{plan.photos * CELLS * CHANNELS} samples, {plan.kills} kills, {plan.outages} outages, "
-        f"{plan.pauses} pauses, {full_disks} full disks, "
-        f"{time.monotonic() - began:.0f} s"
+        f"{plan.pauses} pauses, {full_disks} full disks, {time.monotonic() - began:.0f} s"
     )
 
 
-def check(settings: Settings, store: Store, storage: Storage, plan: Plan) -> None:
-    findings = examine(settings, store, storage, deep=False)
-    assert not [finding for finding in findings if finding.check != "work"], findings
-    with store.database.reading() as session:
-        samples = session.scalar(select(func.count()).select_from(SampleRow))
-        photos = session.scalar(select(func.count()).select_from(PhotoRow))
-        lenses = session.execute(
-            select(OwnerRow.name, LensRow.version, LensRow.photo_count, LensRow.sample_count)
-            .join(LensRow, LensRow.owner_id == OwnerRow.id)
-            .order_by(OwnerRow.name)
-        ).all()
-    each = plan.photos // len(OWNERS)
-    found = [tuple(lens) for lens in lenses]
-    said = f"{samples} samples, {photos} photos, lenses {found}"
-    assert photos == plan.photos, said
-    assert samples == plan.photos * CELLS * CHANNELS, said
-    assert found == [(owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS], said
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--servers", action="store_true", help="PostgreSQL and S3 instead of files")
-    wishes = parser.parse_args()
+    wanted = programs.wishes(__doc__, seeds=20, first=0, servers=False)
     failed = 0
-    for seed in range(wishes.first, wishes.first + wishes.seeds):
+    for seed in range(wanted.first, wanted.first + wanted.seeds):
         with tempfile.TemporaryDirectory(prefix="lensmodel-torture-") as folder:
             try:
-                print(torture(Path(folder), seed, servers=wishes.servers), flush=True)
+                print(torture(Path(folder), seed, servers=wanted.servers), flush=True)
             except AssertionError as error:
                 failed += 1
                 print(f"seed {seed}: FAILED: {error}", flush=True)
-    print(f"{wishes.seeds - failed} of {wishes.seeds} seeds passed")
+    print(f"{wanted.seeds - failed} of {wanted.seeds} seeds passed")
     return 1 if failed else 0
 
 

@@ -11,18 +11,17 @@ import random
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import httpx2
 import pytest
-from deadline import Deadline, stretched
-from quick_tasks import CELLS
+from crew import CELLS, CHANNELS, WORKER, quick, states
+from deadline import stretched, until
 from servers import missing, moto, postgres
 from sqlalchemy import select, text
-from torture import in_environment
 
 from app.blobs.storage import Storage
 from app.runtime.doctor import examine
@@ -30,33 +29,34 @@ from app.runtime.settings import Settings
 from app.store import Store
 from app.store.database import Database, upgrade
 from app.store.owners import ensure_owner
-from app.store.tables import PhotoRow, SampleRow
+from app.store.tables import SampleRow
 
-HERE = Path(__file__).parents[1]
-STAND_INS = HERE / "stand_ins"
 PATIENCE_S = 240.0
 LEASE_S = 5.0
 FENCED = 70
 API_PORT = 8000
-BUCKET = "lenses"
+SETTINGS: dict[str, Any] = {
+    "storage_url": "s3://lenses",
+    "storage_seconds": 5.0,
+    "lease_seconds": LEASE_S,
+    "worker_slots": 2,
+    "min_free_mb": 0,
+}
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+ENVIRONMENT.setdefault("PYTHONPATH", str(Path(__file__).parents[3]))
 
 pytestmark = [pytest.mark.slow, pytest.mark.tools]
 
 
-def ip(*words: str) -> str:
-    return subprocess.run(["ip", *words], check=True, capture_output=True, text=True).stdout
+def ip(words: str) -> str:
+    return subprocess.run(["ip", *words.split()], check=True, capture_output=True, text=True).stdout
 
 
 def free_subnet() -> str:
     """Return three numbers of a network that no cable has: another run may be at work, or was killed."""
-    taken = ip("-o", "-4", "addr")
-    return next(
-        net
-        for number in random.sample(
-            range(256), 256
-        )  # not the first: two runs that begin now look at the same
-        if f" {(net := f'10.77.{number}')}." not in taken
-    )
+    taken = ip("-o -4 addr")
+    numbers = random.sample(range(256), 256)  # two runs that begin now look at different ones first
+    return next(net for net in (f"10.77.{number}" for number in numbers) if f" {net}." not in taken)
 
 
 class Host:
@@ -66,95 +66,79 @@ class Host:
         self.name, self.cable = f"lensmodel-{os.getpid()}-{number}", f"lm{os.getpid() % 10**6}n{number}"
         subnet = free_subnet()
         self.gateway, self.address = f"{subnet}.1", f"{subnet}.2"
-        self.data = folder / f"host{number}"
-        self.log = folder / f"host{number}.log"
+        self.data, self.log = folder / f"host{number}", folder / f"host{number}.log"
         self.data.mkdir()
         self.processes: list[subprocess.Popen[bytes]] = []
         far = f"{self.cable}b"
-        ip("netns", "add", self.name)
-        ip("link", "add", self.cable, "type", "veth", "peer", "name", far)
-        ip("link", "set", far, "netns", self.name)
-        ip("addr", "add", f"{self.gateway}/30", "dev", self.cable)
-        ip("link", "set", self.cable, "up")
-        ip("-n", self.name, "addr", "add", f"{self.address}/30", "dev", far)
-        ip("-n", self.name, "link", "set", far, "up")
-        ip("-n", self.name, "link", "set", "lo", "up")
+        ip(f"netns add {self.name}")
+        ip(f"link add {self.cable} type veth peer name {far}")
+        ip(f"link set {far} netns {self.name}")
+        ip(f"addr add {self.gateway}/30 dev {self.cable}")
+        ip(f"link set {self.cable} up")
+        ip(f"-n {self.name} addr add {self.address}/30 dev {far}")
+        ip(f"-n {self.name} link set {far} up")
+        ip(f"-n {self.name} link set lo up")
 
     def run(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+        command = ["ip", "netns", "exec", self.name, *words]
         with self.log.open("a") as log:
-            process = subprocess.Popen(
-                ["ip", "netns", "exec", self.name, sys.executable, *words], env=environment, stderr=log
-            )
-        self.processes.append(process)
-        return process
+            self.processes.append(subprocess.Popen(command, env=environment, stderr=log))
+        return self.processes[-1]
 
     def cut_off(self) -> None:
-        ip("link", "set", self.cable, "down")
+        ip(f"link set {self.cable} down")
 
     def reconnect(self) -> None:
-        ip("link", "set", self.cable, "up")
+        ip(f"link set {self.cable} up")
 
     def close(self) -> None:
         for process in self.processes:
             process.kill()
             process.wait()
-        for words in (("link", "del", self.cable), ("netns", "del", self.name)):
+        for words in (f"link del {self.cable}", f"netns del {self.name}"):
             with contextlib.suppress(subprocess.CalledProcessError):
-                ip(*words)
+                ip(words)
 
 
 @pytest.fixture
 def hosts(tmp_path: Path) -> Iterator[list[Host]]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
         missing("hosts need root and iproute2")
-    made: list[Host] = []
-    try:
-        try:
-            made += [Host(1, tmp_path)]
-        except subprocess.CalledProcessError as error:
-            missing(f"network namespaces cannot be made here: {error.stderr[:200]}")
-        made += [Host(2, tmp_path)]
+    with contextlib.ExitStack() as stack:
+        made: list[Host] = []
+        for number in (1, 2):
+            try:
+                made.append(stack.enter_context(contextlib.closing(Host(number, tmp_path))))
+            except subprocess.CalledProcessError as error:
+                missing(f"network namespaces cannot be made here: {error.stderr[:200]}")
         yield made
-    finally:
-        for host in made:
-            host.close()
 
 
-class Installation:
+def addresses(hosts: list[Host]) -> str:
+    return ",".join(["127.0.0.1", *(host.gateway for host in hosts)])
+
+
+class Site:
     """Both hosts at work, seen from the servers' side."""
 
-    def __init__(self, store: Store, storage: Storage, settings: Settings, hosts: list[Host]) -> None:
-        self.store, self.storage, self.settings, self.hosts = store, storage, settings, hosts
+    def __init__(self, store: Store, settings: Settings, hosts: list[Host]) -> None:
+        self.store, self.settings, self.hosts = store, settings, hosts
         self.workers: list[subprocess.Popen[bytes]] = []
-        key = store.accounts.create_key(
-            "local", ["write"]
-        )  # others can reach these: they do not start without
+        # others can reach these: they do not start without a key
+        key = {"Authorization": f"Bearer {store.accounts.create_key('local', ['write'])}"}
         self.clients = [
-            httpx2.Client(
-                base_url=f"http://{h.address}:{API_PORT}",
-                headers={"Authorization": f"Bearer {key}"},
-                timeout=60.0,
-            )
-            for h in hosts
+            httpx2.Client(base_url=f"http://{h.address}:{API_PORT}", headers=key, timeout=60.0) for h in hosts
         ]
 
-    def until(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + stretched(PATIENCE_S)
-        while not condition():
-            assert time.monotonic() < end, self.logs()
-            time.sleep(0.1)
-
-    def logs(self) -> str:
-        return "\n".join(host.log.read_text()[-3000:] for host in self.hosts)
+    def are_counted(self, least: int | None = None) -> bool:
+        now = states(self.store)
+        return set(now) == {"counted"} if least is None else now.count("counted") >= least
 
     def all_run(self) -> bool:
-        ended = [process.returncode for host in self.hosts for process in host.processes if process.poll()]
-        assert not ended, self.logs()
-        return all(ready(client) for client in self.clients)
-
-    def states(self) -> list[str]:
-        with self.store.database.reading() as session:
-            return list(session.scalars(select(PhotoRow.state)))
+        for host in self.hosts:
+            assert not any(process.poll() for process in host.processes), host.log.read_text()[-3000:]
+        live = self.store.jobs.live(LEASE_S)
+        return all(map(ready, self.clients)) and len(live) == len(self.hosts)
 
     def makers(self) -> set[str]:
         """Return which workers made the samples."""
@@ -165,51 +149,7 @@ class Installation:
         photo = b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + number.to_bytes(4, "big") * 20
         answer = self.clients[host].post("/v1/photos", files={"file": (f"{number}.jpg", photo)})
         assert answer.status_code == 202, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
-
-
-@pytest.fixture
-def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
-    addresses = ",".join(["127.0.0.1", *(host.gateway for host in hosts)])
-    with postgres(addresses) as server, moto(BUCKET, "0.0.0.0") as s3, in_environment(s3.environment):
-        common: dict[str, Any] = {
-            "storage_url": f"s3://{BUCKET}",
-            "storage_seconds": 5.0,
-            "lease_seconds": LEASE_S,
-            "worker_slots": 2,
-            "min_free_mb": 0,
-        }
-        here = Settings(data_dir=tmp_path / "here", database_url=server.url("app"), **common)
-        store = Store(here)
-        upgrade(store.database)
-        site = Installation(store, Storage(here.storage), here, hosts)
-        for host in hosts:
-            variables = {f"LENS_{name.upper()}": str(value) for name, value in common.items()}
-            environment = {
-                **{k: v for k, v in os.environ.items() if not k.startswith("LENS_")},
-                **variables,
-                **s3.environment_at(host.gateway),
-                "LENS_DATA_DIR": str(host.data),
-                "LENS_DATABASE_URL": server.url("app", host.gateway),
-                "LENS_HOST": host.address,
-                "LENS_PORT": str(API_PORT),
-                "LENS_SANDBOX": "try",  # whatever this machine has
-                "LENS_ALLOWED_HOSTS": "localhost",
-                "PYTHONPATH": os.pathsep.join(
-                    [str(STAND_INS), os.environ.get("PYTHONPATH", str(HERE.parents[1]))]
-                ),
-            }
-            host.run(["-m", "lensmodel", "api"], environment)
-            site.workers.append(host.run([str(STAND_INS / "quick_worker.py")], environment))
-        try:
-            site.until(site.all_run)
-            site.until(lambda: len(store.jobs.live(LEASE_S)) == len(hosts))
-            yield site
-        finally:
-            for client in site.clients:
-                client.close()
-            store.close()
+        return answer.json()
 
 
 def ready(client: httpx2.Client) -> bool:
@@ -218,31 +158,60 @@ def ready(client: httpx2.Client) -> bool:
     return False
 
 
-def test_two_hosts_share_the_photos_and_one_may_be_cut_off_and_return(installed: Installation) -> None:
-    first = installed.send(0, 0)
-    installed.until(lambda: installed.states() == ["counted"])
-    seen = installed.clients[1].get(f"/v1/photos/{first['id']}").json()
+@pytest.fixture
+def site(hosts: list[Host], tmp_path: Path) -> Iterator[Site]:
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(postgres(addresses(hosts)))
+        s3 = stack.enter_context(moto("lenses", "0.0.0.0"))
+        stack.enter_context(mock.patch.dict(os.environ, s3.environment()))
+        here = Settings(data_dir=tmp_path / "here", database_url=server.url("app"), **SETTINGS)
+        store = stack.enter_context(contextlib.closing(Store(here)))
+        upgrade(store.database)
+        made = Site(store, here, hosts)
+        for host, client in zip(hosts, made.clients, strict=True):
+            stack.enter_context(client)
+            environment = {
+                **ENVIRONMENT,
+                **{f"LENS_{name.upper()}": str(value) for name, value in SETTINGS.items()},
+                **s3.environment(host.gateway),
+                **quick(ENVIRONMENT),
+                "LENS_DATA_DIR": str(host.data),
+                "LENS_DATABASE_URL": server.url("app", host.gateway),
+                "LENS_HOST": host.address,
+                "LENS_PORT": str(API_PORT),
+                "LENS_SANDBOX": "try",  # whatever this machine has
+                "LENS_ALLOWED_HOSTS": "localhost",
+            }
+            host.run([sys.executable, "-m", "lensmodel", "api"], environment)
+            made.workers.append(host.run(WORKER, environment))
+        until(made.all_run, within_s=PATIENCE_S)
+        yield made
+
+
+def test_two_hosts_share_the_photos_and_one_may_be_cut_off_and_return(site: Site) -> None:
+    first, log = site.send(0, 0), site.hosts[0].log
+    until(site.are_counted, log, PATIENCE_S)
+    seen = site.clients[1].get(f"/v1/photos/{first['id']}").json()
     assert seen["state"] == "counted"  # either API tells of all
 
-    sent = [installed.send(number % 2, number) for number in range(1, 9)]
-    installed.until(lambda: installed.states().count("counted") >= 2)
-    installed.hosts[1].cut_off()
-    installed.until(lambda: set(installed.states()) == {"counted"})  # the other one finishes all
-    alone = len(installed.store.jobs.live(LEASE_S))
-    installed.hosts[1].reconnect()
-    installed.until(lambda: installed.workers[1].poll() is not None)  # late: it must not go on
+    sent = [site.send(number % 2, number) for number in range(1, 9)]
+    until(lambda: site.are_counted(2), log, PATIENCE_S)
+    site.hosts[1].cut_off()
+    until(site.are_counted, log, PATIENCE_S)  # the other one finishes all
+    alone = len(site.store.jobs.live(LEASE_S))
+    site.hosts[1].reconnect()
+    until(lambda: site.workers[1].poll() is not None, log, PATIENCE_S)  # late: it must not go on
 
     photos = 1 + len(sent)
-    assert len(installed.makers()) == 2  # both have worked
+    assert len(site.makers()) == 2  # both have worked
     assert alone == 1
-    assert installed.workers[1].returncode == FENCED
-    assert installed.workers[0].poll() is None
-    installed.until(lambda: ready(installed.clients[1]))  # its API is of use again
-    lens = installed.store.lenses.page("local", before=None, limit=2)
-    assert [(one.version, one.photo_count, one.sample_count) for one in lens] == [
-        (photos, photos, photos * CELLS * 3)
-    ]
-    assert examine(installed.settings, installed.store, installed.storage) == []
+    assert site.workers[1].returncode == FENCED
+    assert site.workers[0].poll() is None
+    until(lambda: ready(site.clients[1]), site.hosts[1].log, PATIENCE_S)  # its API is of use again
+    (lens,) = site.store.lenses.page("local", before=None, limit=2)
+    assert (lens.version, lens.photo_count) == (photos, photos)
+    assert lens.sample_count == photos * CELLS * CHANNELS
+    assert examine(site.settings, site.store, Storage(site.settings.storage)) == []
 
 
 # Holds a row of the first owner in a transaction without end
@@ -260,21 +229,15 @@ with Database(sys.argv[1]).writing() as session:
 
 
 def test_what_a_host_has_locked_is_free_again_once_it_was_cut_off(hosts: list[Host], tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(HERE.parents[1]))}
-    with postgres(",".join(["127.0.0.1", *(host.gateway for host in hosts)])) as server:
-        database = Database(server.url("app"))
+    with postgres(addresses(hosts)) as server, contextlib.closing(Database(server.url("app"))) as database:
         upgrade(database)
         with database.writing() as session:
             ensure_owner(session, "local")
-        held = tmp_path / "held"
-        hosts[0].run(["-c", HOLDS, server.url("app", hosts[0].gateway), str(held)], environment)
-        deadline = Deadline(PATIENCE_S)
-        while not held.exists():
-            assert not deadline.passed(), hosts[0].log.read_text()
-            time.sleep(0.1)
+        held, url = tmp_path / "held", server.url("app", hosts[0].gateway)
+        hosts[0].run([sys.executable, "-c", HOLDS, url, str(held)], ENVIRONMENT)
+        until(held.exists, hosts[0].log, PATIENCE_S)
 
         hosts[0].cut_off()
         with database.writing() as session:
             session.execute(text(f"SET LOCAL lock_timeout = '{stretched(PATIENCE_S):.0f}s'"))
             assert session.connection().execute(text("UPDATE owner SET name = name")).rowcount == 1
-        database.close()

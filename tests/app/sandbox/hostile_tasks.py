@@ -42,7 +42,9 @@ def weight(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 
 def refuse(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    raise NoUsablePatchesError("nothing sharp in this photo; use another one")
+    raise NoUsablePatchesError(
+        "nothing sharp in this photo; use another one" + "x" * arguments.get("more", 0)
+    )
 
 
 def swell(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
@@ -187,8 +189,8 @@ def probe(  # noqa: C901 - one try each
 def sabotage(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, str]:
     """Try to end, slow down or limit other processes; say how far each try came."""
     libc, others = ctypes.CDLL(None, use_errno=True), arguments["pid"]
-    call = {"tkill": (200, 130), "tgkill": (234, 131), "sigqueue": (129, 138), "prlimit": (302, 261)}
-    number = {name: both[os.uname().machine != "x86_64"] for name, both in call.items()}
+    calls = {"tkill": (200, 130), "tgkill": (234, 131), "sigqueue": (129, 138), "prlimit": (302, 261)}
+    number = {name: both[os.uname().machine != "x86_64"] for name, both in calls.items()}
     space = ctypes.create_string_buffer(256)
     tries: dict[str, Callable[[], int]] = {
         "kill": lambda: libc.kill(others, 0),
@@ -324,10 +326,6 @@ def link(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> Non
     (folder / "inner").mkdir()
     (folder / "inner" / "more").symlink_to(Path(arguments["database"]).parent)
     (folder / "inner" / "made").write_text("made")
-
-
-def shout(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    raise NoUsablePatchesError("x" * 1_000_000)
 
 
 TASKS = {name: each for name, each in globals().items() if isinstance(each, FunctionType) and name[0] != "_"}

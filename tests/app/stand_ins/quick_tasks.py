@@ -43,16 +43,9 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
 
 def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+    window = {"row": 0, "size": 8, "score": 1.0}
     patches = [
-        {
-            "row": 0,
-            "col": 8 * k,
-            "size": 8,
-            "r": k / CELLS,
-            "phi": turn,
-            "score": 1.0,
-            "cell": k,
-        }
+        {**window, "col": 8 * k, "r": k / CELLS, "phi": turn, "cell": k}
         for k, turn in enumerate(np.linspace(-3.0, 3.0, CELLS).tolist())
     ]
     return {"patches": patches, "rejected": [], "lateral": None}
@@ -60,12 +53,9 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[int]:
     time.sleep(SECONDS)
-    kernel, name = gaussian(5, np.eye(2)), f"quick-{os.getppid()}"  # its fork server: one of each worker
-    place = FieldPosition(0.0, 0.0)
-    samples = [
-        PsfSample(kernel, place, LensSettings(channel=channel), estimator=name, error=0.1)
-        for channel in CHANNELS
-    ]
+    kernel, place = gaussian(5, np.eye(2)), FieldPosition(0.0, 0.0)
+    about = {"estimator": f"quick-{os.getppid()}", "error": 0.1}  # its fork server: one of each worker
+    samples = [PsfSample(kernel, place, LensSettings(channel=name), **about) for name in CHANNELS]
     write_samples(folder, samples)
     return [arguments["numbers"][0] for _ in samples]
 

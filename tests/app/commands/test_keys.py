@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import httpx2
 import pytest
@@ -39,25 +40,27 @@ def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
     assert "owner anna" in run(tmp_path, "list")[0]
 
 
-def test_what_cannot_be_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="such as 90d; got '3 months'"):
-        run(tmp_path, "create", "--expires", "3 months")
-    with pytest.raises(UsageError, match="owner's name"):
-        run(tmp_path, "create", "--owner", " ")
-    with pytest.raises(InvalidInputError, match="no key begins with abcd2345"):
-        run(tmp_path, "revoke", "abcd2345")
+@pytest.mark.parametrize(
+    ("words", "error", "said"),
+    [
+        ("create --expires 3months", UsageError, "such as 90d; got '3months'"),
+        ("create --owner |", UsageError, "owner's name"),
+        ("revoke abcd2345", InvalidInputError, "no key begins with abcd2345"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(
+    tmp_path: Path, words: str, error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        run(tmp_path, *words.split())
 
 
 def test_the_client_sends_its_key_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    def sent(client: Client) -> str | None:
-        with client:
-            header: str | None = client._http.headers.get("Authorization")
-        return header
+    def sent(**options: Any) -> str | None:
+        with Client(**options) as client:
+            return client._http.headers.get("Authorization")
 
     monkeypatch.delenv("LENS_API_KEY", raising=False)
-    assert sent(Client()) is None
-    assert sent(Client(key="lpk_a")) == "Bearer lpk_a"
+    assert (sent(), sent(key="lpk_a")) == (None, "Bearer lpk_a")
     monkeypatch.setenv("LENS_API_KEY", "lpk_b")
-    assert sent(Client()) == "Bearer lpk_b"
-    assert sent(Client(key="")) is None
-    assert sent(Client(http=httpx2.Client())) is None
+    assert (sent(), sent(key=""), sent(http=httpx2.Client())) == ("Bearer lpk_b", None, None)

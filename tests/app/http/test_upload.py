@@ -103,7 +103,7 @@ MALFORMED = {
     "many-parts": (form(*((f'name="f{k}"', b"") for k in range(40))), FORM),
     "huge-field": (form(('name="lens_model"', b"x" * 100000)), FORM),
     "file-without-a-name": (form(('name="lens_model"', b"x"), ('name="file"', TIFF)), FORM),
-    "twice": (form(('name="aperture"', b"1.4"), ('name="aperture"', b"2")), FORM),
+    "twice": (form(ONE, ('name="aperture"', b"1.4"), ('name="aperture"', b"2")), FORM),
 }
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from lensmodel import measured as measuring
 from lensmodel.blind.sampling import configured
 from lensmodel.calibration import Admit, Calibration
 from lensmodel.cli import files, options
@@ -17,7 +18,6 @@ from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
-from lensmodel.measured import photos as measuring
 from lensmodel.photo import develop
 
 KINDS: Final = ("target", "pair", "points", "edges")
@@ -164,9 +164,7 @@ def _added(
 
 def target(
     context: typer.Context,
-    output: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Name ending in .pdf; without --edges also .png.")
-    ],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf.")],
     edges: Annotated[
         bool, typer.Option("--edges", help="35 dark squares, for `lensmodel measure edges`.")
     ] = False,
@@ -193,7 +191,7 @@ def target(
 
         lensmodel target target.pdf
 
-        lensmodel target target.png --paper a4 --detail 2800
+        lensmodel target target.pdf --paper a4 --detail 2800
 
         lensmodel target squares.pdf --edges --paper letter
 
@@ -206,7 +204,7 @@ def target(
     if detail not in DETAILS:
         raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
     if output.is_dir():
-        raise UsageError(f"{output} is a folder; name a file ending in .pdf{'' if edges else ' or .png'}")
+        raise UsageError(f"{output} is a folder; name a file ending in .pdf")
     files.refuse_existing(output, force=force)
     with files.as_usage():
         if edges:

@@ -1,15 +1,22 @@
-"""PSFs measured on photos made for it, instead of estimated from ordinary ones."""
+"""PSFs measured on photos made for it, instead of estimated from ordinary ones: photos in, samples out."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
-from lensmodel.measured.chart import print_chart
+from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges
-from lensmodel.measured.measurer import MeasuredPsf, Measurer, estimator_of, is_measured, samples_of
-from lensmodel.measured.page import DETAILS, PAPERS, TargetPage, print_target
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, is_measured, samples_of
+from lensmodel.measured.page import DETAILS, PAPERS, TargetPage, print_chart, print_target
 from lensmodel.measured.pair import AperturePair
 from lensmodel.measured.points import Points
 from lensmodel.measured.target import Target
+from lensmodel.photo import LinearPhoto, inspect
 
 methods: Final[Registry[Measurer]] = Registry(
     "way of measuring", {"target": Target, "pair": AperturePair, "points": Points, "edges": SlantedEdges}
@@ -21,10 +28,56 @@ __all__ = [
     "MeasuredPsf",
     "Measurer",
     "TargetPage",
-    "estimator_of",
     "is_measured",
+    "measurements_of",
     "methods",
     "print_chart",
     "print_target",
     "samples_of",
+    "samples_of_developed",
 ]
+
+
+def samples_of_developed(
+    kind: str,
+    photos: Sequence[LinearPhoto],
+    *,
+    photo_id: str,
+    settings: LensSettings | None = None,
+    size: int = 31,
+    on_step: StepHook = ignore_step,
+) -> list[PsfSample]:
+    """Measure the PSF on one photo, or on the two of an aperture pair, the open one first."""
+    method = methods.create(kind)
+    if not photos:
+        raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
+    metadata = photos[0].info.metadata
+    photos[0].info.require_known_turn()
+    metadata.require_aperture(settings)
+    measured = method.measure(photos, size=size, on_step=on_step)
+    return samples_of(measured, method, photos[0], photo_id=photo_id, settings=metadata.settings(settings))
+
+
+def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:
+    """Group photos into measurements: each for itself, or in twos, the wider aperture first."""
+    count = methods.create(kind).photos
+    if not paths or len(paths) % count:
+        remedy = "; give the open photo and the closed one, two different files" if kind == "pair" else ""
+        raise InvalidInputError(
+            f"measuring by {kind} takes {count} photo{'s' * (count > 1)} at a time, got {len(paths)}{remedy}"
+        )
+    groups = [tuple(paths[i : i + count]) for i in range(0, len(paths), count)]
+    return [_by_aperture(group) if count > 1 else group for group in groups]
+
+
+def _by_aperture(group: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Widest aperture first; in the order given where a photo does not say its own."""
+    known = [aperture for path in group if (aperture := inspect(path).metadata.aperture) is not None]
+    if len(known) < len(group):
+        return group
+    if len(set(known)) < len(group):
+        raise InvalidInputError(
+            f"{' and '.join(path.name for path in group)} are both at f/{known[0]:g}; a pair is one photo "
+            "wide open and one closed to about f/8"
+        )
+    return tuple(path for _, path in sorted(zip(known, group, strict=True)))

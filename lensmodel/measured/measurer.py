@@ -64,10 +64,6 @@ class Measurer(Protocol):
         on_step : StepHook
             Called after each place, and now and then before the first one, with nothing done of 1.
 
-        Returns
-        -------
-        list of MeasuredPsf
-
         Raises
         ------
         InvalidInputError
@@ -97,17 +93,12 @@ def samples_of(
             weight=1.0,
             photo=photo_id,
             pixel_pitch_um=photo.info.metadata.pixel_pitch_um,
-            estimator=estimator_of(method),
+            estimator=f"{PREFIX}{method.name}/{method.version}",
             error=psf.error,
             half_diagonal_px=photo.frame.half_diagonal,
         )
         for psf in measured
     ]
-
-
-def estimator_of(method: Measurer) -> str:
-    """Name and version as samples carry them."""
-    return f"{PREFIX}{method.name}/{method.version}"
 
 
 def is_measured(sample: PsfSample) -> bool:

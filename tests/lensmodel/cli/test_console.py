@@ -119,7 +119,7 @@ def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
 
     write_photo(tmp_path / "page.dng", 1, shape=SMALL)
     monkeypatch.setattr(console.time, "monotonic", lambda: now_s[0])
-    monkeypatch.setattr("lensmodel.measured.photos.samples_of_developed", measure)
+    monkeypatch.setattr("lensmodel.measured.samples_of_developed", measure)
     done = lensmodel("measure", "target", "page.dng", "--profile", "a.lensprofile", cwd=tmp_path)
 
     assert "[0:20]   0 % page.dng: finding the page" in done.stderr.splitlines()
@@ -143,7 +143,7 @@ def test_a_measurement_and_its_report_count_the_same_places(
         ]
 
     write_photo(tmp_path / "stars.dng", 1, shape=SMALL)
-    monkeypatch.setattr("lensmodel.measured.photos.samples_of_developed", measure)
+    monkeypatch.setattr("lensmodel.measured.samples_of_developed", measure)
     done = lensmodel("measure", "points", "stars.dng", "--profile", "a.lensprofile", cwd=tmp_path)
     report = lensmodel("report", "a.lensprofile", cwd=tmp_path)
 

@@ -5,33 +5,30 @@ For the pixels p that the sensor measured in a window,
     y(p) = sum_t k(t) x(p - t) + sum_j c_j q_j(p) + n(p)          var n(p) = s(p)²
 
 so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing. The q_j, terms
-of a quadratic, are slow changes of light over the blurred picture; the c_j are eliminated (R. Frisch and
-F. Waugh, Econometrica 1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well:
-there, a constant (`even`). Every value of the kernel has a prior, normal with mean 0, whose width falls with
-the distance d to the middle as the light of a lens does:
+of a quadratic, are slow changes of light over the blurred picture; the c_j are eliminated (R. Frisch and F.
+Waugh, Econometrica 1, 1933). In a window hardly wider than the kernel a quadratic takes its wings as well:
+there, a constant (`even`). Every value of the kernel has a normal prior of mean 0, whose width falls with the
+distance d to the middle as the light of a lens does,  t(d) = T / (1 + (d / D)²).  The kernel is the minimum
+of
 
-    t(d) = T / (1 + (d / D)²)
+    sum_p (y - k * x - c)² / (q s²) + sum_t k(t)² / t(d)²
 
-The kernel is the minimum of  sum_p (y - k * x - c)² / (q s²) + sum_t k(t)² / t(d)²  over all k >= 0 whose sum
-is that of the minimum over all k, where q >= 1 is the mean of the squared residuals over what the noise
-explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the other: hundreds of
-values around a small core then add up to a halo that is not there. (Where the latent picture has noise of its
-own, which is taken off, the free minimum is not determined, and k >= 0 is all.) Its expected error is
+over all k >= 0 whose sum is that of the minimum over all k, where q >= 1 is the mean of the squared residuals
+over what the noise explains. Without the sum, k >= 0 alone would cut off one half of the noise and keep the
+other: hundreds of values around a small core then add up to a halo that is not there. (Where the latent
+picture has noise of its own, which is taken off, the free minimum is not determined, and k >= 0 is all.) Its
+expected error is  e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
 
-    e² = trace (X'X / q + diag(1 / t²))^-1 / |k|².
+A kernel that changes within the window (`varying`) is linear in the place, k + u k_u + v k_v with u and v
+from -1 to 1 over its rows and columns; k_u and k_v are eliminated too. It is found at the phase between
+pixels that fits best: a kernel that is not negative on one grid of pixels is so on no other, if it has a peak
+as narrow as a pixel. Moved by half a pixel, the peak rings along its row and column, and k >= 0 cuts one half
+of that off. So X S(d) k is compared with y, where S(d) moves a kernel by d pixels (by sinc, exact for a
+picture without frequencies beyond the pixels'), and d minimises the misfit. Where the kernel is smooth, any d
+will do, and a weak prior keeps its centre of mass in the middle.
 
-Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4 (known
-sharp picture, non-negative least squares); M. Delbracio et al., "The non-parametric sub-pixel local
-point spread function estimation is a well posed problem", IJCV 96, 2012, section 3.
-
-**A kernel that changes within the window** (`varying`) is linear in the place, k + u k_u + v k_v with u and
-v from -1 to 1 over its rows and columns; k_u and k_v, whose prior has `CHANGE` of the width, are eliminated
-too. And it is found at the phase between pixels that fits best: a kernel that is not negative on one grid of
-pixels is so on no other, if it has a peak as narrow as a pixel. Moved by half a pixel, the peak rings along
-its row and column, k >= 0 cuts one half of that off, and the rest is explained by something else. So X S(d) k
-is compared with y, where S(d) moves a kernel by d pixels (by sinc, which is exact for a picture without
-frequencies beyond the pixels'), and d minimises the misfit. Where the kernel is smooth, any d will do, and a
-weak prior keeps its centre of mass in the middle.
+Sources: N. Joshi et al., "PSF estimation using sharp edge prediction", CVPR 2008, section 4 (known sharp
+picture, non-negative least squares); M. Delbracio et al., IJCV 96, 2012, section 3.
 """
 
 from __future__ import annotations
@@ -75,7 +72,6 @@ _ROWS: Final = 2048  # of the design matrix at once: a whole window would take h
 _STEPS: Final = 300
 _STILL: Final = 1e-7  # of the light: no value moves by more
 _NO_KERNEL: Final = "no kernel explains this window; the latent picture does not match it"
-_WORST: Final = 1.0  # an error beyond it says that nothing was measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,33 +97,11 @@ def solve(
     even: bool = False,
     varying: bool = False,
 ) -> Solved:
-    """Find the kernel that makes the latent picture the observed one.
+    """Find the kernel of odd side `size` that makes the latent picture the observed one.
 
-    Parameters
-    ----------
-    observed : ndarray, shape (H, W)
-        Linear light.
-    latent : ndarray, shape (H + size - 1, W + size - 1)
-        What the photo shows without blur, with a margin of half a kernel.
-    measured : ndarray of bool, shape (H, W)
-        Which pixels count.
-    variance : ndarray, shape (H, W)
-        Of the noise of `observed`.
-    size : int
-        Odd side of the kernel.
-    latent_noise : ndarray, shape (2 size - 1, 2 size - 1), optional
-        Autocovariance of the noise that the latent picture has itself; it is taken off the normal
-        equations, or noise would be taken for picture and the kernel come out too wide.
-    even : bool
-        Whether c is the same all over the window, as it has to be where that is hardly wider than the kernel.
-    varying : bool
-        Whether the kernel changes within the window; that in the middle is found then, on the grid between
-        pixels that fits best, so that it needs no centring. Only for a latent picture without noise.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If fewer pixels count than the kernel has, or no kernel explains them.
+    The latent picture has a margin of half a kernel; `latent_noise`, shape (2 size - 1, 2 size - 1), is the
+    autocovariance of noise that it has itself, which would pass for picture and make the kernel too wide.
+    Only without it may the kernel be `varying`; that needs no centring.
     """
     if int(measured.sum()) < size * size:
         raise NotEnoughEvidenceError(
@@ -136,7 +110,9 @@ def solve(
     weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
     whole = _normal_equations(observed, latent, weight, size, even=even, varying=varying)
     if latent_noise is not None:
-        whole = replace(whole, a=whole.a - _stationary(latent_noise, size) * weight.sum())
+        # that of all values of a window of `size` pixels, shape (size², size²)
+        row, col = (i[:, None] - i + size - 1 for i in np.divmod(np.arange(size * size), size))
+        whole = replace(whole, a=whole.a - latent_noise[row, col] * weight.sum())
     prior = 1.0 / prior_width(size) ** 2
     count, misfit, moved = int(measured.sum()), 1.0, (0.0, 0.0)
     k = np.zeros(size * size)
@@ -270,14 +246,6 @@ def on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64]
     return np.asarray(np.maximum(values - excess[last], 0.0))
 
 
-def _stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
-    """Return the covariance of all values of a window of `size` pixels, shape (k², k²)."""
-    rows, cols = np.divmod(np.arange(size * size), size)
-    return np.asarray(
-        covariance[rows[:, None] - rows + size - 1, cols[:, None] - cols + size - 1], dtype=np.float64
-    )
-
-
 def prior_width(size: int) -> NDArray[np.float64]:
     """Return t(d), shape (k²,)."""
     t = np.arange(size) - size // 2
@@ -285,13 +253,13 @@ def prior_width(size: int) -> NDArray[np.float64]:
 
 
 def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
-    """Return the root of the posterior variance of all values over the norm of the kernel."""
+    """Root of the posterior variance of all values over the norm of the kernel; 1 is the worst."""
     try:
         inverse = scipy.linalg.inv(precision, check_finite=False)
     except scipy.linalg.LinAlgError:
-        return _WORST
+        return 1.0
     variance = float(np.maximum(np.diag(inverse), 0.0).sum())
-    return min(math.sqrt(variance / float(k @ k)), _WORST)
+    return min(math.sqrt(variance / float(k @ k)), 1.0)
 
 
 # Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed; measured
@@ -350,20 +318,14 @@ def _moved(
     eq: _Equations, phase: tuple[float, float], size: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """S'AS and S'b, axis by axis."""
-    down, across = _sinc(phase[0], size), _sinc(phase[1], size)
-    n = size * size
+    n, t = size * size, np.arange(size)
+    down, across = (np.sinc(t[:, None] - t - by) for by in phase)
 
     def left(m: NDArray[np.float64]) -> NDArray[np.float64]:
         rows = (down.T @ m.reshape(size, -1)).reshape(size, size, -1)
         return np.asarray(np.matmul(across.T, rows).reshape(n, -1))
 
     return left(left(eq.a).T), left(eq.b[:, None])[:, 0]
-
-
-def _sinc(by: float, size: int) -> NDArray[np.float64]:
-    """Matrix that moves a row of a kernel by so many pixels."""
-    t = np.arange(size)
-    return np.asarray(np.sinc(t[:, None] - t[None, :] - by))
 
 
 # `latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels

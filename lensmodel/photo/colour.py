@@ -1,10 +1,6 @@
 """Transfer curves and colour matrices: file numbers to linear light and back.
 
-A curve is a table of linear light at evenly spaced file values, one entry for each of 65536
-codes, so that 8 and 16 bit files are decoded by look-up and encoded by the inverse.
-
 Profiles are read and made by LittleCMS, but for one with primaries that no chromaticities give.
-
 Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022.
 """
 
@@ -70,11 +66,7 @@ def decode(codes: NDArray[np.generic], curve: Curve) -> NDArray[np.float32]:
 
 
 def inverse(curve: Curve) -> NDArray[np.float32]:
-    """Table of file values at the linear light (k / (n - 1))^2, for `encode`.
-
-    The square root spreads the dark levels, where curves are steep; n is so large that the
-    rounding is below a quarter of a 16-bit code: what was decoded is encoded to the same code.
-    """
+    """Table of file values at the linear light (k / (n - 1))^2: so fine that what was decoded comes back."""
     levels = np.linspace(0.0, 1.0, 4 * CODES) ** 2
     return np.interp(levels, curve, np.linspace(0.0, 1.0, CODES)).astype(np.float32)
 

@@ -58,12 +58,10 @@ class Header:
     # median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG, in
     # 8-bit numbers; 0 unknown, or not compressed so
     coarseness: float = 0.0
-    # WhiteLevel of a DNG, of all channels or of each; empty where it does not say
-    white: tuple[int, ...] = ()
+    white: tuple[int, ...] = ()  # WhiteLevel of a DNG, of all channels or of each
     opcodes_2: bytes = b""  # OpcodeList2 and 3 of a DNG
     opcodes_3: bytes = b""
-    # rows and columns of pixels that share one value of a JPEG's chroma
-    chroma_step: tuple[int, int] = (1, 1)
+    chroma_step: tuple[int, int] = (1, 1)  # rows and columns that share one value of a JPEG's chroma
     whole: bool = True  # false where the file ends before its picture does
 
 
@@ -107,11 +105,7 @@ _READABLE: Final = "give RAW, DNG, TIFF, PNG or JPEG"
 
 
 def sniff(head: bytes) -> FileKind:
-    """Tell the kind of file by its first bytes alone; names and declared types are not trusted.
-
-    RAW files that look like TIFF up to their directories (NEF, ARW, PEF, DNG) are "tiff" here;
-    `inspect` looks into the directories and tells them apart.
-    """
+    """Tell the kind of file by its first bytes alone, by which NEF, ARW, PEF and DNG are TIFF too."""
     for at, magic, kind in _KINDS:
         if head.startswith(magic, at):
             return kind
@@ -202,8 +196,7 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
             "the JPEG ends inside its header; copy it again from the camera or card"
         ) from error
     readers = (TiffReader.open(block, 6) for block in segments.exif)
-    # a zero follows a byte of 0xFF in a scan, where the end is looked for: a thumbnail before it has its own
-    whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0
+    whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0  # in a scan a zero follows each byte of 0xFF
     return Header(
         "jpeg",
         *image.size,
@@ -225,7 +218,6 @@ def _chroma_step(layers: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]
         return 1, 1  # grey
     (_, cols, rows, _), (_, chroma_cols, chroma_rows, _) = layers[:2]
     step = rows // max(chroma_rows, 1), cols // max(chroma_cols, 1)
-    # a factor that is no power of two occurs in no camera's file, and is none of chroma's business here
     return step if {*step} <= {1, 2, 4} else (1, 1)
 
 
@@ -340,21 +332,19 @@ def _inflated(packed: bytes) -> bytes | None:
 _ICC: Final = 34675  # tag of the profile: ICC.1:2022, annex B.4
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 _LOSSY: Final = 34892  # compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"
-_JPEG: Final = {6, 7}  # compression, of TIFF 6.0 and of its technical note 2
 _STRIPS: Final = (273, 324), (279, 325)  # tags of the places of strips and of tiles, and of their lengths
 _RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}  # Sony to Pentax: libtiff, tiff.h
 _FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
-# PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3); grey, RGB and
-# YCbCr (TIFF 6.0, sections 4, 6 and 21); what else is said by name.
+# PhotometricInterpretation: colour filter array (TIFF/EP), linear RAW (DNG 1.6, chapter 3); grey is 1, RGB 2
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
-_READ_COLOURS: Final = {1, 2, 6}
 _DEPTHS: Final = {1: {8, 16}, 3: {16, 32, 64}, 4: {8, 16}}  # bits by SampleFormat: integer, floating, unsaid
 _OTHER_COLOURS: Final = {
     0: "inverted grey",
     3: "a palette",
     4: "a mask",
     5: "CMYK, made for print",
+    6: "YCbCr",
     **dict.fromkeys((8, 9, 10), "CIE Lab"),
 }
 
@@ -478,7 +468,7 @@ def _check_strips(tags: Tags, file_bytes: int) -> None:
 def _check_numbers(tags: Tags) -> None:
     """Refuse numbers that are not read, or stand for other things than light, before they are stored."""
     kind, samples, bits = tags.integer(262, 1), tags.integer(277, 1), tags.integer(258, 1)
-    if kind not in _READ_COLOURS:
+    if kind not in {1, 2}:
         named = _OTHER_COLOURS.get(kind, f"kind {kind}")
         raise UnsupportedFormatError(f"the TIFF's colours are {named}; convert it to RGB")
     if samples > 4 or (kind == 2 and samples < 3):
@@ -487,8 +477,6 @@ def _check_numbers(tags: Tags) -> None:
         raise UnsupportedFormatError(
             f"the TIFF's numbers have {bits} bits, or are signed or complex; save it with 8 or 16 bits"
         )
-    if kind == 6 and tags.integer(259, 1) not in _JPEG:
-        raise UnsupportedFormatError("the TIFF's colours are YCbCr that is no JPEG; convert it to RGB")
 
 
 # --- RAW files that are not plain TIFF ---------------------------------------------------------

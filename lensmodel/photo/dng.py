@@ -114,6 +114,7 @@ _OPCODES: Final = (
     *("TrimBounds", "MapTable", "MapPolynomial", "GainMap", "DeltaPerRow", "DeltaPerColumn", "ScalePerRow"),
     *("ScalePerColumn", "WarpRectilinear2"),
 )
+_GAIN_MAP: Final = _OPCODES.index("GainMap")
 _GAIN_HEAD: Final = struct.Struct(">10I4dI")
 _MOST: Final = 64  # opcodes of a list (chosen): cameras write below ten
 
@@ -158,7 +159,7 @@ def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opco
     """
     kept, lost, green = list[Opcode](), list[Opcode](), -1
     for step in steps:
-        mapped = _gain_of_colours(step, cfa) if step.number == _OPCODES.index("GainMap") else None
+        mapped = _gain_of_colours(step, cfa) if step.number == _GAIN_MAP else None
         if mapped is None:
             lost.append(step)
             continue

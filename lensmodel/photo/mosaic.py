@@ -20,12 +20,8 @@ _XTRANS_SIDE: Final = 512  # pixels: LibRaw demosaics no smaller X-Trans (its xt
 _GREEN: Final = 1  # the number of green among the colours of a mosaic
 _BAND: Final = 16  # rows that are judged together by `Mosaic.of`
 
-_CLUSTER: Final = 0.005
-"""Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
-
-_STRAYS: Final = 0.02
-"""Share of a pile that may lie above it: hot pixels; more is a bright part of the picture."""
-
+_CLUSTER: Final = 0.005  # width of the pile of saturated pixels in the range: full wells differ a little
+_STRAYS: Final = 0.02  # share of a pile that may lie above it: hot pixels; more is a part of the picture
 _EDGE: Final = 0.02  # share of a pile below its lower end: 0 would take the darkest stray (chosen)
 _LOWEST_PILE: Final = 0.8  # lowest level, relative to the stated one, at which sensors were seen to clip
 

@@ -24,18 +24,13 @@ from lensmodel.photo.values import Encoding, LensIdentity, LinearPhoto, PhotoInf
 
 _NOISE_MIX: Final = np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]])
 """Share of the variance of each colour's pixels (column) in each plane that AHD makes (row): measured on flat
-fields, as the tests do again.
-
-The noise of the planes is not white: its power at low frequencies is about 3.7 times that of the sensor in
-red and blue and 1.9 times in green, and at the highest it is about half.
-"""
+fields, as the tests do again. The noise of the planes is not white: at low frequencies it has about 3.7 times
+the power of the sensor's in red and blue and 1.9 times in green, at the highest about half."""
 
 _FULL: Final = 65535.0  # 16 bits
 _ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}  # how LibRaw says that a picture is turned -> EXIF orientation
 
-_LEAST_SHARE: Final = 0.25
-"""No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
-
+_LEAST_SHARE: Final = 0.25  # of the strongest that a channel is balanced by: it costs two of 16 bits
 
 # CRW, CR2, MRW: LibRaw reads every camera that wrote them, so that one it does not know is damaged.
 _KNOWN_WHOLE: Final = ((6, b"HEAPCCDR"), (8, b"CR\x02"), (0, b"\0MRM"))

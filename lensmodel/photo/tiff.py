@@ -2,9 +2,7 @@
 
 Reading, every offset is checked against the buffer, loops end, and no count makes us allocate more
 than `MAX_VALUE_BYTES`. A directory that is damaged half-way gives what came before.
-
-Written here rather than by an image library: those that write 16 bits a colour write no EXIF directory, and
-doubles, as others write, are empty tags to some readers.
+Image libraries that write 16 bits a colour write no EXIF directory.
 
 Source: "TIFF Revision 6.0", Aldus, 1992, section 2.
 """
@@ -70,17 +68,6 @@ class Tag:
             return b""
         return bytes(self.buffer[self.offset : end])
 
-    def numbers(self, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
-        """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
-        code, raw = _FORMATS[self.kind], self.raw()[: most * _SIZES[self.kind]]
-        if code == "s":
-            return ()
-        values = struct.unpack(f"{self.order}{len(raw) // struct.calcsize('=' + code[0])}{code[0]}", raw)
-        if len(code) == 1:
-            return values
-        pairs = zip(values[::2], values[1::2], strict=True)
-        return tuple(float(Fraction(a, b)) if b else math.nan for a, b in pairs)
-
 
 class Tags(dict[int, Tag]):
     """The tags of a directory; one that is not there gives an empty value, or `None`."""
@@ -90,8 +77,16 @@ class Tags(dict[int, Tag]):
         return self[tag].raw() if tag in self else b""
 
     def numbers(self, tag: int, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
-        """The first `most` values as numbers."""
-        return self[tag].numbers(most) if tag in self else ()
+        """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
+        if tag not in self or (code := _FORMATS[self[tag].kind]) == "s":
+            return ()
+        raw = self.raw(tag)[: most * _SIZES[self[tag].kind]]
+        count = len(raw) // struct.calcsize("=" + code[0])
+        values = struct.unpack(f"{self[tag].order}{count}{code[0]}", raw)
+        if len(code) == 1:
+            return values
+        pairs = zip(values[::2], values[1::2], strict=True)
+        return tuple(float(Fraction(a, b)) if b else math.nan for a, b in pairs)
 
     def number(self, tag: int) -> float | None:
         """The first value; `None` also where it is not finite."""
@@ -262,10 +257,7 @@ def _rational(value: float) -> tuple[int, int]:
     """Quotient of a positive number, at most a millionth off; infinity as EXIF writes it."""
     if math.isinf(value):
         return _MAX_UINT32, 1
-    for largest in (1_000_000, 10_000, 100, 1):
-        part = Fraction(value).limit_denominator(largest)
-        if 0 < part.numerator <= _MAX_UINT32:
-            return part.numerator, part.denominator
-    if 0.0 <= value < 1e-6:
-        return 0, 1
-    raise InvalidInputError(f"{value} does not fit a TIFF rational")
+    if not 0.0 <= value <= _MAX_UINT32:
+        raise InvalidInputError(f"{value} does not fit a TIFF rational")
+    part = Fraction(value).limit_denominator(min(1_000_000, int(_MAX_UINT32 / max(value, 1.0))))
+    return part.numerator, part.denominator

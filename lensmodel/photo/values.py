@@ -70,54 +70,27 @@ class LensIdentity:
 
 @dataclass(frozen=True, slots=True)
 class PhotoMetadata:
-    """What the file says about camera, lens and exposure; `None` is unknown, never zero.
-
-    Parameters
-    ----------
-    aperture : float or None
-        f-number.
-    focal_mm : float or None
-        Focal length in mm, not its 35 mm equivalent.
-    focus_m : float or None
-        Focus distance in metres.
-    exposure_s : float or None
-        Exposure time in seconds.
-    taken_at : datetime or None
-        Local time of the camera, without a zone.
-    orientation : int
-        EXIF orientation 1 to 8; the planes are always in sensor orientation, whatever it says.
-    pixel_pitch_um : float or None
-        Pitch of the pixels of this file in micrometres.
-    artist, copyright : str or None
-        Who made it, and who holds which rights.
-    rating : int or None
-        Stars 0 to 5, or -1 for rejected.
-    keywords : tuple of str
-    """
+    """What the file says about camera, lens and exposure; `None` is unknown, never zero."""
 
     camera_maker: str | None = None
     camera_model: str | None = None
     body_serial: str | None = None
     lens: LensIdentity = LensIdentity()
-    aperture: float | None = None
-    focal_mm: float | None = None
+    aperture: float | None = None  # f-number
+    focal_mm: float | None = None  # not the equivalent of 35 mm film
     focus_m: float | None = None
     iso: float | None = None
     exposure_s: float | None = None
-    taken_at: datetime | None = None
-    orientation: int = 1
-    pixel_pitch_um: float | None = None
+    taken_at: datetime | None = None  # by the camera's clock, without a zone
+    orientation: int = 1  # EXIF's, 1 to 8; planes are in sensor orientation, whatever it says
+    pixel_pitch_um: float | None = None  # of the pixels of this file
     artist: str | None = None
     copyright: str | None = None
     rating: int | None = None
     keywords: tuple[str, ...] = ()
 
     def settings(self, given: LensSettings | None = None) -> LensSettings:
-        """Settings of the lens as the file says; a caller's values fill what it leaves open.
-
-        The one rule of precedence: a value that is given for a folder of photos is meant for those among them
-        that do not say their own.
-        """
+        """Settings of the lens as the file says; a caller's, meant for a folder, fill what it leaves open."""
         given = given or LensSettings()
         return LensSettings(
             aperture=given.aperture if self.aperture is None else self.aperture,
@@ -139,28 +112,14 @@ class PhotoMetadata:
 
 @dataclass(frozen=True, slots=True)
 class PhotoInfo:
-    """What is known of a photo without decoding it.
+    """What is known of a photo without decoding it."""
 
-    Parameters
-    ----------
-    kind : {"raw", "dng", "tiff", "png", "jpeg"}
-        The kind of file by its content.
-    width, height : int
-        Size as developed, in sensor orientation.
-    metadata : PhotoMetadata
-        What the file says.
-    centred : bool
-        Whether it shows the middle of its sensor, or all of it; false for what a program has cut.
-    turned : bool
-        Whether a program has turned its pixels upright: nothing tells which way.
-    """
-
-    kind: FileKind
-    width: int
+    kind: FileKind  # by its content
+    width: int  # as developed, in sensor orientation
     height: int
     metadata: PhotoMetadata = PhotoMetadata()
-    centred: bool = True
-    turned: bool = False
+    centred: bool = True  # whether it shows all or the middle of its sensor: not what a program has cut
+    turned: bool = False  # whether a program has turned its pixels upright: nothing tells which way
 
     def require_known_turn(self) -> None:
         """Refuse to learn from a photo of which nobody can tell how it lay on the sensor."""
@@ -173,41 +132,18 @@ class PhotoInfo:
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """How linear planes become a file like the one that they came from.
+    """How linear planes become a file like the one that they came from."""
 
-    Parameters
-    ----------
-    bit_depth : int
-        Bits of one sample of the input: 8, 14, 16, 32, ...
-    transfer : {"srgb", "linear", "icc"}
-        Curve between the file's numbers and linear light; "icc" = the curves of `icc`.
-    icc : bytes or None
-        The input's ICC profile.
-    metadata : PhotoMetadata
-        What is written into the output: without serials, GPS and maker notes.
-    white_balance : tuple of float
-        Multipliers of r, g, b that make grey grey; green is 1. All 1 except for RAW.
-    to_srgb : 3 x 3 tuple or None
-        White-balanced planes to linear sRGB, row by row; `None` where the primaries are those
-        of `icc`, or of sRGB.
-    xyz_to_camera : 3 x 3 tuple or None
-        CIE XYZ (D65) to camera RGB, for DNG output.
-    baseline_exposure : float or None
-        Stops by which a DNG asks raw converters to brighten it; `None` where the file does not say.
-    opcodes_2, opcodes_3 : bytes
-        What a DNG asks raw converters to do with a linear image of three colours, and with the developed one.
-    """
-
-    bit_depth: int = 8
-    transfer: Transfer = "srgb"
-    icc: bytes | None = None
-    metadata: PhotoMetadata = PhotoMetadata()
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    to_srgb: Matrix3 | None = None
-    xyz_to_camera: Matrix3 | None = None
-    baseline_exposure: float | None = None
-    opcodes_2: bytes = b""
-    opcodes_3: bytes = b""
+    bit_depth: int = 8  # of one sample of the input: 8, 14, 16, 32, ...
+    transfer: Transfer = "srgb"  # curve between the file's numbers and linear light; "icc" = those of `icc`
+    icc: bytes | None = None  # the input's profile
+    metadata: PhotoMetadata = PhotoMetadata()  # what is written into the output
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multipliers that make grey grey; green is 1
+    to_srgb: Matrix3 | None = None  # white-balanced planes to linear sRGB; None: primaries of `icc`, or sRGB
+    xyz_to_camera: Matrix3 | None = None  # CIE XYZ (D65) to camera RGB, for DNG output
+    baseline_exposure: float | None = None  # stops by which a DNG asks raw converters to brighten it
+    opcodes_2: bytes = b""  # what a DNG asks raw converters to do with a linear image of three colours,
+    opcodes_3: bytes = b""  # and with the developed one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -63,15 +63,11 @@ def write_image(
 ) -> None:
     """Write planes as a file that shows the picture as its input did, complete or not at all.
 
-    It carries an ICC profile, and of the metadata camera, lens, exposure, time, maker, rights, rating
-    and keywords; never maker notes or serials, and the place only where its owner wants it (`gps`).
-    Light is clipped to 0..1 but in "tiff32", which holds floating-point numbers. TIFF, JPEG and DNG
-    keep the sensor orientation and say how to turn it; PNG, where programs ignore that, is written
-    upright.
-
-    The colour space "same" is profile and curve of the input, and for RAW sRGB with the camera's white
-    balance; "srgb" is converted to sRGB; "camera-linear" is the planes' own numbers and primaries, with
-    a profile that describes them, which DNG is by its nature. `lens` is what its owner calls it.
+    It never carries maker notes or serials, and the place only where its owner wants it (`gps`). Light is
+    clipped to 0..1 but in "tiff32". TIFF, JPEG and DNG keep the sensor orientation and say how to turn it;
+    PNG, where programs ignore that, is written upright. The colour space "same" is profile and curve of the
+    input, and for RAW sRGB with the camera's white balance; "camera-linear", as in DNG, the planes' own
+    numbers.
     """
     if planes.ndim != 3 or planes.shape[0] != 3:
         raise InvalidInputError(f"planes must have the shape (3, height, width), got {planes.shape}")
@@ -128,12 +124,9 @@ def _tell_losses(name: str, planes: Planes, encoding: Encoding, output: OutputFo
             ", ".join(steps),
         )
     clipped = encoding.bit_depth == 32 and output not in {"tiff32", "dng"}
-    if clipped and (beyond := float((planes > 1.0).mean())):
-        remarks_log.warning(
-            "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
-            name,
-            100.0 * beyond,
-        )
+    if clipped and (beyond := 100.0 * float((planes > 1.0).mean())):
+        said = "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them"
+        remarks_log.warning(said, name, beyond)
 
 
 # --- colour ------------------------------------------------------------------------------------

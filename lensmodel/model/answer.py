@@ -29,8 +29,7 @@ class ModelSettings:
     ----------
     r, phi, stops : float or None
         Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
-        eq. (8) of the paper [1]_, and from three photos on the factors on it with the least
-        leave-one-photo-out error.
+        eq. (8) of the paper [1]_.
     excluded : tuple of str
         Photos whose samples do not count; they stay listed.
     mode : {"default", "paper"}

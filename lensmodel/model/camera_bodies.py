@@ -1,9 +1,7 @@
 """Samples of one lens seen by bodies whose frames or pixels differ in size.
 
-A frame in crop mode, or of a body with a smaller sensor, shows the middle of what the lens draws: its corner
-is no corner of the lens. The largest frame that a lens was seen on is the measure of all its samples.
-
-Light falls on the sensor in micrometres; a pixel of pitch p samples it after integrating over p. From
+A frame in crop mode, or of a smaller sensor, shows the middle of what the lens draws: the largest frame that
+a lens was seen on is the measure of all its samples. A pixel of pitch p integrates the light over p; from
 pitch p to q the spectrum is that of the kernel times the ratio of the two pixels::
 
     K_q(f) = K_p(f) sinc(q f) / sinc(p f),     f in cycles / micrometre, on both axes

@@ -11,10 +11,7 @@ from lensmodel.core.names import name_key, serial_key
 from lensmodel.model import Camera, LensProfile
 from lensmodel.photo import PhotoMetadata
 
-SAME_FOCAL: Final = 1.19
-"""Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
-(`focal_octaves` in `lensmodel.model.variables`)."""
-
+SAME_FOCAL: Final = 1.19  # ratio of focal lengths that count as one: a quarter of an octave, as of the model
 _COMPACT_MM: Final = (
     8.0  # focal lengths below are of compacts, whose zooms are one lens (chosen: of fisheyes)
 )

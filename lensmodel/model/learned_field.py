@@ -4,14 +4,12 @@ Cross-attention from a place and settings to samples is Nadaraya-Watson regressi
 weights and values a network has learned: the weight of a sample follows from its distance in place and
 settings and from what its patch says, and the answer is a weighted sum over samples. A question attends to
 the nearest `NEAREST` samples, spread over photos, whose keys and values are computed once for each
-neighbourhood: so it takes the same time for a hundred samples and a million. Each patch was encoded beside
-the others of its photo; a new photo changes no sample of another one.
+neighbourhood: so it takes the same time for a hundred samples and a million.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -37,36 +35,11 @@ _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / va.UNITS
 _MEMORIES: Final = 64
 """Neighbourhoods whose keys are kept (chosen: those of a whole picture; each takes a megabyte)."""
 
-_ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
-_KEY_BYTES: Final = 4608  # of a patch: keys and values of three attentions, 192 floats each
 _ANSWERS: Final = 64
 """Answers that are kept: one holds all three channels, which are asked for one after the other (chosen)."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """Samples of one pixel pitch in a kd-tree over place and settings; an unknown one is the usual."""
-
-    rows: NDArray[np.intp]
-    usual: NDArray[np.float64]
-    tree: scipy.spatial.cKDTree
-
-    @classmethod
-    def of(cls, rows: NDArray[np.intp], where: NDArray[np.float64]) -> _Group:
-        unknown = np.isnan(where)
-        known = zip(where.T, ~unknown.T, strict=True)
-        usual = np.array([float(np.median(column[has])) if has.any() else 0.0 for column, has in known])
-        return cls(rows, usual, scipy.spatial.cKDTree(np.where(unknown, usual, where)))
-
-    def nearest(self, asked: NDArray[np.float64], photo: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the nearest samples, as many of each photo, as places `(NEAREST,)` in `rows`."""
-        point = np.where(np.isnan(asked), self.usual, asked)
-        distance, near = self.tree.query(point, k=min(_CANDIDATES, len(self.rows)))
-        by_photo = np.argsort(photo[near], kind="stable")  # nearest first within each
-        starts = np.flatnonzero(np.diff(photo[near][by_photo], prepend=-1))
-        rank = np.empty(len(near), dtype=np.intp)
-        rank[by_photo] = np.arange(len(near)) - np.repeat(starts, np.diff(starts, append=len(near)))
-        return np.asarray(np.sort(near[np.lexsort((distance, rank))[:NEAREST]]))
+_ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
+_KEY_BYTES: Final = 4608  # of a patch: keys and values of three attentions, 192 floats each
 
 
 class LearnedField:
@@ -74,15 +47,20 @@ class LearnedField:
 
     def __init__(self, samples: Sequence[PsfSample]) -> None:
         self.network = FieldNetwork.load()
-        self._conditions = _conditions(samples)
+        self._conditions = [
+            Conditions.of(s.settings, s.pixel_pitch_um, s.encoded.kind) for s in samples if s.encoded
+        ]
         self._tokens = _tokens(samples, self._conditions, self.network)
         self._xy = np.array([s.position.xy for s in samples])  # half diagonals, to the right and up
         self._where = va.all_in_units(samples)
+        unknown = np.isnan(self._where)
+        columns = zip(self._where.T, ~unknown.T, strict=True)
+        self._usual = np.array([np.median(column[has]) if has.any() else 0.0 for column, has in columns])
         self._usual_pitch = camera_bodies.usual_pitch(samples)
         self._pitch = np.array([s.pixel_pitch_um for s in samples], dtype=np.float64)  # NaN = unknown
         self._photos = np.array([s.photo for s in samples], dtype=object)
         self._photo = np.unique(self._photos.astype(str), return_inverse=True)[1]
-        self._group = lru_cache(maxsize=4)(self._group_of)
+        self._tree = lru_cache(maxsize=4)(self._tree_of)
         self._memory = lru_cache(maxsize=_MEMORIES)(self._memory_of)
         self._answer = lru_cache(maxsize=_ANSWERS)(self._answer_of)
 
@@ -108,33 +86,41 @@ class LearnedField:
             own = pitch_um
         cell = np.round(va.in_units(position, settings) / _CELL)
         steps = tuple(None if np.isnan(step) else float(step) for step in cell)
-        rows, memory, kind = self._memory(own, () if len(self._group(own).rows) <= NEAREST else steps)
+        rows, memory, kind = self._memory(own, () if len(self._tree(own)[0]) <= NEAREST else steps)
         conditions = Conditions.of(settings, own, kind)
         return self.network.query(memory, np.array(position.xy), conditions), rows, own
-
-    def _of_pitch(self, pitch_um: float) -> NDArray[np.bool_]:
-        return np.abs(self._pitch / pitch_um - 1.0) <= camera_bodies.SAME
 
     def _memory_of(
         self, pitch_um: float | None, cell: tuple[float | None, ...]
     ) -> tuple[NDArray[np.intp], Memory, PatchKind]:
         """Samples near a cell of places, or all; their keys and values; the usual kind of files."""
-        group = self._group(pitch_um)
-        rows = group.rows
-        if cell:
-            center = np.array(cell, dtype=np.float64) * _CELL
-            rows = rows[group.nearest(center, self._photo[rows])]
+        rows = self._nearest(pitch_um, np.array(cell, dtype=np.float64)) if cell else self._tree(pitch_um)[0]
         conditions = [self._conditions[int(row)] for row in rows]
         kinds = [one.kind for one in conditions]
         memory = self.network.memory(self._tokens[rows].astype(np.float32), self._xy[rows], conditions)
         return rows, memory, max(KINDS, key=kinds.count)
 
-    def _group_of(self, pitch_um: float | None) -> _Group:
-        same = np.isnan(self._pitch) | (pitch_um is None)
-        if pitch_um is not None:
-            same |= self._of_pitch(pitch_um)
-        rows = np.flatnonzero(same)
-        return _Group.of(rows, self._where[rows])
+    def _nearest(self, pitch_um: float | None, cell: NDArray[np.float64]) -> NDArray[np.intp]:
+        """The `NEAREST` samples of a pitch, as many of each photo."""
+        rows, tree = self._tree(pitch_um)
+        point = np.where(np.isnan(cell), self._usual, cell * _CELL)
+        distance, near = tree.query(point, k=min(_CANDIDATES, len(rows)))
+        photo = self._photo[rows[near]]
+        by_photo = np.argsort(photo, kind="stable")  # nearest first within each
+        starts = np.flatnonzero(np.diff(photo[by_photo], prepend=-1))
+        rank = np.empty(len(near), dtype=np.intp)
+        rank[by_photo] = np.arange(len(near)) - np.repeat(starts, np.diff(starts, append=len(near)))
+        return rows[np.sort(near[np.lexsort((distance, rank))[:NEAREST]])]
+
+    def _tree_of(self, pitch_um: float | None) -> tuple[NDArray[np.intp], scipy.spatial.cKDTree]:
+        """Samples of a pixel pitch, an unknown one being any, and a tree over their places and settings."""
+        same = np.ones(len(self._pitch), dtype=bool) if pitch_um is None else self._of_pitch(pitch_um)
+        rows = np.flatnonzero(same | np.isnan(self._pitch))
+        where = self._where[rows]
+        return rows, scipy.spatial.cKDTree(np.where(np.isnan(where), self._usual, where))
+
+    def _of_pitch(self, pitch_um: float) -> NDArray[np.bool_]:
+        return np.abs(self._pitch / pitch_um - 1.0) <= camera_bodies.SAME
 
     @property
     def nbytes(self) -> int:
@@ -142,14 +128,6 @@ class LearnedField:
         near = min(len(self._tokens), NEAREST)
         kept = (1 if near < NEAREST else _MEMORIES) * near * _KEY_BYTES
         return self._tokens.nbytes + len(self._tokens) * _ROW_BYTES + kept
-
-
-def _conditions(samples: Sequence[PsfSample]) -> tuple[Conditions, ...]:
-    """Conditions of samples; equal ones are one object."""
-    of = lru_cache(maxsize=None)(Conditions.of)
-    return tuple(
-        of(s.settings, s.pixel_pitch_um, "raw" if s.encoded is None else s.encoded.kind) for s in samples
-    )
 
 
 def _tokens(

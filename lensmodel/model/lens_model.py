@@ -58,7 +58,7 @@ class LensModel:
         self._attention = LearnedField(encoded) if encoded else None
         self._regression = before if before is not None and before.samples == kernels else None
         if kernels and self._regression is None:
-            self._regression = Regression.of(kernels, settings)
+            self._regression = Regression(kernels, settings)
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:

@@ -13,14 +13,13 @@ through the map of pixel offsets::
     M_i = L_i' S_i S^-1 L,      L = [[-sin phi, cos phi], [-cos phi, -sin phi]],   S = diag(s_u, s_v)
 
 A sample is stored once, in its own frame, as a cubic spline S_i on a grid twice as fine as the pixel, and
-resampled once, at the pixels q of an answer (`loops.sums`)::
+resampled once, at the pixels q of an answer (`spline_sums`)::
 
     f(q) = sum_i w_i |M_i| S_i(M_i (q - shift)),    S(p) = sum_k c_k B3(p_r - k_r) B3(p_c - k_c)
 
-A cubic spline on the pixels themselves would be off by 0.7 percent of the peak where a Gaussian of 1.1 px is
-turned by 45 degrees; a spline of degree 7 is off by 0.09 percent. It fills the finer grid. Kernels so narrow
-that the pixels do not hold them (their spectrum reaches the Nyquist frequency) ripple between the pixels with
-a high degree, and are filled with the cubic one.
+The finer grid is filled by a spline of degree 7: a cubic one of the pixels would be off by 0.7 percent of the
+peak where a Gaussian of 1.1 px is turned by 45 degrees. Kernels so narrow that their spectrum reaches the
+Nyquist frequency ripple between the pixels with a high degree, and are filled with the cubic one.
 
 Source: M. Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine
 16, 1999.
@@ -28,14 +27,16 @@ Source: M. Unser, "Splines: a perfect fit for signal and image processing", IEEE
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import scipy  # `interpolate` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
+from lensmodel.core.jit import jit
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
@@ -55,8 +56,7 @@ _ROUNDS = 4  # of reweighting: each costs as much, and later ones change less (c
 class WidthField:
     """Widths (s_u, s_v) of the PSF over the field, relative to a reference width of the model."""
 
-    # (m, 2), coefficients of log s_u and log s_v; None = one width everywhere
-    slopes: NDArray[np.float64] | None = None
+    slopes: NDArray[np.float64] | None = None  # (m, 2), of log s_u and log s_v; None = one width everywhere
     reference: float = 0.0  # logarithm of the width that counts as 1
     stops: float = 0.0  # origins of the settings, where terms of them are zero
     focal: float = 0.0
@@ -82,10 +82,7 @@ class WidthField:
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], weights: NDArray[np.float64]) -> WidthField:
-        """Fit the widths of weighted samples robustly; one width everywhere below six samples.
-
-        Huber's weights by iteration: a width that is wrong by a factor counts less, not nothing.
-        """
+        """Fit the widths of weighted samples by Huber's weights; one width everywhere below six samples."""
         rows = np.flatnonzero(weights > 0)
         if len(rows) < _MIN_SAMPLES:
             return cls()
@@ -180,17 +177,12 @@ class LocalKernels:
         angles = np.array([s.position.phi for s in samples])
         return cls(side, stored, angles, radii, field.over(where), finer)
 
-    def rescaled(self, where: NDArray[np.float64], field: WidthField) -> LocalKernels:
-        """Return the same kernels with widths of another field."""
-        return replace(self, widths=field.over(where))
-
     def kernels(
         self, answers: Answers, angles: NDArray[np.float64], widths: NDArray[np.float64], size: int
     ) -> NDArray[np.float64]:
         """Means of the neighbours at places of `angles` (q,) and `widths` (q, 2), shape (q, size, size).
 
-        Non-negative, sum 1, centre of mass on the middle pixel. Centring moves the points at which the
-        splines are read: kernels are not resampled again.
+        Centring moves the points at which the splines are read: kernels are not resampled again.
         """
         shifts = np.zeros((len(angles), 2))
         light = np.empty((len(angles), size, size))
@@ -223,15 +215,13 @@ class LocalKernels:
         size: int,
     ) -> NDArray[np.float64]:
         """Weighted sums of the samples of each answer, which may be negative and off the centre."""
-        from lensmodel.model import loops  # noqa: PLC0415 - Numba takes a while to load
-
         rows, asked = answers.rows, np.repeat(np.arange(len(angles)), answers.counts)
         scale = self.widths[rows] / widths[asked]
         maps = _frames(self.angles[rows]).mT @ ((scale * self.finer)[:, :, None] * _frames(angles[asked]))
         factors = answers.weights * scale[:, 0] * scale[:, 1]
         starts = np.concatenate([[0], np.cumsum(answers.counts)])
         out = np.zeros((len(angles), size, size))
-        loops.sums(self.splines, self.radii, rows, factors, maps, starts, shifts, out)
+        spline_sums(self.splines, self.radii, rows, factors, maps, starts, shifts, out)
         return out
 
 
@@ -282,3 +272,81 @@ def _refining(side: int, degree: int, finer: int) -> NDArray[np.float64]:
     )
     sampling = (4.0 * np.eye(fine.size) + np.eye(fine.size, k=1) + np.eye(fine.size, k=-1)) / 6.0
     return np.asarray(np.linalg.inv(sampling) @ through(fine / finer))
+
+
+# Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.
+_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+_SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
+
+
+@jit
+def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
+    """Integers j in 0..size with a j^2 + 2 b j + c <= 0, as first and last + 1."""
+    root = b * b - a * c
+    if root < 0.0:
+        return 0, 0
+    root = math.sqrt(root)
+    first, last = math.ceil((-b - root) / a), math.floor((-b + root) / a)
+    return max(first, 0), min(last + 1, size)
+
+
+@jit
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Weights of the four coefficients round a point that lies `t` beyond the second."""
+    rest = _ONE - t
+    first, last = rest * rest * rest * _SIXTH, t * t * t * _SIXTH
+    second = _TWO_THIRDS - t * t * (_ONE - _HALF * t)
+    return first, second, _ONE - first - second - last, last
+
+
+@jit
+def _value(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x); 0 where not all of its coefficients lie on the grid."""
+    if not (1.0 <= y < side - 2 and 1.0 <= x < side - 2):
+        return np.float32(0.0)
+    row, col = int(y), int(x)
+    v0, v1, v2, v3 = _weights(np.float32(y - row))
+    h0, h1, h2, h3 = _weights(np.float32(x - col))
+    p = (row - 1) * side + col - 1
+    q, r, o = p + side, p + 2 * side, p + 3 * side
+    return (
+        v0 * (h0 * spline[p] + h1 * spline[p + 1] + h2 * spline[p + 2] + h3 * spline[p + 3])
+        + v1 * (h0 * spline[q] + h1 * spline[q + 1] + h2 * spline[q + 2] + h3 * spline[q + 3])
+        + v2 * (h0 * spline[r] + h1 * spline[r + 1] + h2 * spline[r + 2] + h3 * spline[r + 3])
+        + v3 * (h0 * spline[o] + h1 * spline[o + 1] + h2 * spline[o + 2] + h3 * spline[o + 3])
+    )
+
+
+@jit
+def spline_sums(
+    rows: NDArray[np.float32],
+    radii: NDArray[np.float64],
+    chosen: NDArray[np.intp],
+    weights: NDArray[np.float64],
+    maps: NDArray[np.float64],
+    starts: NDArray[np.intp],
+    shifts: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Add weighted sums of splines, read through affine maps, to `out` (answers, size, size).
+
+    `chosen` (m,) are the samples that are read, one answer after the other from `starts` on, with their
+    `weights`, which include the determinants of the `maps` (m, 2, 2), from (row, col) offsets of the answer
+    in pixels to those of the sample in steps of its grid; each answer is moved by its `shifts` in pixels.
+    """
+    side, size = round(math.sqrt(rows.shape[1])), out.shape[1]
+    half, middle = side // 2, size // 2
+    for answer in range(out.shape[0]):
+        left = -middle - shifts[answer, 1]
+        for k in range(starts[answer], starts[answer + 1]):
+            row, weight = chosen[k], weights[k]
+            spline, reach = rows[row], radii[row]
+            dy, dx = maps[k, 0, 1], maps[k, 1, 1]
+            for i in range(size):
+                down = i - middle - shifts[answer, 0]
+                y = maps[k, 0, 0] * down + dy * left
+                x = maps[k, 1, 0] * down + dx * left
+                first, last = _inside(dy * dy + dx * dx, y * dy + x * dx, y * y + x * x - reach * reach, size)
+                y, x = y + half, x + half
+                for j in range(first, last):
+                    out[answer, i, j] += weight * _value(spline, side, y + j * dy, x + j * dx)

@@ -6,8 +6,8 @@ Layout of a `.lensprofile`, format 2::
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     encoded.npy     (m, bytes) uint8: what patches say without a kernel, see `EncodedPatch`
 
-The model is built from them when the file is opened. Nothing in it can run code: no pickle,
-sizes bounded before arrays are made. Samples cross the service, to its tasks and tables, in the same form.
+Nothing in it can run code: no pickle, sizes bounded before arrays are made. Samples cross the service, to
+its tasks and tables, in the same form.
 """
 
 from __future__ import annotations
@@ -67,10 +67,8 @@ class LensProfile:
     """A model with what is known of its lens and of the photos that it came from."""
 
     model: LensModel
-    # texts: maker, model, serial, label; whatever is known
-    lens: dict[str, str] = field(default_factory=dict)
-    # file name of each photo by the id that samples carry
-    photos: dict[str, str] = field(default_factory=dict)
+    lens: dict[str, str] = field(default_factory=dict)  # maker, model, serial, label; whatever is known
+    photos: dict[str, str] = field(default_factory=dict)  # file names by the id that samples carry
     cameras: tuple[Camera, ...] = ()  # what these were taken with, each once; empty where no photo says
 
 
@@ -89,30 +87,24 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
             f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {len(samples)} of side {side}"
         )
     packed = pack_samples(samples)
+    cameras = [asdict(camera) for camera in profile.cameras]
     document = {
         "format": FORMAT,
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "lens": profile.lens,
         "photos": profile.photos,
-        "cameras": [
-            {key: text for key, text in asdict(camera).items() if text is not None}
-            for camera in profile.cameras
-        ],
+        "cameras": [{key: text for key, text in of.items() if text is not None} for of in cameras],
         "model": asdict(profile.model.settings),
         "samples": packed.entries,
     }
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
-        archive.writestr(_KERNELS, _saved(packed.kernels))
-        archive.writestr(_ENCODED, _saved(packed.encoded))
+        for name, array in ((_KERNELS, packed.kernels), (_ENCODED, packed.encoded)):
+            buffer = io.BytesIO()
+            np.save(buffer, array, allow_pickle=False)
+            archive.writestr(name, buffer.getvalue())
         if _unpacked(archive) > _MAX_BYTES:
             raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
-
-
-def _saved(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def _within_limits(count: int, side: int) -> bool:
@@ -183,8 +175,7 @@ def _texts(values: dict[str, Any]) -> dict[str, str]:
 class PackedSamples:
     """Samples as JSON and arrays."""
 
-    # named fields of each sample, of what `json` can write; `size` is the side of its kernel, `encoded` the
-    # row of its patch in `encoded`, which the channels of one patch share, or None
+    # `entry_of` each sample, and in `encoded` the row of its patch, which its channels share, or None
     entries: list[dict[str, Any]]
     kernels: NDArray[np.float32]  # (n, k, k), zeros around kernels that are smaller than the largest
     encoded: NDArray[np.uint8]  # (m, bytes), `EncodedPatch.to_bytes` of the patches
@@ -213,15 +204,11 @@ def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
     samples = []
     for entry, kernel in zip(packed.entries, packed.kernels, strict=True):
         row = entry["encoded"]
+        if not (row is None or (isinstance(row, int) and 0 <= row < len(patches))):
+            raise ValueError(f"no encoded patch {row!r}, there are {len(patches)}")
         own = kernel[_middle(side, int(entry["size"]))]
-        samples.append(sample_of(entry, own, None if row is None else patches[_row(row, len(patches))]))
+        samples.append(sample_of(entry, own, None if row is None else patches[row]))
     return samples
-
-
-def _row(number: Any, count: int) -> int:  # noqa: ANN401 - of a JSON document
-    if not isinstance(number, int) or not 0 <= number < count:
-        raise ValueError(f"no encoded patch {number!r}, there are {count}")
-    return number
 
 
 def _middle(side: int, size: int) -> tuple[slice, slice]:

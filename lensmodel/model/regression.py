@@ -9,14 +9,14 @@ with C_i the sample's kernel in its own radial frame, d_i its distance in bandwi
 weight. The samples near a question are found in a kd-tree (paper, section 6.3). Departures from the paper:
 n in eq. (8) counts PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of
 pixels would widen the PSF; unless the mode is "paper", kernels are scaled to the width of the place before
-averaging (`widths`).
+averaging (`WidthField`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -29,14 +29,13 @@ from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import camera_bodies
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings, Part
-from lensmodel.model.bandwidths import CrossValidation, bandwidths, cross_validate
+from lensmodel.model.bandwidths import bandwidths, cross_validate
 from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
 _DROPPED: Final = 3e-5
 """Samples that together weigh less are left out (chosen: below what a kernel in single precision holds)."""
 _FEW: Final = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
-_MANY: Final = 4096  # fewer samples are looked through as fast as a tree (chosen)
 
 _DRIFT: Final = 0.15
 """Relative L2 error for each unit of `Support` beyond the first to the nearest sample (chosen)."""
@@ -49,7 +48,7 @@ _WIDEST: Final = 255
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Samples by their points and weights, in kd-trees that are built when they are first asked."""
+    """Samples by their points and weights, in a kd-tree of the variables that a question knows."""
 
     points: NDArray[np.float64]  # (n, 7), of `variables`; NaN = unknown
     weights: NDArray[np.float64]  # (n,), samples of weight 0 take no part
@@ -67,7 +66,7 @@ class Neighbourhood:
 
     def _weighed(self, asked: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Rows and weights of sum 1 for one question, the least first (eq. 4 and 7)."""
-        rows = np.arange(len(self.points)) if len(self.points) <= _MANY else self.within(asked, _REACH)
+        rows = self.within(asked, _REACH)
         squared = va.squared_distances(self.points[rows], asked, self.scale)
         near = np.flatnonzero((squared <= _REACH**2) & (self.weights[rows] > 0.0))
         if len(near) < _FEW:  # the nearest few, however far
@@ -82,7 +81,7 @@ class Neighbourhood:
         return rows[kept], weight[kept] / weight[kept].sum()
 
     def within(self, asked: NDArray[np.float64], reach: float) -> NDArray[np.intp]:
-        """Rows within `reach` bandwidths of a point, and some beyond that do not know all its variables."""
+        """Rows within `reach` bandwidths of a point, and some beyond where a variable is not known."""
         # a sample that does not know a variable is near in it: the tree leaves that one out
         known = tuple(np.flatnonzero(~np.isnan(asked) & ~np.isnan(self.points).any(axis=0)).tolist())
         scale = self.scale[list(known)]
@@ -92,65 +91,42 @@ class Neighbourhood:
         return np.sort(np.asarray(inside, dtype=np.intp))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """Kernels of samples, prepared for questions."""
+    """Kernels of samples, prepared for questions; `NoSamplesError` if no sample has a weight."""
 
-    samples: Sequence[PsfSample]
-    pitch_um: float | None  # pixel pitch that all kernels are brought to; None where none is known
-    widths: WidthField
-    local: LocalKernels
-    where: NDArray[np.float64]  # (n, 5), places and settings of the samples in units of `Support`
-    validation: CrossValidation
-    # (n,), errors that the estimators expect of their samples; 0 where they expect nothing
-    expected: NDArray[np.float64]
-    photos: NDArray[np.object_]  # (n,)
-    bandwidth: dict[str, float]  # bandwidths in use
-    neighbourhood: Neighbourhood  # which samples answer a question, and with which weights
-
-    @classmethod
-    def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Regression:
-        """Fit widths, bandwidths and robust weights; `NoSamplesError` if no sample has a weight."""
-        normalised = settings.mode != PAPER
+    def __init__(self, samples: Sequence[PsfSample], settings: ModelSettings) -> None:
         base = np.array([s.weight for s in samples])
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples has a weight; include a photo again")
-        pitch_um = camera_bodies.usual_pitch(samples)
-        common = camera_bodies.at_pitch(samples, pitch_um)
+        self.samples = samples
+        self._pitch_um = camera_bodies.usual_pitch(samples)  # that all kernels are brought to, or None
+        common = camera_bodies.at_pitch(samples, self._pitch_um)
         points = va.points(common)
-        widths = WidthField.fit(common, base) if normalised else WidthField()
-        local = LocalKernels.of(common, points, widths)
-        validation = cross_validate(common, settings, local, points, base)
-        if validation.spoilt:
-            # a spoilt photo has bent the widths too: fit them again without it
-            widths = WidthField.fit(common, validation.weights)
-            local = local.rescaled(points, widths)
-            validation = cross_validate(common, settings, local, points, base)
-        used = bandwidths(points, settings, validation.factors)
-        return cls(
-            samples,
-            pitch_um,
-            widths,
-            local,
-            va.all_in_units(common),
-            validation,
-            expected=np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples]),
-            photos=np.array([s.photo for s in samples], dtype=object),
-            bandwidth=used,
-            neighbourhood=Neighbourhood(points, validation.weights, va.scales(used)),
-        )
+        self._widths = WidthField() if settings.mode == PAPER else WidthField.fit(common, base)
+        self._local = LocalKernels.of(common, points, self._widths)
+        self._validation = cross_validate(common, settings, self._local, points, base)
+        if self._validation.spoilt:  # that photo has bent the widths too: fit them again without it
+            self._widths = WidthField.fit(common, self._validation.weights)
+            self._local = replace(self._local, widths=self._widths.over(points))
+            self._validation = cross_validate(common, settings, self._local, points, base)
+        self._where = va.all_in_units(common)
+        # what the estimators expect of their samples; 0 where they expect nothing
+        self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
+        self._photos = np.array([s.photo for s in samples], dtype=object)
+        self.bandwidth = bandwidths(points, settings)
+        self._around = Neighbourhood(points, self._validation.weights, va.scales(self.bandwidth))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:
         """Answer at a place, in pixels of some pitch."""
-        near = self.neighbourhood.near([position], settings)
-        where, asked = self.where[near.rows], va.in_units(position, settings)
+        near = self._around.near([position], settings)
+        where, asked = self._where[near.rows], va.in_units(position, settings)
         support = va.Support.of(where, asked)
         outward = math.hypot(*asked[:2]) - float(np.hypot(where[:, 0], where[:, 1]).max())
         return Part(
             self.kernels([position], settings, size, pitch_um)[0],
             self._error(near, support.nearest, max(outward, 0.0)),
             near.weights,
-            self.photos[near.rows],
+            self._photos[near.rows],
             support,
         )
 
@@ -158,14 +134,14 @@ class Regression:
         self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
     ) -> NDArray[np.float64]:
         """Return the kernels of many places, shape (q, size, size)."""
-        near = self.neighbourhood.near(positions, settings)
-        widths = self.widths.over(np.array([va.point(p, settings) for p in positions]))
+        near = self._around.near(positions, settings)
+        widths = self._widths.over(np.array([va.point(p, settings) for p in positions]))
         angles = np.array([p.phi for p in positions])
-        own = self.pitch_um
+        own = self._pitch_um
         if own is None or pitch_um is None or camera_bodies.alike(own, pitch_um):
-            return self.local.kernels(near, angles, widths, size)
+            return self._local.kernels(near, angles, widths, size)
         inside = min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
-        kernels = self.local.kernels(near, angles, widths, inside)
+        kernels = self._local.kernels(near, angles, widths, inside)
         return np.stack([camera_bodies.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
     def _error(self, near: Answers, nearest: float, outward: float) -> float:
@@ -180,13 +156,13 @@ class Regression:
         Estimators that err alike do not scatter: at least half of what they expect is taken for shared.
         """
         weight, rows = near.weights, near.rows
-        _, number = np.unique(self.photos[rows].astype(str), return_inverse=True)
+        _, number = np.unique(self._photos[rows].astype(str), return_inverse=True)
         independent = 1.0 / float((np.bincount(number, weight) ** 2).sum())
-        held_out = float(weight @ self.validation.errors[rows] ** 2)
-        scatter = min(float(weight @ self.validation.noise[rows]), held_out)
+        held_out = float(weight @ self._validation.errors[rows] ** 2)
+        scatter = min(float(weight @ self._validation.noise[rows]), held_out)
         own = max(held_out - scatter * (1.0 + 1.0 / independent), held_out / 9.0) + scatter / independent
-        expected = float(weight @ self.expected[rows] ** 2)
-        if len(self.where) == 1 and expected > 0.0:
+        expected = float(weight @ self._expected[rows] ** 2)
+        if len(self._where) == 1 and expected > 0.0:
             own = 0.0  # no other sample foretells it
         shared = max(expected - scatter, expected / 4.0)
         drift = math.hypot(_DRIFT * max(nearest - 1.0, 0.0), _OUTWARD * outward)
@@ -195,4 +171,4 @@ class Regression:
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
-        return self.local.splines.nbytes
+        return self._local.splines.nbytes

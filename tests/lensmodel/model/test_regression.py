@@ -16,7 +16,7 @@ from lab.model_benchmark import PaperModel, pixel_to_local
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
-from lensmodel.model import LensModel, ModelSettings, local_frame, loops, regression
+from lensmodel.model import LensModel, ModelSettings, local_frame
 from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES
 from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
@@ -160,7 +160,7 @@ def test_spline_goes_through_the_pixels(finer: int) -> None:
     row, whole, at = np.zeros(1, dtype=np.intp), np.array([0, 1]), np.eye(2)[None] * finer
     read = np.zeros((1, 11, 11))
 
-    loops.sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
+    local_frame.spline_sums(stored, np.full(1, 99.0), row, np.ones(1), at, whole, np.zeros((1, 2)), read)
 
     assert np.abs(read[0] - kernel).max() < 1e-6
 
@@ -194,24 +194,23 @@ def test_answer_is_the_sum_over_all_kernels_turned_by_formula() -> None:
         assert np.abs(fast - brute).max() < 2e-3 * brute.max()
 
 
-def test_trees_and_a_look_at_every_sample_give_the_same_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbours_in_the_tree_weigh_what_all_samples_would() -> None:
     rng = np.random.default_rng(6)
     colours = [GREEN.with_channel(CHANNELS[i % 3]) for i in range(300)]
     where = np.array([va.point(p, s) for p, s in zip(places(300, 3), colours, strict=True)])
     where[::5, 3] = np.nan  # some do not know their aperture
-    weights = np.where(rng.random(300) < 0.2, 0.0, rng.random(300))
-    around = Neighbourhood(where, weights, np.array([0.03, 0.2, 0.2, 0.5, 20.0, 0.25, 0.5]))
-    asked = [FieldPosition(0.0, 0.0), *places(7, 4)]
+    claims = np.where(rng.random(300) < 0.2, 0.0, rng.random(300))
+    around = Neighbourhood(where, claims, np.array([0.03, 0.2, 0.2, 0.5, 20.0, 0.25, 0.5]))
 
-    every = around.near(asked, GREEN)
-    monkeypatch.setattr(regression, "_MANY", 0)
-    by_tree = around.near(asked, GREEN)
+    for position in [FieldPosition(0.0, 0.0), *places(7, 4)]:
+        near = around.near([position], GREEN)
+        squared = va.squared_distances(where, va.point(position, GREEN), around.scale)
+        expected = claims * np.exp(-0.5 * (squared - squared[claims > 0.0].min()))
+        found = np.bincount(near.rows, near.weights, 300)
 
-    assert min(every.counts) > 1
-    assert np.array_equal(by_tree.counts, every.counts)
-    assert np.array_equal(by_tree.rows, every.rows)
-    assert by_tree.weights == pytest.approx(every.weights, rel=1e-12)
-    assert len(around.within(va.point(asked[1], GREEN), 1.5)) < 300
+        assert 1 < len(near.rows) < 300
+        assert found == pytest.approx(expected / expected.sum(), abs=1e-3)
+        assert len(around.within(va.point(position, GREEN), 1.5)) < 300
 
 
 def all_pairs(samples: Sequence[PsfSample], position: FieldPosition, *, pixel: float) -> np.ndarray:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from lensmodel.core.geometry import field_grid
     from lensmodel.core.psf import PsfSample
     from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
-    from lensmodel.correction import Bounds, Corrected, Deconvolver, Restored, Sensor, deconvolvers
+    from lensmodel.correction import Bounds, Corrected, Deconvolver, Sensor, deconvolvers
     from lensmodel.lens import Lens
     from lensmodel.model import ModelSettings, PsfAnswer
     from lensmodel.patches import Selector, selectors
@@ -54,7 +54,6 @@ __all__ = [
     "PsfEstimate",
     "PsfEstimator",
     "PsfSample",
-    "Restored",
     "Selector",
     "Sensor",
     "calibrate",
@@ -72,7 +71,7 @@ _HOMES: Final = {
     "lensmodel.photo.development": ("photo_from_array",),
     "lensmodel.blind": ("PsfEstimate", "PsfEstimator", "estimators"),
     "lensmodel.patches": ("Selector", "selectors"),
-    "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
+    "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Sensor", "deconvolvers"),
     "lensmodel.core.errors": ("CancelledError", "LensModelError"),
     "lensmodel.lens": ("Lens",),
     "lensmodel.photo": ("LinearPhoto", "develop"),

@@ -348,7 +348,7 @@ def correct_photo(
     field = known or psfs_for(developed, model, settings, method=method, photo=photo)
     planes, cfa = developed.planes, developed.cfa
     solver = correction.deconvolvers.resolve(wanted)
-    if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
+    if getattr(solver, "warped", False) and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return correction.correct_planes(
         planes,

@@ -41,7 +41,7 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.correction.blur import UniformBlur, fast_shape
-from lensmodel.correction.compiled.common import Real, to_plane, to_spectrum
+from lensmodel.correction.transforms import Real, to_plane, to_spectrum
 from lensmodel.photo import develop, write_image
 
 Window = tuple[int, int, int, int] | None

@@ -27,10 +27,9 @@ from lab.reproduce.cases import repository_grids
 from lensmodel.api import lateral_of
 from lensmodel.core.psf import PsfField, as_kernel
 from lensmodel.core.types import Channel, FieldPosition, Kernel
-from lensmodel.correction import StoredColour, correct_planes
+from lensmodel.correction import KERNEL_SIZE, PsfPosterior, StoredColour, correct_planes, crop_to_support
 from lensmodel.photo import develop
 
-KERNEL: Final = 55
 _HEAD: Final = (
     *("frame", "width", "gain, dB", "overshoot, %", "grain", "dots", "hue flips", "held back", "CPU s/MP"),
 )
@@ -52,10 +51,12 @@ class Widened:
         along = np.maximum(inside, 0.0) / self.width
         return as_kernel(along @ kernel @ along.T)
 
-    def error(self, position: FieldPosition, channel: Channel) -> float:
-        """Return its relative L2 error."""
-        own, true = (field.kernel_at(position, channel, KERNEL) for field in (self, self.true))
-        return float(np.linalg.norm(own - true) / np.linalg.norm(true))
+    def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
+        """Return it with the error that it has."""
+        own, true = (field.kernel_at(position, channel, KERNEL_SIZE) for field in (self, self.true))
+        return PsfPosterior.of_error(
+            crop_to_support(own), float(np.linalg.norm(own - true) / np.linalg.norm(true))
+        )
 
 
 def frames() -> dict[str, SimulatedFrame]:
@@ -70,12 +71,10 @@ def judged(frame: SimulatedFrame, folder: Path, width: float, method: str) -> li
     """Correct a frame with kernels of a width: cells of the table."""
     path, truth = take(frame, folder)
     seen, true = develop(path), frame.truth()
-    wide = Widened(true, width)
-    field, error = (true, 0.0) if width == 1.0 else (wide, wide.error)
     correct = partial(
-        correct_planes, seen.planes, field, seen.frame, noise=seen.correction_noise, clip=seen.clip,
-        cfa=seen.cfa, stored=StoredColour.of_photo(seen), lateral=lateral_of(seen), method=method,
-        psf_error=error,
+        correct_planes, seen.planes, true if width == 1.0 else Widened(true, width), seen.frame,
+        noise=seen.correction_noise, clip=seen.clip, cfa=seen.cfa, stored=StoredColour.of_photo(seen),
+        lateral=lateral_of(seen), method=method,
     )  # fmt: skip
     correct(strength=0.0)  # asks for all kernels
     start = time.process_time()

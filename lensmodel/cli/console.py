@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from lensmodel.core.codec import to_json
 
 REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced in it
-COMPILING = "lensmodel.correction.engine.first_use"  # Logs when loops are compiled, once on a machine
+COMPILING = "lensmodel.correction.whole_photo.first_use"  # Logs when loops are compiled, once on a machine
 
 
 class _Lines(logging.Handler):

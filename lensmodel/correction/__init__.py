@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from lensmodel.correction.blur import crop_to_support
-from lensmodel.correction.deconvolver import (
-    ColourDeconvolver,
-    Deconvolver,
-    Restored,
-    Sensor,
-    WarpableMethod,
-    restore_planes,
-)
+from lensmodel.correction.deconvolver import ColourDeconvolver, Deconvolver, Sensor, restore_planes
 from lensmodel.correction.expected_gain import ZoneReport
+from lensmodel.correction.lattice import Roi
 from lensmodel.correction.limit import Bounds
-from lensmodel.correction.methods.catalogue import deconvolvers
 from lensmodel.correction.methods.direct import DirectFilter
 from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
 from lensmodel.correction.posterior import PosteriorField, PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
-from lensmodel.correction.tiles.lattice import Roi
-from lensmodel.correction.whole_photo import KERNEL_SIZE, Corrected, PsfError, correct_planes
+from lensmodel.correction.whole_photo import KERNEL_SIZE, Corrected, correct_planes, deconvolvers
 
 __all__ = [
     "KERNEL_SIZE",
@@ -30,16 +22,13 @@ __all__ = [
     "Deconvolver",
     "DirectFilter",
     "PosteriorField",
-    "PsfError",
     "PsfPosterior",
-    "Restored",
     "RichardsonLucy",
     "Roi",
     "SaturationAwareRichardsonLucy",
     "Sensor",
     "SparseGradient",
     "StoredColour",
-    "WarpableMethod",
     "ZoneReport",
     "correct_planes",
     "crop_to_support",

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
-from lensmodel.core.types import CHANNELS, ZONES, NoiseModel, Plane, Planes, Zone
+from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.clipped import LEAST_CLIPPED
-from lensmodel.correction.compiled.common import Complex, Real, smooth, through
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.transforms import Complex, Real, smooth, through
 
 Window: TypeAlias = tuple[slice, slice]
 
@@ -25,10 +24,7 @@ LIMITS: Final[Mapping[str, float]] = {REBLUR: 2.0, SPECTRUM: 2.0, ISOLATED: _STA
 """Figure of each check, in the unit of its own equation, from which a correction is held back (chosen: above
 what sound corrections of photographs reach)."""
 
-CHECKS: Final = tuple(LIMITS)
-"""Every check by name."""
-
-MODEL_ERROR: Final = 0.3
+_MODEL_ERROR: Final = 0.3
 """Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and prior
 and limit give way at edges (chosen)."""
 _GLOW: Final = 0.005
@@ -43,7 +39,7 @@ sixty stand out by 4; a correction amplifies noise three times before one is a f
 _ROOM: Final = 1.25  # factor for points that lie a part of a pixel beside the middle of theirs (chosen)
 _USUAL_GAIN: Final = 8.0  # of a point behind a PSF of one pixel, and the largest gain to assume
 
-SIDE: Final = 8  # pixels of a block: that of a JPEG (ITU-T T.81)
+_SIDE: Final = 8  # pixels of a block: that of a JPEG (ITU-T T.81)
 _WEIGHTS: Final = np.array([1, 2, 3, 4, 5, 4, 3, 2, 1], dtype=np.float32)
 """Weights of the blocks around one, along rows and columns: a window that fades out (chosen). A wrong kernel
 is wrong all around; patches of different sharpness would show, and fewer pixels say less."""
@@ -54,68 +50,45 @@ nothing of a faulty pixel comes back, and no edge shows)."""
 HELD: Final = 0.1
 """Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth is only
 just seen, a half only what is spoilt)."""
-MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """What is known of a tile apart from its pixels.
-
-    Parameters
-    ----------
-    noise : sequence of NoiseModel
-        One per channel; that of the measured pixels if `measured` is given, else of every pixel.
-    clip : sequence of float
-        Level per channel at and above which a value of the photo is only a lower bound.
-    blurs : sequence of UniformBlur or None
-        PSF of each channel, lateral shift included; None if unknown, and nothing is re-blurred.
-    psf_errors : sequence of float
-        Expected relative L2 error of each PSF.
-    measured : sequence of (ndarray of bool or None)
-        Per channel where the sensor measured it, `(rows, cols)`; None for everywhere.
-    """
-
-    noise: Sequence[NoiseModel]
-    clip: Sequence[float] = (1.0, 1.0, 1.0)
-    blurs: Sequence[UniformBlur] | None = None
-    psf_errors: Sequence[float] = (0.0, 0.0, 0.0)
-    measured: Sequence[NDArray[np.bool_] | None] = (None, None, None)
-
-    def __post_init__(self) -> None:
-        counts = [len(self.noise), len(self.clip), len(self.psf_errors), len(self.measured)]
-        if self.blurs is not None:
-            counts.append(len(self.blurs))
-        if any(count != len(CHANNELS) for count in counts):
-            raise InvalidInputError(f"every kind of evidence needs one entry per channel, got {counts}")
+_MAPPED: Final = 0.01  # least share held back at which a tile is on the map (chosen: less is not seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TileAudit:
-    """Verdict on one tile.
+    """Mean share of a tile's correction that is held back, 0 to 1, and that of each check as if alone."""
 
-    Parameters
-    ----------
-    keep : Plane, shape (rows, cols)
-        Share of the correction that is kept, 0 to 1; 1 everywhere on a sound tile.
-    held_back : float
-        Mean share of the correction that is held back, 0 to 1.
-    checks : Mapping[str, float]
-        The same by check, each as if alone.
-    """
-
-    keep: Plane
     held_back: float
     checks: Mapping[str, float]
 
-    def without_map(self) -> TileAudit:
-        """Return the figures alone: the maps of all tiles are as large as a photo's plane."""
-        return replace(self, keep=np.zeros((0, 0), dtype=np.float32))
+
+def held_back(
+    photo: Planes,
+    restored: Planes,
+    blurs: Sequence[UniformBlur] | None,
+    sensors: Sequence[Sensor],
+    errors: Sequence[float],
+    inner: Window,
+) -> tuple[Planes, TileAudit]:
+    """Audit the correction of a tile and mix its `inner` part back towards the photo as far as it fails.
+
+    Where all is kept, it is exactly the correction. Without `blurs` nothing is re-blurred; see `kept_shares`.
+    """
+    keep, checks = kept_shares(photo, restored, blurs, sensors, errors, inner)
+    part = (slice(None), *inner)
+    before, after = photo[part], restored[part]
+    audit = TileAudit(float(1.0 - keep.mean(dtype=np.float64)), checks)
+    return after if keep.min(initial=1.0) == 1.0 else (after - before) * keep + before, audit
 
 
-def audit_tile(
-    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Window | None = None
-) -> TileAudit:
-    r"""Audit the correction of a tile.
+def kept_shares(
+    photo: Planes,
+    restored: Planes,
+    blurs: Sequence[UniformBlur] | None,
+    sensors: Sequence[Sensor],
+    errors: Sequence[float],
+    inner: Window,
+) -> tuple[Plane, dict[str, float]]:
+    r"""Share of the correction of each pixel of `inner` that is kept, and what each check alone holds back.
 
     With y the photo, x the result, sigma the noise, k the PSF and e its relative error, three figures around
     each place; D_s is the mean power of second differences along rows and columns at a distance of s pixels,
@@ -130,48 +103,23 @@ def audit_tile(
                          the photo's bump there would
 
     Of a correction within the limits all is kept, from twice the limit on nothing, and a share between.
-
-    Parameters
-    ----------
-    original, corrected : Planes, shape (3, rows, cols)
-        Linear light, saturation 1, with surrounding pixels if there are any.
-    evidence : Evidence
-        What else is known.
-    inner : tuple of slice or None
-        The part that is judged; the rest is context. None for all.
-
-    Returns
-    -------
-    TileAudit
-        Of the inner part.
-
-    Raises
-    ------
-    InvalidInputError
-        If the planes have different sizes.
     """
-    if original.shape != corrected.shape or original.ndim != 3 or original.shape[0] != len(CHANNELS):
-        raise InvalidInputError(
-            f"original and correction must be (3, rows, cols) of one size, got {original.shape} and "
-            f"{corrected.shape}"
-        )
-    y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (original, corrected))
+    y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (photo, restored))
     shape = (y.shape[1], y.shape[2])
-    inner = inner or (slice(0, shape[0]), slice(0, shape[1]))
-    noise = np.array([[n.shot, n.read] for n in evidence.noise], dtype=np.float32)
+    noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
     powers = np.zeros((6, *_blocks(shape)), dtype=np.float32)
-    clip = np.asarray(np.minimum(evidence.clip, 1e9), dtype=np.float32)
+    clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
     keep = np.ones(shape, dtype=np.float32)
     part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
-    spikes = _spikes(y, x, noise, clip, _point_gains(evidence), part, _FOOT, keep)
+    spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, _FOOT, keep)
     checks = {ISOLATED: spikes / keep[inner].size}
     _powers(y, x, noise, clip, powers)
-    wide = around(powers)
+    wide = _around(powers)
     known = wide[2:5].max(axis=0) + np.float32(_NOISE) * wide[5] + np.float32(1e-12)
     severities = {SPECTRUM: np.sqrt(wide[:2].max(axis=0) / known)}
-    if evidence.blurs is not None:
-        severities[REBLUR] = _misfit(y, x, evidence)
-    blocks = tuple(slice(a // SIDE, max(-(-b // SIDE), 1)) for a, b in (part[:2], part[2:]))
+    if blurs is not None:
+        severities[REBLUR] = _misfit(y, x, blurs, sensors, errors)
+    blocks = tuple(slice(a // _SIDE, max(-(-b // _SIDE), 1)) for a, b in (part[:2], part[2:]))
     for check, severity in severities.items():
         share = np.clip(
             np.float32(2.0) - severity / np.float32(LIMITS[check]), np.float32(0.0), np.float32(1.0)
@@ -179,41 +127,15 @@ def audit_tile(
         if share.min() < 1.0:
             _lower(keep, share)
         checks[check] = float(1.0 - share[blocks].mean(dtype=np.float64))
-    keep = keep[inner]
-    return TileAudit(keep, float(1.0 - keep.mean(dtype=np.float64)), checks)
+    return keep[inner], checks
 
 
-def held_back(
-    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Window | None = None
-) -> tuple[Planes, TileAudit]:
-    """Audit the correction of a tile and mix it back towards the original as far as it fails.
-
-    Parameters and errors as `audit_tile`.
-
-    Returns
-    -------
-    planes : Planes, shape (3, rows, cols) of the inner part
-        original + keep (corrected - original); where all is kept, exactly the correction.
-    audit : TileAudit
-        Why.
-    """
-    audit = audit_tile(original, corrected, evidence, inner=inner)
-    part = (slice(None), *(inner or (slice(None), slice(None))))
-    before, after = original[part], corrected[part]
-    if audit.keep.min(initial=1.0) == 1.0:
-        return after, audit
-    mixed = after - before
-    mixed *= audit.keep
-    mixed += before
-    return mixed, audit
-
-
-def _point_gains(evidence: Evidence) -> Real:
+def _point_gains(blurs: Sequence[UniformBlur] | None) -> Real:
     """How much more a point stands out of its surroundings than its image does, by colour."""
-    if evidence.blurs is None:
+    if blurs is None:
         return np.full(len(CHANNELS), _USUAL_GAIN, dtype=np.float32)
     gains = []
-    for blur in evidence.blurs:
+    for blur in blurs:
         middle = blur.kernel.shape[0] // 2
         low = max(middle - 2, 0)
         mean = float(blur.kernel[low : middle + 3, low : middle + 3].sum() / 25.0)
@@ -321,14 +243,15 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
     return held
 
 
-def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
+def _misfit(
+    y: Planes, x: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], errors: Sequence[float]
+) -> Real:
     """Root mean square of the residual around each block, the most of all colours."""
-    assert evidence.blurs is not None
     shape = (y.shape[1], y.shape[2])
-    grid = fast_shape(tuple(max(n, b.kernel.shape[0]) for n in shape for b in evidence.blurs[:1]))
+    grid = fast_shape(tuple(max(extent, blurs[0].kernel.shape[0]) for extent in shape))
     worst = np.zeros(_blocks(shape), dtype=np.float32)
     limit = np.float32(LIMITS[REBLUR] ** 2)
-    for c, blur in enumerate(evidence.blurs):
+    for c, (blur, sensor) in enumerate(zip(blurs, sensors, strict=True)):
         K = blur.spectrum(grid)
         scratch = np.empty_like(K)
 
@@ -342,23 +265,22 @@ def _misfit(y: Planes, x: Planes, evidence: Evidence) -> Real:
         rim = min(blur.reach, (min(shape) - 1) // 2)
         counted = np.zeros(shape, dtype=np.float32)
         counted[rim : shape[0] - rim, rim : shape[1] - rim] = 1.0
-        measured = evidence.measured[c]
-        if measured is not None:
-            counted *= measured
-        clipped = y[c] >= np.float32(LEAST_CLIPPED * evidence.clip[c])
+        if sensor.measured is not None:
+            counted *= sensor.measured
+        clipped = y[c] >= np.float32(LEAST_CLIPPED * sensor.clip)
         if clipped.any():
             counted *= spread(clipped)[: shape[0], : shape[1]] < _GLOW
-        noise, error = evidence.noise[c], max(evidence.psf_errors[c], MODEL_ERROR)
-        allowed = np.array([noise.shot, noise.read, error**2], dtype=np.float32)
+        error = max(errors[c], _MODEL_ERROR)
+        allowed = np.array([sensor.noise.shot, sensor.noise.read, error**2], dtype=np.float32)
         blurred = spread(x[c])
         sums = np.zeros((2, *worst.shape), dtype=np.float32)
         _residual(y[c], x[c], blurred, blurred, counted, allowed, sums)
-        square, number = around(sums)
+        square, number = _around(sums)
         number = np.maximum(number, np.float32(1.0))
         if (square > limit * number).any():  # else it does not matter what the photo itself leaves
             sums[:] = 0.0
             _residual(y[c], x[c], blurred, spread(y[c]), counted, allowed, sums)
-            number = np.maximum(number, around(sums)[0] / limit)
+            number = np.maximum(number, _around(sums)[0] / limit)
         np.maximum(worst, np.sqrt(square / number), out=worst)
     return worst
 
@@ -382,10 +304,10 @@ def _residual(
 
 
 def _blocks(shape: tuple[int, int]) -> tuple[int, int]:
-    return -(-shape[0] // SIDE), -(-shape[1] // SIDE)
+    return -(-shape[0] // _SIDE), -(-shape[1] // _SIDE)
 
 
-def around(totals: Real) -> Real:
+def _around(totals: Real) -> Real:
     """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
     out = np.empty_like(totals)
     for figures, into in zip(totals, out, strict=True):
@@ -469,34 +391,22 @@ class AuditReport:
 
 
 def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side: int = 0) -> AuditReport:
-    """Pool the audits of tiles.
-
-    Parameters
-    ----------
-    audits : iterable of (zone, (row, col), TileAudit)
-        Zone of each tile and its first pixel in the photo.
-    tile_side : int
-        Side of the square in pixels that a tile stands for.
-
-    Returns
-    -------
-    AuditReport
-    """
+    """Pool the audits of tiles, each with its zone and its first pixel in the photo."""
     listed = list(audits)
-    zones: dict[Zone, ZoneAudit] = {}
-    for zone in ZONES:
-        in_zone = [audit for name, _, audit in listed if name == zone]
-        if in_zone:
-            zones[zone] = _zone(in_zone)
+    zones = {
+        zone: _zone(in_zone)
+        for zone in ZONES
+        if (in_zone := [audit for name, _, audit in listed if name == zone])
+    }
     held = tuple(
-        HeldTile(top, left, audit.held_back) for _, (top, left), audit in listed if audit.held_back >= MAPPED
+        HeldTile(top, left, audit.held_back) for _, (top, left), audit in listed if audit.held_back >= _MAPPED
     )
     return AuditReport(zones, held, tile_side)
 
 
 def _zone(audits: list[TileAudit]) -> ZoneAudit:
     shares = [audit.held_back for audit in audits]
-    checks = {name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits])) for name in CHECKS}
+    checks = {name: float(np.mean([audit.checks.get(name, 0.0) for audit in audits])) for name in LIMITS}
     return ZoneAudit(
         len(audits),
         sum(share > HELD for share in shares),

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel
+from lensmodel.core.jit import jit
+from lensmodel.core.psf import as_kernel, resized
 from lensmodel.core.types import Kernel, Plane
-from lensmodel.correction.compiled.common import through, transfer
-from lensmodel.correction.compiled.tile import spectra_of
+from lensmodel.correction.transforms import Complex, Number, Real, through, transfer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,17 +76,7 @@ class UniformBlur:
         return max(support_radius(self.kernel, 0.98), 1) + math.ceil(max(map(abs, self.offset))) + 1
 
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer function on the `rfft2` grid of `shape`, cached.
-
-        Parameters
-        ----------
-        shape : tuple of int
-            Rows and columns, no smaller than the kernel.
-
-        Returns
-        -------
-        ndarray of complex64, shape (rows, cols // 2 + 1)
-        """
+        """Transfer function on the `rfft2` grid of `shape`, which is no smaller than the kernel; cached."""
         if shape not in self._spectra:
             K = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
             transfer(self.taps, K, shape[1])
@@ -106,16 +96,7 @@ class UniformBlur:
         return np.asarray(rows @ self.kernel @ cols.T, dtype=np.float32)
 
     def forward(self, latent: Plane) -> Plane:
-        """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`.
-
-        Parameters
-        ----------
-        latent : Plane, float32
-
-        Returns
-        -------
-        Plane, float32
-        """
+        """K * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`, float32."""
         cut, (height, width) = self.reach, latent.shape
         if min(latent.shape) <= 2 * cut:
             raise InvalidInputError(
@@ -127,16 +108,7 @@ class UniformBlur:
         return np.ascontiguousarray(work[cut : height - cut, cut : width - cut])
 
     def adjoint(self, blurred: Plane) -> Plane:
-        """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`.
-
-        Parameters
-        ----------
-        blurred : Plane, float32
-
-        Returns
-        -------
-        Plane, float32
-        """
+        """Correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`, float32."""
         cut = self.reach
         height, width = (extent + 2 * cut for extent in blurred.shape)
         work, scratch, K = self._canvas((height, width))
@@ -153,49 +125,24 @@ class UniformBlur:
         return np.zeros(grid, dtype=np.float32), np.empty_like(K), K
 
     def covered(self, shape: tuple[int, ...]) -> Plane:
-        """Share of the light of each latent point that falls into a frame of `shape`: F^T 1.
+        """Share of the light of each latent point that falls into a frame of `shape`: F^T 1, float32.
 
         A point sees a rectangle of the kernel, so cumulative sums suffice and no transform is needed,
         except for a shift by parts of a pixel.
-
-        Parameters
-        ----------
-        shape : tuple of int
-            Of the frame.
-
-        Returns
-        -------
-        Plane, float32
-            Wider than the frame by the side of the kernel less 1.
         """
         if self.offset != (0.0, 0.0):
             return self.adjoint(np.ones(shape, dtype=np.float32))
         side = self.kernel.shape[0]
         sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        spans, kinds = [], []
-        for extent in shape:
-            start = side - 1 - np.arange(extent + side - 1)
-            ends = np.clip(start, 0, side) * (side + 1) + np.clip(start + extent, 0, side)
-            # Points far from the rim all see the whole kernel: one lookup serves them all.
-            distinct, kind = np.unique(ends, return_inverse=True)
-            spans.append(np.divmod(distinct, side + 1))
-            kinds.append(kind)
-        (above, below), (before, after) = spans
+        starts = [side - 1 - np.arange(extent + side - 1) for extent in shape]
+        above, before = (np.clip(start, 0, side) for start in starts)
+        below, after = (np.clip(start + n, 0, side) for start, n in zip(starts, shape, strict=True))
         inside = sums[np.ix_(below, after)] - sums[np.ix_(above, after)]
         inside += sums[np.ix_(above, before)] - sums[np.ix_(below, before)]
-        return inside.astype(np.float32)[np.ix_(*kinds)]
+        return inside.astype(np.float32)
 
     def frame(self, latent: Plane) -> Plane:
-        """Return the part of the latent plane that the photo shows.
-
-        Parameters
-        ----------
-        latent : Plane
-
-        Returns
-        -------
-        Plane
-        """
+        """Return the part of the latent plane that the photo shows."""
         cut = self.reach
         return latent[cut : latent.shape[0] - cut, cut : latent.shape[1] - cut]
 
@@ -223,18 +170,7 @@ def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def support_radius(kernel: Kernel, energy: float = 0.999) -> int:
-    """Half side, in pixels, of the centred square that holds `energy` of the kernel's sum.
-
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    energy : float
-        Share in 0..1.
-
-    Returns
-    -------
-    int
-    """
+    """Half side, in pixels, of the centred square that holds a share `energy` of the kernel's sum."""
     middle = kernel.shape[0] // 2
     t = np.abs(np.arange(kernel.shape[0]) - middle)
     ring = np.maximum(t[:, None], t[None, :])
@@ -243,70 +179,61 @@ def support_radius(kernel: Kernel, energy: float = 0.999) -> int:
 
 
 def crop_to_support(kernel: Kernel, energy: float = 0.999) -> Kernel:
-    """Cut a kernel to its support; the middle pixel stays the middle, the sum is 1 again.
-
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    energy : float
-        Share of the sum that the support holds, 0..1.
-
-    Returns
-    -------
-    Kernel, shape (s, s)
-        s odd, at most k.
-    """
-    middle, radius = kernel.shape[0] // 2, support_radius(kernel, energy)
-    return as_kernel(kernel[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1])
-
-
-Transfers = tuple[NDArray[np.complex64], NDArray[np.complex64]]
+    """Cut a kernel to what holds a share `energy` of its sum; the sum is 1 again."""
+    return resized(kernel, 2 * support_radius(kernel, energy) + 1)
 
 
 def transfers(
-    blurs: Sequence[UniformBlur],
-    shape: tuple[int, int],
-    reach: float,
-    *,
-    drifting: bool = True,
-) -> Transfers:
+    blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float
+) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
     """Return K, `(channel, rows, cols)`, and its change per pixel, `(channel, 2, rows, cols)`.
 
-    The latter is empty where a kernel has none or `drifting` is false. Each step of a solver inverts K
-    alone and takes the change to the other side, as data. That converges only where the change is
-    smaller than K, so it is limited to half of K at `reach` pixels from the middle.
+    The latter is empty where a kernel has none. Each step of a solver inverts K alone and takes the change to
+    the other side, as data. That converges only where the change is smaller than K, so it is limited to half
+    of K at `reach` pixels from the middle.
     """
-    taps = _taps(blurs, drifting=drifting)
+    parts = [[(0, blur.taps, 1.0)] for blur in blurs]
+    drifts = [blur.drift for blur in blurs if blur.drift is not None]
+    if drifting := len(drifts) == len(blurs):
+        for drift, listed in zip(drifts, parts, strict=True):
+            for index, (before, after, pixels) in enumerate((drift.down, drift.across), start=1):
+                change = 1.0 / max(pixels, 1.0)
+                listed += [(index, before.taps, -change), (index, after.taps, change)]
+    side = max(kernel.shape[0] for listed in parts for _, kernel, _ in listed)
+    taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
+    for c, listed in enumerate(parts):
+        for index, kernel, factor in listed:
+            low = (side - kernel.shape[0]) // 2
+            taps[c, index, low : side - low, low : side - low] += factor * kernel
     half = shape[1] // 2 + 1
-    K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
-    rates = np.empty((len(taps) if taps.shape[1] > 1 else 0, 2, shape[0], half), dtype=np.complex64)
-    spectra_of(taps, np.float32(reach), shape[1], K, rates)
+    K = np.empty((len(blurs), shape[0], half), dtype=np.complex64)
+    rates = np.empty((len(drifts) if drifting else 0, 2, shape[0], half), dtype=np.complex64)
+    _spectra_of(taps, np.float32(reach), shape[1], K, rates)
     return K, rates
 
 
-def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32]:
-    """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
-    drifts = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
-    drifting = drifting and len(drifts) == len(blurs)
-    kernels = [blur.taps for blur in blurs]
-    ends = [
-        [(before.taps, after.taps, max(pixels, 1.0)) for before, after, pixels in pair] for pair in drifts
-    ]
-    sides = [kernel.shape[0] for kernel in kernels]
-    if drifting:
-        sides += [end.shape[0] for pair in ends for both in pair for end in both[:2]]
-    side = max(sides)
-    taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
+@jit
+def _spectra_of(taps: Real, reach: Number, width: int, K: Complex, rates: Complex) -> None:
+    """Transfer functions of kernels `(channel, 1 or 3, k, k)`, and how they change, limited."""
+    for c in range(taps.shape[0]):
+        transfer(taps[c, 0], K[c], width)
+        if taps.shape[1] > 1:
+            transfer(taps[c, 1], rates[c, 0], width)
+            transfer(taps[c, 2], rates[c, 1], width)
+            _limit_change(K[c], rates[c], reach)
 
-    def place(channel: int, index: int, kernel: NDArray[np.float32], factor: float) -> None:
-        low = (side - kernel.shape[0]) // 2
-        taps[channel, index, low : side - low, low : side - low] += factor * kernel
 
-    for c, kernel in enumerate(kernels):
-        place(c, 0, kernel, 1.0)
-    if drifting:
-        for c, pair in enumerate(ends):
-            for index, (before, after, pixels) in enumerate(pair, start=1):
-                place(c, index, before, -1.0 / pixels)
-                place(c, index, after, 1.0 / pixels)
-    return taps
+@jit
+def _limit_change(K: Complex, rates: Complex, reach: Number) -> None:
+    """Hold the change of a transfer function within half of it; see `transfers`."""
+    for i in range(K.shape[0]):
+        for j in range(K.shape[1]):
+            k, d, a = K[i, j], rates[0, i, j], rates[1, i, j]
+            change = reach * (
+                np.sqrt(d.real * d.real + d.imag * d.imag) + np.sqrt(a.real * a.real + a.imag * a.imag)
+            )
+            allowed = np.float32(0.5) * np.sqrt(k.real * k.real + k.imag * k.imag)
+            if change > allowed:
+                share = allowed / max(change, np.float32(1e-9))
+                rates[0, i, j] = d * share
+                rates[1, i, j] = a * share

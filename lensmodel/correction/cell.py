@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,48 +15,30 @@ from scipy import ndimage
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, delta
-from lensmodel.core.types import (
-    CHANNELS,
-    BayerPattern,
-    Channel,
-    FieldPosition,
-    NoiseModel,
-    Planes,
-)
-from lensmodel.correction.audit import Evidence, TileAudit, held_back
+from lensmodel.core.types import CHANNELS, BayerPattern, Channel, FieldPosition, NoiseModel, Planes
+from lensmodel.correction.audit import TileAudit, held_back
 from lensmodel.correction.blur import Drift, UniformBlur
-from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver, Sensor, Solution, restore_planes
+from lensmodel.correction.canvas import fitted_halo
+from lensmodel.correction.deconvolver import Deconvolver, Sensor, Solution, restore_planes
 from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
+from lensmodel.correction.lattice import Cell
 from lensmodel.correction.limit import Bounds, limited
 from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
-from lensmodel.correction.tiles.canvas import fitted_halo
-from lensmodel.correction.tiles.lattice import Cell
+from lensmodel.photo.lateral import LateralColour
 
-_WINDOW, _NOISE, _TEXTURE = 7, 1.5, 4.0
-"""Side of the window in pixels in which what is unexplained is compared with the noise, and its power over
-that of the noise up to which it is noise, and from which it is texture (chosen: more than chance makes)."""
-
-
-class LateralColourShift(Protocol):
-    """Lateral colour of a lens: how far red and blue images lie from the green one."""
-
-    def displacement(self, r: float, channel: Channel) -> float:
-        """Outward distance in pixels from the green image of a point at r to a channel's image of it."""
-
-
-MIN_HALO, MORE = 12, 6
+_MIN_HALO, _MORE = 12, 6
 """Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
-
-SHARE: Final = 0.87
+_SHARE: Final = 0.87
 """Share of what the prior took that is added back to full planes: three quarters of the power of the grain,
 so that with grain that the inverse of the blur amplifies it is no more than there was (chosen). Of a mosaic
 all comes back that `spread_grain` leaves, where a plan counts on as much: coloured grain stays away."""
-
-
-HALF, BEST = 0.5, 0.25
+_HALF, _BEST = 0.5, 0.25
 """Error of a kernel at which half of the correction of a processed photo is made, and the least that counts
 (chosen: through a camera's processing none is known better). See `CorrectionJob.strength_at`."""
+_WINDOW, _NOISE, _TEXTURE = 7, 1.5, 4.0
+"""Side of the window in pixels in which what is unexplained is compared with the noise, and its power over
+that of the noise up to which it is noise, and from which it is texture (chosen: more than chance makes)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,12 +55,10 @@ class CorrectionJob:
     clip: Sequence[float]
     cfa: BayerPattern | None
     bounds: Bounds
-    cell_factor: int
-    audited: bool
+    layers: tuple[Bounds, ...]
     unguarded: bool
     stored: StoredColour | None
-    processed: bool = False
-    layers: tuple[Bounds, ...] = ()
+    processed: bool
 
     def __post_init__(self) -> None:
         shape = (len(CHANNELS), self.frame.height, self.frame.width)
@@ -90,6 +70,12 @@ class CorrectionJob:
             raise InvalidInputError(
                 f"noise and clip need one entry per channel, got {len(self.noise)} and {len(self.clip)}"
             )
+
+    @property
+    def cell_factor(self) -> int:
+        """How much larger than usual cells are: then kernels do not change within them."""
+        factor: int = getattr(self.method, "cell_factor", 1)
+        return factor
 
     def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
@@ -118,7 +104,7 @@ class CorrectionJob:
         change is in vain. A share s of a change that is right gains 1 - (1 - s)² of it; of one that is not,
         the error falls with s².
         """
-        return self.strength / (1.0 + (max(error, BEST) / HALF) ** 2) if self.processed else self.strength
+        return self.strength / (1.0 + (max(error, _BEST) / _HALF) ** 2) if self.processed else self.strength
 
 
 def _weakened(photo: Planes, restored: Planes, strength: float) -> Planes:
@@ -157,7 +143,7 @@ class _CellTile:
         """Cut the tile of a cell out of a photo."""
         blurs = [job.blur_at(cell.position, channel, 1.0) for channel in CHANNELS]
         reach = max(blur.reach for blur in blurs)
-        halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
+        halo = fitted_halo((len(cell.rise), len(cell.run)), max(_MIN_HALO, reach + _MORE))
         top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
         part = job.planes[:, top : cell.bottom + halo, left : cell.right + halo]
         tile = np.ascontiguousarray(part, dtype=np.float32)
@@ -216,7 +202,7 @@ def _within(
 ) -> RestoredCell:
     """Restore a tile within bounds, checked; cut its halo off."""
     cell, sensors = tile.cell, tile.sensors
-    plans = plan(cell, tile.photo, tile.posteriors, tile.offsets, sensors, SHARE * bounds.texture)
+    plans = plan(cell, tile.photo, tile.posteriors, tile.offsets, sensors, _SHARE * bounds.texture)
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.unguarded):
@@ -246,13 +232,13 @@ def _checked(
     blurs: Sequence[UniformBlur],
     solution: Solution,
     softness: float,
-) -> tuple[Planes, TileAudit | None]:
+) -> tuple[Planes, TileAudit]:
     """Add back what the prior took, limit, audit; the cell without its halo."""
     photo, sensors, errors = tile.photo, tile.sensors, [posterior.error for posterior in tile.posteriors]
     restored = solution.planes
     if solution.unexplained is not None and bounds.texture > 0.0:
-        most = SHARE if job.cfa is None else 1.0
-        share = np.float32(most * bounds.texture) * texture_share(
+        most = _SHARE if job.cfa is None else 1.0
+        share = np.float32(most * bounds.texture) * _texture_share(
             photo, solution.unexplained, sensors, bounds.denoise
         )
         if softness > 0.0:
@@ -261,14 +247,8 @@ def _checked(
     if job.stored is not None:
         restored = job.stored.held(photo, restored)
     restored = limited(photo, restored, blurs, sensors, errors, bounds.halo)
-    if not job.audited:
-        return restored[tile.inner], None
-    known = (
-        None if isinstance(job.method, CoarseMethod) else blurs
-    )  # Wiener's filter leaves no more than noise
-    evidence = Evidence(job.noise, job.clip, known, errors, [sensor.measured for sensor in sensors])
-    restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
-    return restored, verdict.without_map()
+    known = None if job.cell_factor > 1 else blurs  # Wiener's filter leaves no more than noise
+    return held_back(photo, restored, known, sensors, errors, tile.inner[1:])
 
 
 def _without_own_grain(photo: Planes, restored: Planes, softness: float) -> NDArray[np.float32]:
@@ -284,7 +264,7 @@ def _without_own_grain(photo: Planes, restored: Planes, softness: float) -> NDAr
     return np.asarray(1.0 - softness * own, dtype=np.float32)
 
 
-def texture_share(
+def _texture_share(
     photo: Planes, unexplained: Planes, sensors: Sequence[Sensor], denoise: float
 ) -> NDArray[np.float32] | np.float32:
     """1 where what is unexplained is texture, 1 - denoise where it is noise."""
@@ -299,7 +279,7 @@ def texture_share(
 
 def blur_of(
     posterior: PsfPosterior,
-    lateral: LateralColourShift | None,
+    lateral: LateralColour | None,
     position: FieldPosition,
     channel: Channel,
     share: float,

@@ -17,6 +17,7 @@ from lensmodel.core.types import ZONES, Plane, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.lattice import Cell
 from lensmodel.correction.posterior import GRID, WIDEST, PsfPosterior
 from lensmodel.correction.scene_power import (
     frequency_counts,
@@ -26,7 +27,7 @@ from lensmodel.correction.scene_power import (
     scene_power,
     softness,
 )
-from lensmodel.correction.tiles.lattice import Cell
+from lensmodel.correction.transforms import Complex, Number, Real
 
 WORTH_DB: Final = 0.1
 """Expected gain below which a place is left as it is: a tenth of a decibel is not seen (chosen)."""
@@ -37,7 +38,6 @@ _UNKNOWN: Final = 1.0
 _SHARES: Final = np.array([1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1, 0.0], dtype=np.float32)
 """Shares of a kernel to try, the last if all others may harm; finer steps change the error by a hundredth."""
 
-_GRID: Final = GRID
 _SHARPER: Final = 3.0
 """Standard deviations z by which the true kernel may be narrower where a scene is out of focus (chosen: with
 2, twice as many blocks of a photo out of focus lose by a lens that is known from one such photo)."""
@@ -73,7 +73,7 @@ class CellForecast:
         than full planes do, for which the forecast is made: there the change itself counts. None where the
         change is so small that the error cannot have fallen by `least` decibels.
         """
-        scale = _GRID[0] * _GRID[1] / photo[0].size
+        scale = GRID[0] * GRID[1] / photo[0].size
         change = scale * _squared_distance(photo, result)
         if change < (1.0 - 10.0 ** (-0.1 * least)) * self.before:
             return None
@@ -132,9 +132,9 @@ class Plan:
 class _Scene:
     """One colour of a cell: transfer functions of its kernel and of a point, noise, and the scene's power."""
 
-    K: NDArray[np.complex64]
-    point: NDArray[np.complex64]
-    D: NDArray[np.float32]
+    K: Complex
+    point: Complex
+    D: Real
     noise: float
     level: float
     slope: float
@@ -150,9 +150,9 @@ class _Scene:
         sensor: Sensor,
     ) -> _Scene:
         """Fit the law of the scene to the power of a plane in each ring."""
-        point = UniformBlur(delta(1), offset).spectrum(_GRID)
+        point = UniformBlur(delta(1), offset).spectrum(GRID)
         known = posterior.kernel.shape[0] <= WIDEST
-        K = UniformBlur(posterior.kernel, offset).spectrum(_GRID) if known else point
+        K = UniformBlur(posterior.kernel, offset).spectrum(GRID) if known else point
         noise = float(sensor.variance(plane[::_EVERY, ::_EVERY].mean()))
         seen = noise_power(noise, channel, mosaic=sensor.measured is not None)
         law = scene_law(rings, K.real**2 + K.imag**2 + posterior.variance, seen)
@@ -184,12 +184,7 @@ def plan(
 
         H = K |K|^-min( z D^(1/2) / |K ln |K||, 1 ),    t ( 1 - min( |W|², 1 ) )
 
-    Parameters
-    ----------
-    offsets : sequence of tuple of float
-        Lateral shift of each channel, `(row, col)` in pixels.
-    returned : float
-        t.
+    `offsets` are the lateral shifts of the channels, `(row, col)` in pixels; `returned` is t.
     """
     rings = ring_power(tile).mean(axis=1)
     scenes = [
@@ -202,7 +197,7 @@ def plan(
     for scene in scenes:
         left, harm = np.empty((2, _SHARES.size))
         S, t = scene_power(scene.level, scene.slope), np.float32(returned)
-        given = (scene.K, scene.point, S, scene.D, frequency_counts(_GRID), np.float32(scene.noise))
+        given = (scene.K, scene.point, S, scene.D, frequency_counts(GRID), np.float32(scene.noise))
         unchanged = _remaining(*given, _SHARES, t, np.float32(soft), z, left, harm)
         harmless = harm <= 0.0
         harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
@@ -217,16 +212,16 @@ def plan(
 
 @jit
 def _remaining(
-    K: NDArray[np.complex64],
-    point: NDArray[np.complex64],
-    S: NDArray[np.float32],
-    D: NDArray[np.float32],
-    times: NDArray[np.float32],
-    noise: np.float32,
-    shares: NDArray[np.float32],
-    returned: np.float32,
-    soft: np.float32,
-    z: np.float32,
+    K: Complex,
+    point: Complex,
+    S: Real,
+    D: Real,
+    times: Real,
+    noise: Number,
+    shares: Real,
+    returned: Number,
+    soft: Number,
+    z: Number,
     out: NDArray[np.float64],
     harm: NDArray[np.float64],
 ) -> float:
@@ -297,21 +292,7 @@ def zone_reports(
 
 
 def _squared_distance(a: Planes, b: Planes) -> float:
-    # strides that a compiler does not know cost more than a copy
-    return _sum_of_squares(np.ascontiguousarray(a), np.ascontiguousarray(b))
-
-
-@jit
-def _sum_of_squares(a: Planes, b: Planes) -> float:
-    total = np.float64(0.0)
-    for c in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            part = np.float32(0.0)
-            for j in range(a.shape[2]):
-                step = a[c, i, j] - b[c, i, j]
-                part += step * step
-            total += part
-    return float(total)
+    return float(np.square(a - b).sum(dtype=np.float64))
 
 
 def _decibels(before: float, after: float) -> float:

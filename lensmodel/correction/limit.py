@@ -16,10 +16,9 @@ from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import LEAST_CLIPPED, compact
-from lensmodel.correction.compiled.common import Number
 from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.transforms import Number, Real
 
-Real = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _REACH: Final = 2
@@ -42,9 +41,7 @@ shows none beside it (chosen)."""
 _OWN_COLOURLESS: Final = 0.02
 """The same for the pixel itself where the kernel is unsure (chosen: with more, black letters get green)."""
 _TINY: Final = 1e-5  # light, as seen, below which there is none
-_MOST: Final = (
-    12  # pixels of a blur's reach beyond which levels beside an edge belong to other things (chosen)
-)
+_MOST: Final = 12  # pixels of a blur's reach beyond which levels beside an edge are of other things (chosen)
 _LAMP: Final = 2.0
 """Solved light, in units of saturation, from which a pixel counts as a lamp although the photo did not clip
 (chosen: edges overshoot by less, lamps that the blur has dimmed are brighter)."""
@@ -136,20 +133,7 @@ def limited(
     than the span of a line, at least by the width of that range and around lamps by no more: where a colour
     has next to no light, its noise shows.
 
-    Parameters
-    ----------
-    photo, restored : Planes, shape (3, rows, cols)
-        A tile with its halo, and its correction.
-    blurs, sensors : sequence
-        By colour.
-    errors : sequence of float
-        Expected relative L2 errors of the kernels.
-    halo : float or None
-        A share s that the photographer chose; None derives it.
-
-    Returns
-    -------
-    Planes, float32
+    `halo` is the share of the range that a photographer chose for line and edge.
     """
     error = max(*errors, _EXACT)
     room, edge = widening(error) if halo is None else (min(halo, _FREE),) * 2
@@ -281,13 +265,7 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
 
 @jit
 def _hold_light(
-    y: Real,
-    x: Real,
-    free: Mask,
-    wide: int,
-    shares: tuple[Number, Number],
-    darkest: Number,
-    most: Real,
+    y: Real, x: Real, free: Mask, wide: int, shares: tuple[Number, Number], darkest: Number, most: Real
 ) -> None:
     """Hold the light of `x` within that of `y` nearby, widened, in place, but where it is `free`.
 

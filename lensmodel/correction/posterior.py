@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -52,7 +51,8 @@ class PsfPosterior:
         H = otf(kernel, GRID)
         power = np.maximum(H.real**2 + H.imag**2, _LEAST)
         shape = power * np.log(power) ** 2
-        times = _times()
+        times = np.full(power.shape, 2.0)  # how often each column of the half spectrum stands in the whole
+        times[:, [0, -1]] = 1.0
         scale = error**2 * float((times * power).sum()) / max(float((times * shape).sum()), _LEAST)
         return cls(kernel, (scale * shape).astype(np.float32), error)
 
@@ -63,12 +63,3 @@ class PosteriorField(Protocol):
 
     def posterior_at(self, position: FieldPosition, channel: Channel) -> PsfPosterior:
         """Return what is known of the PSF at a field position, its kernel cut to its support."""
-
-
-@lru_cache(maxsize=1)
-def _times() -> NDArray[np.float64]:
-    """How often each column of the half spectrum stands in the whole."""
-    times = np.full((GRID[0], GRID[1] // 2 + 1), 2.0)
-    times[:, [0, -1]] = 1.0
-    times.setflags(write=False)
-    return times

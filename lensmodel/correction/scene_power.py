@@ -13,8 +13,8 @@ from scipy import fft
 
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Planes
-from lensmodel.correction.compiled.common import to_spectrum
 from lensmodel.correction.posterior import GRID
+from lensmodel.correction.transforms import Complex, Real, to_spectrum
 
 SLOPE = 2.2
 """Exponent of the power spectrum of natural images, S(f) = c |f|^-2.2: A. Torralba, A. Oliva, "Statistics of
@@ -38,7 +38,7 @@ demosaicing spreads what few pixels saw, and would pass for detail in focus if i
 _BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 
 
-def scene_power(level: float, slope: float) -> NDArray[np.float32]:
+def scene_power(level: float, slope: float) -> Real:
     """Power of a scene on the `rfft2` grid of `GRID`, S = c |f|^-a with c and a of `scene_law`."""
     return np.asarray(level * np.exp(np.float32(-0.5 * slope) * _log_squared()), dtype=np.float32)
 
@@ -60,16 +60,8 @@ def scene_law(
 
     Scaled so that white noise has its variance as power. c and a are fitted to rings of the photo's own
     spectrum that blur and demosaicing leave intact: a soft scene, or one without detail, has nothing that a
-    correction could restore.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (rings,)
-        Mean power of a part of the photo in each ring, of `ring_power`.
-    transferred : ndarray, shape (64, 33)
-        Expected |H|² of its blur.
-    noise : ndarray, shape (rings,)
-        Mean power of its noise there, of `noise_power`.
+    correction could restore. `measured` and `noise` are mean powers of a part of the photo in each ring, of
+    `ring_power` and `noise_power`; `transferred` is the expected |H|² of its blur, `(64, 33)`.
     """
     transmitted = _rings() @ transferred.ravel().astype(np.float64)
     power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)
@@ -100,11 +92,7 @@ def ring_power(planes: Planes) -> NDArray[np.float64]:
 
 @jit
 def _block_power(
-    planes: Planes,
-    rows: NDArray[np.intp],
-    cols: NDArray[np.intp],
-    window: NDArray[np.float32],
-    power: NDArray[np.float32],
+    planes: Planes, rows: NDArray[np.intp], cols: NDArray[np.intp], window: Real, power: Real
 ) -> None:
     """Power of windowed blocks of planes, less their means."""
     height, width = window.shape
@@ -124,13 +112,13 @@ def _block_power(
 
 
 @lru_cache(maxsize=1)
-def _window() -> NDArray[np.float32]:
+def _window() -> Real:
     window = np.outer(*(np.hanning(n + 2)[1:-1] for n in GRID))
     return np.asarray(window / np.sqrt(np.mean(window**2)), dtype=np.float32)
 
 
 @lru_cache(maxsize=1)
-def _log_squared() -> NDArray[np.float32]:
+def _log_squared() -> Real:
     """Logarithm of |f|² on the grid; the mean has no power."""
     squared = frequency_squared(GRID)
     squared[0, 0] = np.inf
@@ -145,9 +133,7 @@ def _rings() -> NDArray[np.float64]:
     return np.array([(ring / ring.sum()).ravel() for ring in rings])
 
 
-def wiener_spectrum(
-    data: NDArray[np.float32], K: NDArray[np.complex64], noise: float, variance: float
-) -> NDArray[np.complex64]:
+def wiener_spectrum(data: Real, K: Complex, noise: float, variance: float) -> Complex:
     """Spectrum of the Wiener estimate on a periodic canvas, given the variances of noise and data.
 
     In the Fourier domain::
@@ -165,7 +151,7 @@ def wiener_spectrum(
     return np.asarray(fft.rfft2(data) * np.conj(K) / (power + ratio + np.float32(1e-9)))
 
 
-def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
+def frequency_squared(shape: tuple[int, int]) -> Real:
     """|f|² on the `rfft2` grid, in (cycles/pixel)²; the value at zero is a tenth of the next."""
     squared = fft.fftfreq(shape[0])[:, None] ** 2 + fft.rfftfreq(shape[1])[None, :] ** 2
     squared[0, 0] = 0.1 * min(squared[0, 1], squared[1, 0])
@@ -173,15 +159,14 @@ def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=8)
-def prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def prior(shape: tuple[int, int]) -> tuple[Real, Real]:
     """1 / S(f) for c = 1, and S(f) times `frequency_counts`."""
     decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
     prior_power = frequency_counts(shape) / decay
-    decay.setflags(write=False)
     return decay, np.ascontiguousarray(prior_power, dtype=np.float32)
 
 
-def frequency_counts(shape: tuple[int, int]) -> NDArray[np.float32]:
+def frequency_counts(shape: tuple[int, int]) -> Real:
     """How often the whole spectrum holds each frequency of the half; the mean counts as none."""
     counts = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
     counts[:, 0] = 1.0

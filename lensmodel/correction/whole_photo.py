@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache, partial
+from typing import Final
 
 import numpy as np
+from numba.core import event
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.jit import jit
 from lensmodel.core.psf import PsfField
+from lensmodel.core.registry import Registry
 from lensmodel.core.types import (
     CHANNELS,
     BayerPattern,
@@ -26,28 +31,46 @@ from lensmodel.core.types import (
 )
 from lensmodel.correction.audit import AuditReport, pooled
 from lensmodel.correction.blur import UniformBlur, crop_to_support
-from lensmodel.correction.cell import CorrectionJob, LateralColourShift, RestoredCell, blur_of, restore_cell
-from lensmodel.correction.compiled.tile import add
-from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver
-from lensmodel.correction.engine import keep_freed_memory, tell_of_compiling
+from lensmodel.correction.cell import CorrectionJob, RestoredCell, blur_of, restore_cell
+from lensmodel.correction.deconvolver import Deconvolver
 from lensmodel.correction.expected_gain import ZoneReport, zone_reports
+from lensmodel.correction.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.correction.limit import Bounds
-from lensmodel.correction.methods.catalogue import deconvolvers
+from lensmodel.correction.methods.direct import DirectFilter
+from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
+from lensmodel.correction.methods.sparse_gradient import SparseGradient
 from lensmodel.correction.posterior import PosteriorField, PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
-from lensmodel.correction.tiles.lattice import Cell, Roi, cells, usual_pitch
+from lensmodel.correction.transforms import Real
+from lensmodel.photo.lateral import LateralColour
 
-PsfError = Callable[[FieldPosition, Channel], float] | float
-"""Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
+deconvolvers: Registry[Deconvolver] = Registry(
+    "deconvolver",
+    {
+        "standard": SparseGradient,
+        "paper": partial(SaturationAwareRichardsonLucy, warped=True),  # section 7
+        "fast": DirectFilter,
+        "richardson-lucy": RichardsonLucy,
+    },
+    "lensmodel.deconvolvers",
+)
+"""The deconvolution methods by name."""
 
-
+KERNEL_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
 _ENOUGH_CELLS, _MORE_CELLS = 24, 96
 """Cells to try of a photo (chosen): a tenth of the work, sure to `_SURE_DB`; more where too few decide."""
-_SURE_DB = 0.1
-KERNEL_SIZE = 55  # pixels: the largest kernel that the paper estimates
-KEPT = 640
+_SURE_DB: Final = 0.1
+_KEPT: Final = 640
 """Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
 megapixels."""
+_COMPILE_S: Final = 30
+"""Seconds that compiling takes on a usual machine (chosen: it is only said, lest the silence look like a
+fault; slow machines take longer)."""
+_FREED: Final = 31 << 20
+"""Bytes of the block to free: just below the 32 MiB up to which glibc adapts (see `_keep_freed_memory`)."""
+
+first_use = logging.getLogger(f"{__name__}.first_use")
+"""Says when loops are compiled, during which nothing else happens that a user could see."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,20 +124,18 @@ def correct_planes(
     clip: Sequence[float] = (1.0, 1.0, 1.0),
     method: str | Deconvolver = "standard",
     strength: float = 1.0,
-    psf_error: PsfError | None = None,
-    lateral: LateralColourShift | None = None,
+    psf_error: float = 0.0,
+    lateral: LateralColour | None = None,
     cfa: BayerPattern | None = None,
     bounds: Bounds | None = None,
     layers: Sequence[Bounds] = (),
-    audited: bool = True,
     unguarded: bool = False,
     least_gain_db: float | None = None,
     stored: StoredColour | None = None,
     processed: bool = False,
-    roi: Roi | tuple[int, int, int, int] | None = None,
+    roi: tuple[int, int, int, int] | None = None,
     workers: int = 1,
     pitch: int | None = None,
-    out: Planes | None = None,
     on_step: StepHook = ignore_step,
 ) -> Corrected:
     """Remove the lens blur of a photo.
@@ -139,10 +160,10 @@ def correct_planes(
         A name in `deconvolvers`, or a method of your own.
     strength : float
         0 leaves the photo as it is, 1 applies what the noise allows.
-    psf_error : float, callable or None
+    psf_error : float
         Expected relative L2 error of the PSFs of a `PsfField`: the larger, the more of a point is mixed into
-        them, and the less is allowed beside edges. None is 0.
-    lateral : LateralColourShift or None
+        them, and the less is allowed beside edges.
+    lateral : LateralColour or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
     cfa : BayerPattern or None
@@ -153,9 +174,6 @@ def correct_planes(
     layers : sequence of Bounds
         Further bounds within which to correct the photo, for a preview: they share the solution, a third of
         the work.
-    audited : bool
-        Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
-        errors can be seen.
     unguarded : bool
         Return what the method makes of the PSFs as they are: nothing is weighed, bounded, added back or
         audited, as in a paper's own experiments. Not for photos that anyone wants to keep.
@@ -173,8 +191,6 @@ def correct_planes(
         Threads.
     pitch : int or None
         Side of a cell in pixels; None chooses.
-    out : Planes or None
-        Where to write, for instance memory-mapped; zeroed first. None allocates.
     on_step : StepHook
         Called after each cell; may raise to stop.
 
@@ -191,10 +207,9 @@ def correct_planes(
     """
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
-    solver = deconvolvers.create(method) if isinstance(method, str) else method
     posteriors = _posteriors_of(field, psf_error)
 
-    @lru_cache(maxsize=KEPT)
+    @lru_cache(maxsize=_KEPT)
     def blur_at(position: FieldPosition, channel: Channel, share: float) -> UniformBlur:
         return blur_of(posteriors(position, channel), lateral, position, channel, share)
 
@@ -203,25 +218,23 @@ def correct_planes(
         posteriors,
         blur_at,
         frame,
-        solver,
+        deconvolvers.resolve(method),
         strength,
         tuple(noise),
         tuple(clip),
         cfa,
         bounds or Bounds(),
-        # Kernels do not change within cells that are larger than usual.
-        solver.cell_factor if isinstance(solver, CoarseMethod) else 1,
-        audited,
+        tuple(layers),
         unguarded,
         stored,
         processed,
-        tuple(layers),
     )
     window = Roi.of(frame, roi)
-    keep_freed_memory()
+    _keep_freed_memory()
     tell_of_compiling()
-    shape = (len(CHANNELS), window.height, window.width)
-    out, layer_planes = _zeroed(out, shape), tuple(_zeroed(None, shape) for _ in layers)
+    out, *layer_planes = np.zeros(
+        (1 + len(layers), len(CHANNELS), window.height, window.width), dtype=np.float32
+    )
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
     window_cells = [cell for cell in cells(frame, pitch) if cell.meets(window)]
@@ -243,7 +256,7 @@ def correct_planes(
         on_step(done, len(window_cells))
     report = pooled(audits, pitch)
     step = (1, 1) if stored is None else stored.step
-    return Corrected(out, zone_reports(forecasts, left, report), report, step, layer_planes)
+    return Corrected(out, zone_reports(forecasts, left, report), report, step, tuple(layer_planes))
 
 
 def _unchanged(
@@ -253,36 +266,21 @@ def _unchanged(
     some = window_cells[:: max(1, len(window_cells) // enough)]
     forecasts = [restored.forecast for _, restored in _restored(job, some, workers)]
     left = Counter(forecast.zone for forecast in forecasts)
-    rows, cols = (
-        slice(start, start + extent)
-        for start, extent in ((window.top, window.height), (window.left, window.width))
-    )
-    planes = np.array(job.planes[:, rows, cols], dtype=np.float32)
+    bottom, right = window.top + window.height, window.left + window.width
+    planes = np.array(job.planes[:, window.top : bottom, window.left : right], dtype=np.float32)
     return Corrected(planes, zone_reports(forecasts, left, pooled(())))
 
 
-def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
-    """Zero the caller's array, or allocate one."""
-    if out is None:
-        return np.zeros(shape, dtype=np.float32)
-    if out.shape != shape or out.dtype != np.float32:
-        raise InvalidInputError(f"out must be float32 {shape}, got {out.dtype} {out.shape}")
-    out[:] = 0.0
-    return out
-
-
 def _posteriors_of(
-    field: PsfField | PosteriorField, psf_error: PsfError | None
+    field: PsfField | PosteriorField, error: float
 ) -> Callable[[FieldPosition, Channel], PsfPosterior]:
     """The posterior of the PSF of one channel at one place, cached."""
 
-    @lru_cache(maxsize=KEPT)
+    @lru_cache(maxsize=_KEPT)
     def posterior(position: FieldPosition, channel: Channel) -> PsfPosterior:
         if isinstance(field, PosteriorField):
             return field.posterior_at(position, channel)
-        error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
-        kernel = crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
-        return PsfPosterior.of_error(kernel, float(error))
+        return PsfPosterior.of_error(crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), error)
 
     return posterior
 
@@ -321,4 +319,46 @@ def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
     at, part = (top - window.top, left - window.left), (top - cell.top, left - cell.left)
     # strides that a compiler does not know cost more than a copy
     planes = np.ascontiguousarray(restored)
-    add(np.asarray(out), at, cell.rise[rows], cell.run[cols], planes, part)
+    _add_weighted(out, at, cell.rise[rows], cell.run[cols], planes, part)
+
+
+@jit
+def _add_weighted(
+    out: Real, at: tuple[int, int], rise: Real, run: Real, planes: Real, part: tuple[int, int]
+) -> None:
+    """Add planes from pixel `part` on, times a weight for each row and each column, to `out` from `at` on."""
+    for c in range(planes.shape[0]):
+        for i in range(rise.size):
+            weight, line, into = rise[i], planes[c, part[0] + i], out[c, at[0] + i]
+            for j in range(run.size):
+                into[at[1] + j] += weight * run[j] * line[part[1] + j]
+
+
+@cache
+def tell_of_compiling() -> None:
+    """Log once when Numba compiles; loading from its cache does not count."""
+
+    class CompilationLog(event.Listener):
+        logged = False
+
+        def on_start(self, started: object) -> None:
+            del started
+            if not self.logged:
+                self.logged = True
+                first_use.info("compiling the inner loops, once on this machine: about %d s", _COMPILE_S)
+
+        def on_end(self, ended: object) -> None:
+            """The progress display shows the end."""
+
+    event.register("numba:compile", CompilationLog())  # type: ignore[no-untyped-call] # Numba has no types
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep what a cell frees for the next one.
+
+    The arrays of a cell take some megabytes each. glibc returns such memory to the system as soon as it is
+    freed, and the system clears every page again for the next cell, which took a quarter of the time of
+    "fast". It stops doing so for blocks smaller than the largest block, up to 32 MiB, that it has seen freed;
+    the pages of this one are never touched. Other C libraries are not affected.
+    """
+    np.empty(_FREED, dtype=np.uint8)

@@ -48,8 +48,8 @@ class Everywhere:
 class Adjoint:
     """Blurs once more: of no use, and easily told from a method that deblurs."""
 
-    def deconvolve(self, blurred, blur, *, sensor, on_step=None):
-        return lensmodel.Restored(blur.frame(blur.adjoint(blurred)), 1)
+    def deconvolve(self, blurred, blur, *, sensor):
+        return blur.frame(blur.adjoint(blurred))
 '''
 
 POINTS = """[lensmodel.estimators]

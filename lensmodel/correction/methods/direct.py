@@ -11,26 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.core.types import Plane, Planes, StepHook, ignore_step
+from lensmodel.core.types import Plane, Planes
 from lensmodel.correction.blur import UniformBlur, transfers
+from lensmodel.correction.canvas import Canvas
 from lensmodel.correction.clipped import Lights
-from lensmodel.correction.compiled.common import (
+from lensmodel.correction.deconvolver import Sensor, Solution
+from lensmodel.correction.posterior import GRID
+from lensmodel.correction.scene_power import frequency_squared, noise_power, ring_power, scene_law
+from lensmodel.correction.transforms import (
     ONE,
     ZERO,
     Complex,
-    Number,
     Real,
     smooth,
     to_plane,
     to_spectrum,
 )
-from lensmodel.correction.compiled.tile import fill
-from lensmodel.correction.deconvolver import Restored, Sensor, Solution
-from lensmodel.correction.posterior import GRID
-from lensmodel.correction.scene_power import frequency_squared, noise_power, ring_power, scene_law
-from lensmodel.correction.tiles.beyond_frame import fill_outside
-from lensmodel.correction.tiles.canvas import Canvas, seam
 
+_TEXTURE: Final = np.float32(0.87)  # t, see `DirectFilter` (chosen as `cell._SHARE` is)
+_LIGHT_STEPS, _OUTSIDE_STEPS = 15, 10
+"""Steps that estimate the light of clipped pixels, and that from beyond the frame (chosen)."""
 _FLOOR: Final = np.float32(1e-3)
 """Added to |K|²: the square of what a transfer function is expected to be off by within a cell (chosen:
 without it strong frequencies of the scene come back as coloured ripples)."""
@@ -62,49 +62,28 @@ class DirectFilter:
 
     Of a mosaic, what demosaicing made of it is filtered.
 
-    Parameters
-    ----------
-    texture : float
-        t.
-    light_steps : int
-        Steps that estimate the light of clipped pixels.
-    outside_steps : int
-        Steps that estimate the light from beyond the frame.
-
     References
     ----------
     .. [1] N. Wiener, "Extrapolation, interpolation, and smoothing of stationary time series", 1949.
     """
 
-    texture: float = 0.87
-    light_steps: int = 15
-    outside_steps: int = 10
-
     cell_factor = 2
     """Cells may be larger: a filter that is quick has no use for kernels that are exact everywhere."""
 
-    def deconvolve(
-        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
-    ) -> Restored:
+    def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
         """Deconvolve one plane; see `Deconvolver`."""
-        restored = self.deconvolve_planes(blurred[None], [blur], [sensor])
-        on_step(1, 1)
-        return Restored(restored.planes[0], steps=1)
+        return self.deconvolve_planes(blurred[None], [blur], [sensor]).planes[0]
 
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Solution:
         """Restore the colours together; see `ColourDeconvolver`."""
-        lights = Lights.of(blurred, blurs, sensors, self.light_steps)
+        lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
         photo, blurred = blurred, np.ascontiguousarray(blurred if lights is None else lights.rest)
         canvas = Canvas.around(blurred, blurs, sensors)
-        x = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
-        rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
+        K, _ = transfers(blurs, canvas.shape, 1.0)
         unit = np.ones(len(blurred), dtype=np.float32)
-        fill(blurred, unit, canvas.margin, rows, cols, x)
-        K, _ = transfers(blurs, canvas.shape, 1.0, drifting=False)
-        if not all(sensor.surrounded for sensor in sensors):
-            fill_outside(x, blurred, unit, K, blurs, sensors, canvas, self.outside_steps)
+        x = canvas.filled(blurred, unit, K, blurs, sensors, _OUTSIDE_STEPS)
         part = blurred[:, ::_EVERY, ::_EVERY]
         noise = np.array([s.noise.variance(p).mean() for s, p in zip(sensors, part, strict=True)])
         # of the usual part of the cell, not of its lamps
@@ -122,7 +101,7 @@ class DirectFilter:
         slope = round(2.0 * laws[:, 1].mean()) / 2.0  # few enough to keep their powers
         over = (_CAREFUL * np.maximum(noise, 1e-12) / laws[:, 0]).astype(np.float32)
         amplified = np.empty(len(x), dtype=np.float32)
-        _filter(x, K, over, _rise(canvas.shape, slope), np.float32(self.texture), amplified)
+        _filter(x, K, over, _rise(canvas.shape, slope), amplified)
         models = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
         restored = np.empty_like(blurred)
         _where_it_stands_out(blurred, x, canvas.margin, models * amplified[:, None], restored)
@@ -130,14 +109,7 @@ class DirectFilter:
 
 
 @jit
-def _filter(
-    x: Real,
-    K: Complex,
-    over: Real,
-    rise: Real,
-    texture: Number,
-    amplified: Real,
-) -> None:
+def _filter(x: Real, K: Complex, over: Real, rise: Real, amplified: Real) -> None:
     """Filter planes in place; `over` times `rise` is n / S, and `amplified` receives mean( |G|² - Re G )."""
     height, half = rise.shape
     X = np.empty((height, half), np.complex64)
@@ -155,7 +127,7 @@ def _filter(
                 ratio = over[c] * rise[i, j]
                 power = a * a + b * b + _FLOOR
                 scale = ONE / (power + ratio)
-                gain, turn = (a + texture * ratio) * scale, -b * scale
+                gain, turn = (a + _TEXTURE * ratio) * scale, -b * scale
                 changed += gain * gain + turn * turn - gain
                 p, q = xx[i, re], xx[i, im]
                 xx[i, re], xx[i, im] = gain * p - turn * q, gain * q + turn * p
@@ -221,6 +193,4 @@ def _where_it_stands_out(  # noqa: C901, PLR0912 - blocks, then pixels
 @lru_cache(maxsize=16)
 def _rise(shape: tuple[int, int], slope: float) -> NDArray[np.float32]:
     """|f|^a, one over the power of a scene."""
-    rise = np.ascontiguousarray(frequency_squared(shape) ** np.float32(0.5 * slope), dtype=np.float32)
-    rise.setflags(write=False)
-    return rise
+    return np.ascontiguousarray(frequency_squared(shape) ** np.float32(0.5 * slope), dtype=np.float32)

@@ -7,26 +7,37 @@ from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import Plane, StepHook, ignore_step
+from lensmodel.core.jit import jit
+from lensmodel.core.types import Plane
 from lensmodel.correction.blur import UniformBlur, fast_shape
-from lensmodel.correction.compiled.richardson_lucy import richardson_lucy
-from lensmodel.correction.deconvolver import TINY, Restored, Sensor
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.transforms import BACK, FORWARD, ONE, ZERO, Complex, Number, Real, through
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
 
-ACCELERATIONS: Final = get_args(Acceleration)
-
-ALPHA_MAX = 0.9
+_ACCELERATIONS: Final = get_args(Acceleration)
+_ALPHA_MAX: Final = 0.9
 """Cap of the fixed extrapolation; above it the noise is accelerated as well."""
-
-SHARPNESS = 50.0
+_SHARPNESS: Final = 50.0
 """a of the sensor response, per clipping level: how sharply it bends where it clips (chosen: the bend is then
 a tenth of the level wide; a sharper one gives steps no slope to follow, a softer one bends what the sensor
 records in proportion)."""
+_REACH_FLOOR: Final = 0.05
+"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen: a pixel with less of its light
+in the frame would be divided by little, and noise would explode; with more, the rim would be too dark)."""
+_LIGHT: Final = 0.9
+"""Share of the clipping level above which a sharp pixel counts as a light (chosen: blur leaves the rim of a
+light a little below the level; much lower, ordinary bright places would be treated as lights)."""
+_TINY: Final = np.float32(1e-6)
+"""Least light that is divided by, in units of saturation (chosen: far below the noise of any sensor, far
+above what single precision cannot divide by)."""
+_LEAST_PREDICTED: Final = np.float32(0.1)
+"""Least prediction as a share of the datum, so that a step raises light tenfold at most (chosen): a transfer
+function that belongs to no positive kernel, such as that of a point moved by a part of a pixel, predicts zero
+or negative light here and there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +69,17 @@ class RichardsonLucy:
     def __post_init__(self) -> None:
         _check(self.iterations)
 
-    def deconvolve(
-        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
-    ) -> Restored:
+    def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
         """Deconvolve one plane; see `Deconvolver`."""
-        base = background(sensor)
+        base = _background(sensor)
         data = np.maximum(blurred, 0.0) + base
         latent, reach = first_guess(blurred, blur)
-        for step in range(1, self.iterations + 1):
+        for _ in range(self.iterations):
             # Written with the error instead of the ratio: at the rim, where F^T 1 is small and
             # floored, a perfect prediction must leave the estimate alone.
-            error = data / np.maximum(blur.forward(latent) + base, TINY) - 1.0
+            error = data / np.maximum(blur.forward(latent) + base, _TINY) - 1.0
             latent = latent * np.maximum(1.0 + blur.adjoint(error) / reach, 0.0)
-            on_step(step, self.iterations)
-        return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
+        return blur.frame(latent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +109,11 @@ class SaturationAwareRichardsonLucy:
     ----------
     iterations : int
         Number of steps.
-    sharpness : float
-        a, per clipping level.
     acceleration : {"fixed", "adaptive", "none"}
         How to extrapolate, or not at all.
     warped : bool
-        Whether lateral colour is to be removed by resampling before: see `WarpableMethod`.
+        Whether lateral colour is to be removed by resampling before; otherwise the shift is part of the
+        kernels.
 
     References
     ----------
@@ -117,114 +124,30 @@ class SaturationAwareRichardsonLucy:
     """
 
     iterations: int = 25
-    sharpness: float = SHARPNESS
     acceleration: Acceleration = "fixed"
     warped: bool = False
 
     def __post_init__(self) -> None:
         _check(self.iterations)
-        if self.acceleration not in ACCELERATIONS:
+        if self.acceleration not in _ACCELERATIONS:
             raise InvalidInputError(
-                f"acceleration must be one of {', '.join(ACCELERATIONS)}, got {self.acceleration!r}"
+                f"acceleration must be one of {', '.join(_ACCELERATIONS)}, got {self.acceleration!r}"
             )
 
-    def deconvolve(
-        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
-    ) -> Restored:
+    def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
         """Deconvolve one plane; see `Deconvolver`."""
         latent, reach = first_guess(blurred, blur)
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
-        latent = richardson_lucy_steps(
-            latent,
-            blurred,
-            reach,
-            blur,
-            sensor,
-            steps=self.iterations,
-            sharpness=self.sharpness,
-            acceleration=self.acceleration,
-            lights=lights,
-            on_step=on_step,
+        return blur.frame(
+            richardson_lucy_steps(
+                latent, blurred, reach, blur, sensor, self.iterations, self.acceleration, lights=lights
+            )
         )
-        return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
 
 
-_REACH_FLOOR = 0.05
-"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen: a pixel with less of its light
-in the frame would be divided by little, and noise would explode; with more, the rim would be too dark)."""
-_LIGHT = 0.9
-"""Share of the clipping level above which a sharp pixel counts as a light (chosen: blur leaves the rim of a
-light a little below the level; much lower, ordinary bright places would be treated as lights)."""
-
-
-def richardson_lucy_steps(
-    latent: Plane,
-    blurred: Plane,
-    reach: Plane,
-    blur: UniformBlur,
-    sensor: Sensor,
-    *,
-    steps: int,
-    sharpness: float = SHARPNESS,
-    acceleration: Acceleration = "fixed",
-    lights: bool = False,
-    on_step: StepHook = ignore_step,
-) -> Plane:
-    """Take the steps of `SaturationAwareRichardsonLucy`.
-
-    Parameters
-    ----------
-    latent : Plane
-        Start, wider than the data by the reach of the blur.
-    blurred : Plane
-        The data.
-    reach : Plane
-        Normaliser of each pixel of the latent plane.
-    blur, sensor, steps, sharpness, acceleration, on_step
-        As in `SaturationAwareRichardsonLucy`.
-    lights : bool
-        Whether to keep what is poorly known about lights out of the update of all other pixels.
-    """
-    base = background(sensor)
-    data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
-    count = np.arange(1, steps + 1)
-    fixed = np.minimum((count - 1) / (count + 2), ALPHA_MAX) * (acceleration == "fixed")
-    alphas, adaptive = fixed.astype(np.float32), acceleration == "adaptive"
-    shape = fast_shape(latent.shape)
-    latent = np.array(latent, dtype=np.float32, order="C")
-    richardson_lucy(
-        latent,
-        data,
-        reach.astype(np.float32),
-        blur.spectrum(shape),
-        np.float32(base),
-        np.float32(sensor.clip),
-        *_bend(sharpness),
-        alphas,
-        adaptive,
-        shape[1],
-        lights,
-    )
-    on_step(steps, steps)
-    return latent
-
-
-@lru_cache(maxsize=8)
-def _bend(sharpness: float) -> tuple[NDArray[np.float32], np.float32, np.float32]:
-    """R and R' of `response` at even steps of light over clipping level, and the first and last step.
-
-    Below that range R equals the light and above it the clipping level, to a millionth.
-    """
-    first, last = max(1.0 - 15.0 / sharpness, 0.0), 1.0 + 25.0 / sharpness
-    light = np.linspace(first, last, 4097)
-    return np.stack(response(light.astype(np.float32), 1.0, sharpness)), np.float32(first), np.float32(last)
-
-
-def background(sensor: Sensor) -> float:
-    """Read variance over shot variance: the light whose Poisson noise equals the read noise."""
-    if sensor.noise.shot <= 0.0:
-        return 0.0
-    return min(sensor.noise.read / sensor.noise.shot, 1.0)
+def _check(iterations: int) -> None:
+    if not 1 <= iterations <= 500:
+        raise InvalidInputError(f"iterations must lie in 1..500, got {iterations}")
 
 
 def first_guess(blurred: Plane, blur: UniformBlur) -> tuple[Plane, Plane]:
@@ -233,26 +156,260 @@ def first_guess(blurred: Plane, blur: UniformBlur) -> tuple[Plane, Plane]:
     F^T 1 falls below 1 where part of the light fell outside the frame. It is floored: latent
     pixels that hardly touch the data must not explode; they start from the nearest data.
     """
-    light = np.maximum(blurred, TINY)
+    light = np.maximum(blurred, _TINY)
     reach = blur.covered(blurred.shape)
     floor = _REACH_FLOOR * float(reach.max())
     wide = (reach.shape[0] - blurred.shape[0]) // 2
     start = np.where(
         reach > floor, blur.adjoint(light) / np.maximum(reach, floor), np.pad(light, wide, mode="edge")
     )
-    return np.maximum(start, TINY).astype(np.float32), np.maximum(reach, floor)
+    return np.maximum(start, _TINY).astype(np.float32), np.maximum(reach, floor)
 
 
-def response(light: Plane, clip: float, sharpness: float) -> tuple[Plane, Plane]:
-    """Sensor response R and its slope R' for linear light; see `SaturationAwareRichardsonLucy`."""
-    if not np.isfinite(clip):
-        return light, np.ones_like(light)
-    over = sharpness * (light / clip - 1.0)
-    recorded = clip * (light / clip - np.logaddexp(0.0, over) / sharpness)
+def richardson_lucy_steps(
+    latent: Plane,
+    blurred: Plane,
+    reach: Plane,
+    blur: UniformBlur,
+    sensor: Sensor,
+    steps: int,
+    acceleration: Acceleration = "fixed",
+    *,
+    lights: bool = False,
+) -> Plane:
+    """Take steps of `SaturationAwareRichardsonLucy` from `latent`, each pixel normalised by `reach`.
+
+    `lights` says whether to keep what is poorly known about lights out of the update of all other pixels.
+    """
+    base = _background(sensor)
+    data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
+    count = np.arange(1, steps + 1)
+    fixed = np.minimum((count - 1) / (count + 2), _ALPHA_MAX) * (acceleration == "fixed")
+    shape = fast_shape(latent.shape)
+    latent = np.array(latent, dtype=np.float32, order="C")
+    _steps(
+        latent,
+        data,
+        reach.astype(np.float32),
+        blur.spectrum(shape),
+        np.float32(base),
+        np.float32(sensor.clip),
+        *_response(),
+        fixed.astype(np.float32),
+        acceleration == "adaptive",
+        shape[1],
+        lights,
+    )
+    return latent
+
+
+def _background(sensor: Sensor) -> float:
+    """Read variance over shot variance: the light whose Poisson noise equals the read noise."""
+    if sensor.noise.shot <= 0.0:
+        return 0.0
+    return min(sensor.noise.read / sensor.noise.shot, 1.0)
+
+
+@lru_cache(maxsize=1)
+def _response() -> tuple[Real, np.float32, np.float32]:
+    """R and R' at even steps of light over clipping level, and the first and last step.
+
+    Below that range R equals the light and above it the clipping level, to a millionth.
+    """
+    first, last = 1.0 - 15.0 / _SHARPNESS, 1.0 + 25.0 / _SHARPNESS
+    light = np.linspace(first, last, 4097).astype(np.float32)
+    over = _SHARPNESS * (light - 1.0)
+    recorded = light - np.logaddexp(0.0, over) / _SHARPNESS
     slope = 0.5 * (1.0 - np.tanh(0.5 * over))  # the logistic function without overflow
-    return recorded.astype(np.float32), slope.astype(np.float32)
+    return np.stack([recorded, slope]).astype(np.float32), np.float32(first), np.float32(last)
 
 
-def _check(iterations: int) -> None:
-    if not 1 <= iterations <= 500:
-        raise InvalidInputError(f"iterations must lie in 1..500, got {iterations}")
+@jit
+def _blur_marks(hard: Real, soft: Real) -> None:
+    """Gaussian of sigma 3, cut at 10 pixels, zero outside; at most 1."""
+    rows, cols = hard.shape
+    weights = np.empty(21, np.float32)
+    for k in range(21):
+        weights[k] = np.exp(-np.float32((k - 10) * (k - 10)) / np.float32(18.0))
+    weights /= weights.sum()
+    soft[:] = ZERO
+    for i in range(rows):
+        for k in range(max(0, 10 - i), min(21, rows + 10 - i)):
+            weight = weights[k]
+            for j in range(cols):
+                soft[i, j] += weight * hard[i + k - 10, j]
+    padded = np.zeros(cols + 20, np.float32)
+    for i in range(rows):
+        padded[10 : cols + 10] = soft[i]
+        soft[i] = ZERO
+        for k in range(21):
+            weight = weights[k]
+            for j in range(cols):
+                soft[i, j] += weight * padded[j + k]
+        for j in range(cols):
+            soft[i, j] = min(soft[i, j], ONE)
+
+
+@jit
+def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
+    latent: Real, level: Number, reach: int, clean: Real, soft: Real
+) -> bool:
+    """Find bright sharp pixels: mark what they reach as unclean, and their own places softly.
+
+    Returns whether there are any. `clean` has the size of the data, `soft` that of the latent plane.
+    """
+    rows, cols = latent.shape
+    hard = np.zeros((rows, cols), np.float32)
+    any_light = False
+    for i in range(rows):
+        for j in range(cols):
+            if latent[i, j] >= level:
+                any_light = True
+                for di in range(-3, 4):
+                    for dj in range(-3, 4):
+                        a, b = i + di, j + dj
+                        if di * di + dj * dj <= 9 and 0 <= a < rows and 0 <= b < cols:
+                            hard[a, b] = ONE
+    if not any_light:
+        return False
+    # A square of the operator's reach covers the kernel without knowing its shape. One pass each
+    # way that remembers the last mark costs the same for any reach.
+    across = clean.shape[1]
+    wide = np.zeros((rows, across), np.uint8)
+    for i in range(rows):
+        last = -4 * reach - 4
+        for j in range(cols):
+            if hard[i, j] > ZERO:
+                last = j
+            if j >= 2 * reach and j - last <= 2 * reach:
+                wide[i, j - 2 * reach] = 1
+    for b in range(across):
+        last = -4 * reach - 4
+        for i in range(rows):
+            if wide[i, b]:
+                last = i
+            if i >= 2 * reach:
+                clean[i - 2 * reach, b] = ZERO if i - last <= 2 * reach else ONE
+    _blur_marks(hard, soft)
+    return True
+
+
+@jit
+def _errors(
+    light: Real, data: Real, base: Number, clip: Number, bend: Real, first: Number, last: Number
+) -> None:
+    """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
+
+    `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; below, the sensor
+    records the light itself, above it `clip`. A logarithm and two exponentials for each pixel of
+    a blown area would take ten times as long as all transforms.
+    """
+    brightest = ZERO
+    for j in range(light.size):
+        brightest = max(brightest, light[j])
+    if brightest <= first * clip:  # no branch in the loop: several pixels at a time
+        for j in range(light.size):
+            light[j] = data[j] / max(max(light[j], ZERO) + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
+        return
+    top = np.float32(bend.shape[1] - 1)
+    share, steps = ONE / clip, top / (last - first)
+    for j in range(light.size):
+        predicted = max(light[j], ZERO)
+        at = min((predicted * share - first) * steps, top)
+        if not at > ZERO:  # a NaN stays one
+            light[j] = data[j] / max(predicted + base, _LEAST_PREDICTED * data[j], _TINY) - ONE
+        else:
+            k = min(np.int32(at), np.int32(bend.shape[1] - 2))
+            part = at - np.float32(k)
+            recorded = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
+            slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
+            light[j] = (data[j] / max(recorded + base, _LEAST_PREDICTED * data[j], _TINY) - ONE) * slope
+
+
+@jit
+def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> Number:
+    """Measure alpha of Biggs and Andrews; `change` holds that of the step before, then that of this one."""
+    rows, cols = start.shape
+    norm = 0.0
+    product = 0.0
+    for i in range(rows):
+        row_product, row_norm = np.float64(0.0), np.float64(0.0)
+        for j in range(cols):
+            light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)
+            now, before = light - start[i, j], change[i, j]
+            row_product += now * before
+            row_norm += before * before
+            change[i, j] = now
+        product += row_product
+        norm += row_norm
+    if not norm > 0.0:
+        return ZERO
+    return np.float32(min(max(product / norm, 0.0), 1.0))
+
+
+@jit
+def _steps(  # noqa: C901 - one pass over memory per loop
+    latent: Real,
+    data: Real,
+    reach: Real,
+    K: Complex,
+    base: Number,
+    clip: Number,
+    bend: Real,
+    first: Number,
+    last: Number,
+    alphas: Real,
+    adaptive: bool,
+    width: int,
+    lights: bool,
+) -> None:
+    """Accelerated saturation-aware steps; `latent` is start and result.
+
+    The transforms live on the grid of `K`, `width` columns wide; the latent plane lies in its
+    first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
+    step is measured on the changes of the two before it, and `alphas` only gives their number.
+    `bend`, `first` and `last` are those of `_errors`.
+    """
+    rows, cols = latent.shape
+    high, wide = data.shape
+    top, left = (rows - high) // 2, (cols - wide) // 2
+    bottom, right = top + high, left + wide
+    steps = alphas.shape[0]
+    P = np.empty(K.shape, np.complex64)
+    work = np.zeros((K.shape[0], width), np.float32)
+    calm = np.zeros_like(work) if lights else work
+    start = latent.copy()
+    work[:rows, :cols] = latent
+    share = ONE / reach
+    clean = np.empty_like(data)
+    soft = np.empty_like(latent)
+    change = np.zeros_like(latent) if adaptive else soft
+    for step in range(steps):
+        through(work, P, K, FORWARD, 0, rows, top, bottom)
+        for i in range(high):
+            _errors(work[top + i, left:right], data[i], base, clip, bend, first, last)
+            work[top + i, :left] = ZERO
+            work[top + i, right:] = ZERO
+        split = lights and _lights(start, np.float32(_LIGHT) * clip, top, clean, soft)
+        if split:
+            for i in range(high):
+                calm[top + i] = ZERO
+                for j in range(wide):
+                    calm[i + top, j + left] = work[i + top, j + left] * clean[i, j]
+            through(calm, P, K, BACK, top, bottom, 0, rows)
+        through(work, P, K, BACK, top, bottom, 0, rows)
+        if split:
+            for i in range(rows):
+                for j in range(cols):
+                    work[i, j] = calm[i, j] + (work[i, j] - calm[i, j]) * soft[i, j]
+        alpha = alphas[step + 1] if step + 1 < steps else ZERO
+        if adaptive:
+            alpha = _measured_alpha(start, work, share, change)
+        for i in range(rows):
+            for j in range(cols):
+                light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _TINY)
+                ahead = max(light + alpha * (light - latent[i, j]), _TINY)
+                latent[i, j] = light
+                start[i, j] = ahead
+                work[i, j] = ahead
+            work[i, cols:] = ZERO

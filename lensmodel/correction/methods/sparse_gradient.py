@@ -5,28 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import CHANNELS, Plane, Planes, StepHook, ignore_step
+from lensmodel.core.jit import jit
+from lensmodel.core.types import CHANNELS, Plane, Planes
 from lensmodel.correction.blur import UniformBlur, transfers
+from lensmodel.correction.canvas import BLOCK, Canvas, spread_blocks
 from lensmodel.correction.clipped import Lights
-from lensmodel.correction.compiled.grain import spread_grain
-from lensmodel.correction.compiled.half_quadratic import half_quadratic
-from lensmodel.correction.compiled.tile import fill
-from lensmodel.correction.deconvolver import Restored, Sensor, Solution
-from lensmodel.correction.methods.shrinkage import Shrinkage
+from lensmodel.correction.deconvolver import Sensor, Solution
+from lensmodel.correction.methods.half_quadratic import Shrinkage, half_quadratic
+from lensmodel.correction.mosaic import refill, spread_grain
 from lensmodel.correction.scene_power import prior
-from lensmodel.correction.tiles.beyond_frame import fill_outside
-from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.local_statistics import BlockMeans, signal_variance, smoothed, spread_blocks
-from lensmodel.correction.tiles.mosaic import refilled
+from lensmodel.correction.transforms import ONE, ZERO, Real
 
 # Luma, and two chroma directions, orthonormal.
-_OPPONENT = np.array(
+_OPPONENT: Final = np.array(
     [
         [1 / np.sqrt(3)] * 3,
         [1 / np.sqrt(2), 0.0, -1 / np.sqrt(2)],
@@ -34,6 +32,25 @@ _OPPONENT = np.array(
     ],
     dtype=np.float32,
 )
+_LIGHT_STEPS: Final = 20
+"""Steps that estimate the light of clipped pixels, and that from beyond the frame (chosen)."""
+_TYPICAL_CONTRAST: Final = np.float32(0.02)
+"""Variance over squared light of a scene for which kappa is `weight` (chosen: detail of a seventh of the
+light. It only sets the unit of `weight`; see `_BUSIEST`, `_CALMEST` for how far others lie)."""
+_SCENE: Final = 0.2
+"""Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
+with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
+them their noise)."""
+# See `_reliance` (chosen on lenses of development seeds: measured once, no command repeats it)
+_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4
+# Range of the weight of the prior between texture and flat places (chosen on the same lenses, as those)
+_BUSIEST, _CALMEST = 0.7, 50.0
+_DARK: Final = np.float32(0.02)
+"""Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of
+black would be smoothed away; with more, shadows keep noise that lighter places lose)."""
+_UNSURE: Final = np.float32(0.1)
+"""Share of the noise that a variance over so few pixels cannot resolve, and that counts as signal (chosen: at
+0, places without detail would be smoothed without limit)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +87,6 @@ class SparseGradient:
         Half-quadratic steps.
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
-        What a kernel's change within the tile adds is recomputed in the first step and half way.
-    light_steps : int
-        Steps that estimate the light of clipped pixels, and that from beyond the frame.
 
     References
     ----------
@@ -87,187 +101,109 @@ class SparseGradient:
     steps: int = 8
     coupling: float = 1.5
     growth: float = 3.0
-    light_steps: int = 20
 
     def __post_init__(self) -> None:
         if not (self.weight > 0.0 and self.chroma > 0.0 and self.coupling > 0.0 and self.growth >= 1.0):
             raise InvalidInputError(f"weights of the prior must be positive, got {self}")
 
-    def deconvolve(
-        self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor, on_step: StepHook = ignore_step
-    ) -> Restored:
+    def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
         """Deconvolve one plane; see `Deconvolver`."""
         # as three equal colours, each of which adds its datum but not its gradients to the sum
-        alike = replace(
-            self,
-            **{
-                name: getattr(self, name) * len(CHANNELS) ** (1.0 - self.alpha / 2.0)
-                for name in ("weight", "mosaic_weight")
-            },
-        )
-        solved = alike.deconvolve_planes(np.stack([blurred] * 3), [blur] * 3, [sensor] * 3)
-        on_step(self.steps, self.steps)
-        return Restored(solved.planes[0], steps=self.steps)
+        more = len(CHANNELS) ** (1.0 - self.alpha / 2.0)
+        alike = replace(self, weight=more * self.weight, mosaic_weight=more * self.mosaic_weight)
+        return alike.deconvolve_planes(np.stack([blurred] * 3), [blur] * 3, [sensor] * 3).planes[0]
 
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Solution:
         """Restore the colours together; see `ColourDeconvolver`."""
-        lights = Lights.of(blurred, blurs, sensors, self.light_steps)
+        lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
         rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas.around(blurred, blurs, sensors)
-        problem = self._problem(rest, blurs, sensors, light, canvas, glow)
-        x, explained = _solved(problem)
+        x, explained = self._solved(rest, blurs, sensors, light, canvas, glow)
         inner = (slice(None), *canvas.data)
         restored = x[inner] * light[:, None, None]
         left = rest - explained[inner] * light[:, None, None]
-        unexplained = self._unexplained(blurred, left, sensors, light)
-        return Solution(restored if lights is None else lights.put_back(blurred, restored), unexplained)
-
-    @staticmethod
-    def _unexplained(
-        blurred: Planes, left: Planes, sensors: Sequence[Sensor], light: NDArray[np.float32]
-    ) -> Planes:
-        """What the prior took: the residual of each colour, or, of a mosaic, its grain in light of no colour.
-
-        In a mosaic each pixel measures one colour k; L is the mean light, n the noise of a colour over it,
-        and w weighs colours as they are seen. Of the measured residual e, the means S over 5 x 5 pixels are
-        coarse grain and detail, their chroma as far as it exceeds its noise (a share q). Fine grain is that
-        which one sees in the photo: of the demosaiced residual d, in light of no colour, within a few
-        standard deviations of the noise, f = sum w_k ( d_k - mean d_k ) / L_k. Where more than noise is in
-        it, t = 0, demosaicing made detail of its own, and the measured residual counts for all colours.
-        Either is never more than the grain of a colour, or grain would be coloured::
-
-            s = sum w_k S_k / L_k,    m² = sum w_k n_k²
-            r_c / L_c = s + q ( S_c / L_c - s )
-                          + t min(1, n_c / m) f + (1 - t) min(1, n_c / n_k) ( e_k - S_k ) / L_k
-        """
         clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
         clipped = blurred >= clip[:, None, None]
         left[clipped] = 0.0
-        if all(sensor.measured is None for sensor in sensors):
-            return left
-        known = ~clipped
-        for c, sensor in enumerate(sensors):
-            if sensor.measured is not None:
-                known[c] &= sensor.measured
-        noise = np.array([[s.noise.shot, s.noise.read] for s in sensors], dtype=np.float32)
-        out = np.empty_like(blurred)
-        spread_grain(blurred, left, known, clip, noise, light, out)
-        return out
+        if any(sensor.measured is not None for sensor in sensors):
+            left = spread_grain(blurred, left, clipped, sensors, light)
+        return Solution(restored if lights is None else lights.put_back(blurred, restored), left)
 
-    def _problem(
+    def _solved(
         self,
         blurred: Planes,
         blurs: Sequence[UniformBlur],
         sensors: Sequence[Sensor],
-        light: NDArray[np.float32],
+        light: Real,
         canvas: Canvas,
         glow: Planes | None,
-    ) -> SparseProblem:
-        blocks = BlockMeans.of(blurred, light)
-        recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light)
+    ) -> tuple[Planes, Planes]:
+        """The planes on the canvas over their `light`, and what they make of the data, blurred again."""
+        blocks = _BlockMeans.of(blurred, light)
+        recorded = blocks if glow is None else _BlockMeans.of(blurred + glow, light)
         var = np.stack(
             [
-                s.noise.variance(smoothed(b * bright)) / bright**2
+                s.noise.variance(_smoothed(b * bright)) / bright**2
                 for s, b, bright in zip(sensors, recorded.planes, light, strict=True)
             ]
         ).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-        level = smoothed(blocks.luma)
+        level = np.maximum(_smoothed(blocks.luma), _DARK)
         relative = (var / noise[:, None, None]).mean(axis=0)
-        prox = Shrinkage.of(self.alpha, _RAMP)
+        prox = Shrinkage.of(self.alpha)
         calm = _calm(blocks, level, var.mean(axis=0) / len(blurred), self.alpha)
-        threshold = relative * calm / np.maximum(level, _DARK) ** np.float32(self.alpha)
+        threshold = relative * calm / level ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
-        known = _known(sensors, canvas)
-        drift = blurs[0].drift
         K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0)
         variance = (blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32)
-        weight, middle = self.weight, len(blurred) // 2
-        if any(sensor.measured is not None for sensor in sensors):
-            weight = self.mosaic_weight
-        elif glow is None:  # beside removed lights the rest is no natural scene: the prior keeps its weight
-            weight *= _reliance(_determined_share(K[middle], canvas.shape, noise[middle], variance[middle]))
-        weights = np.full(len(blurred), weight)
+        mosaic = any(sensor.measured is not None for sensor in sensors)
+        weights = np.full(len(blurred), self.mosaic_weight if mosaic else self.weight)
+        if not mosaic and glow is None:
+            # beside removed lights the rest is no natural scene: the prior keeps its weight
+            weights *= _reliance(_determined_share(K[1], canvas.shape, noise[1], variance[1]))
         weights[1:] *= self.chroma
-        y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
-        fill(
-            blurred,
-            np.float32(1.0) / light,
-            canvas.margin,
-            seam(canvas.rows, canvas.shape[0]),
-            seam(canvas.cols, canvas.shape[1]),
+        y = canvas.filled(blurred, light, K, blurs, sensors, _LIGHT_STEPS)
+        if mosaic:
+            refill(y, K, noise, variance, sensors, canvas)
+        known = _known(sensors, canvas)
+        x, explained = np.empty_like(y), np.empty_like(y)
+        half_quadratic(
+            x,
             y,
+            known,
+            bool(known.all()),
+            K,
+            _gradient_power(canvas.shape),
+            *prior(canvas.shape),
+            noise,
+            variance,
+            spread_blocks(prox.scale(threshold), canvas),
+            prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
+            couplings.astype(np.float32),
+            # what a kernel's change within the tile adds is recomputed in the first step and half way
+            np.isin(np.arange(self.steps), (0, self.steps // 2)),
+            rates,
+            *_from_middle(canvas, blurs[0]),
+            _OPPONENT,
+            prox.edge,
+            prox.steepness,
+            prox.terms,
+            explained,
         )
-        if not all(sensor.surrounded for sensor in sensors):
-            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.light_steps)
-        if any(sensor.measured is not None for sensor in sensors) and len(blurred) == len(CHANNELS):
-            refilled(y, K, noise, variance, sensors, canvas)
-
-        def ramp(axis: int) -> NDArray[np.float32]:
-            """Distance in pixels from where the kernel is K; constant beyond the ends of the data."""
-            at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
-            return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
-
-        return SparseProblem(
-            y=y,
-            variance=variance,
-            known=known,
-            K=K,
-            smooth=_gradient_power(canvas.shape),
-            noise=noise.astype(np.float32),
-            scale=spread_blocks(prox.scale(threshold), canvas),
-            factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
-            couplings=couplings.astype(np.float32),
-            turns=np.isin(np.arange(self.steps), (0, self.steps // 2)),
-            drift=rates,
-            down=ramp(0),
-            across=ramp(1),
-            rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
-            prox=prox,
-        )
+        return x, explained
 
 
-_RAMP = 0.1
-"""Of the jump of the shrinkage, see `Shrinkage` (chosen: with none, rounding decides what is kept; a wide one
-is no longer the prior's own answer)."""
-_TYPICAL_CONTRAST = np.float32(0.02)
-"""Variance over squared light of a scene for which kappa is `weight` (chosen: detail of a seventh of the
-light. It only sets the unit of `weight`; see `_BUSIEST`, `_CALMEST` for how far others lie)."""
-_SCENE = 0.2
-"""Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
-with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
-them their noise)."""
-# See `_reliance` (chosen on lenses of development seeds: measured once, no command repeats it)
-_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4
-# Range of the weight of the prior between texture and flat places (chosen on the same lenses, as those)
-_BUSIEST, _CALMEST = 0.7, 50.0
-_DARK = np.float32(0.02)
-"""Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of
-black would be smoothed away; with more, shadows keep noise that lighter places lose)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SparseProblem:
-    """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
-
-    y: Planes
-    variance: NDArray[np.float32]
-    known: NDArray[np.bool_]
-    K: NDArray[np.complex64]
-    smooth: NDArray[np.float32]
-    noise: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    factors: NDArray[np.float32]
-    couplings: NDArray[np.float32]
-    turns: NDArray[np.bool_]
-    drift: NDArray[np.complex64]
-    down: NDArray[np.float32]
-    across: NDArray[np.float32]
-    rotation: NDArray[np.float32]
-    prox: Shrinkage
+def _from_middle(canvas: Canvas, blur: UniformBlur) -> tuple[Real, Real]:
+    """Rows and columns from where the kernel is K, in pixels; constant beyond the ends of the data."""
+    origin = blur.drift.origin if blur.drift else (0.0, 0.0)
+    down, across = (
+        (np.clip(np.arange(length) - canvas.margin, 0, extent - 1) - middle).astype(np.float32)
+        for length, extent, middle in zip(canvas.shape, (canvas.rows, canvas.cols), origin, strict=True)
+    )
+    return down, across
 
 
 def _determined_share(
@@ -309,54 +245,93 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _solved(p: SparseProblem) -> tuple[Planes, Planes]:
-    """The planes on the canvas, and what they make of the data, blurred again."""
-    decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
-    x, explained = np.empty_like(p.y), np.empty_like(p.y)
-    half_quadratic(
-        x,
-        p.y,
-        p.known,
-        bool(p.known.all()),
-        p.K,
-        p.smooth,
-        decay,
-        prior_power,
-        p.noise,
-        p.variance,
-        p.scale,
-        p.factors,
-        p.couplings,
-        p.turns,
-        p.drift,
-        p.down,
-        p.across,
-        p.rotation,
-        np.float32(p.prox.edge),
-        np.float32(p.prox.steepness),
-        p.prox.terms,
-        explained,
-    )
-    return x, explained
-
-
-def _calm(
-    blocks: BlockMeans, level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
-) -> NDArray[np.float32]:
+def _calm(blocks: _BlockMeans, level: Real, noise: Real, alpha: float) -> Real:
     """How much smoother than an average scene each block is: the factor on kappa.
 
     The maximum-likelihood kappa of a hyper-Laplacian is proportional to E|g|^-alpha; gradients
     scale with the local contrast, so it is (typical over local variance of the signal)^(alpha / 2).
     Without it the flat parts of a picture keep the noise that the inverse of a wide kernel amplifies.
     """
-    signal = signal_variance(blocks, noise)
-    calm = (_TYPICAL_CONTRAST * np.maximum(level, _DARK) ** 2 / signal) ** np.float32(alpha / 2)
+    mean = _smoothed(blocks.luma)
+    local = _smoothed(blocks.square) - mean * mean
+    signal = np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12)
+    calm = (_TYPICAL_CONTRAST * level**2 / signal) ** np.float32(alpha / 2)
     return np.asarray(np.clip(calm, _BUSIEST, _CALMEST), dtype=np.float32)
 
 
 @lru_cache(maxsize=8)
-def _gradient_power(shape: tuple[int, int]) -> NDArray[np.float32]:
+def _gradient_power(shape: tuple[int, int]) -> Real:
     """sum_j |F_j|² of the two forward differences."""
     rows = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.fftfreq(shape[0]))
     cols = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.rfftfreq(shape[1]))
     return (rows[:, None] + cols[None, :]).astype(np.float32)
+
+
+def _smoothed(blocks: Real) -> Real:
+    """Local mean of a coarse plane over about 13 pixels of the fine one."""
+    for axis in (0, 1):
+        sums = np.float32(4.0) * blocks
+        # The same array seen along the other axis: sums are taken in place.
+        lines, into = (blocks, sums) if axis == 0 else (blocks.T, sums.T)
+        into[1:] += lines[:-1]
+        into[:-1] += lines[1:]
+        into[0] += lines[0]
+        into[-1] += lines[-1]
+        blocks = sums
+    blocks *= np.float32(1.0 / 36.0)
+    return blocks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BlockMeans:
+    """Means over blocks of a tile whose colours are scaled to equal light."""
+
+    planes: Real  # (channels, rows, cols), of each colour
+    luma: Real  # (rows, cols), of the mean of the colours
+    square: Real  # (rows, cols), of its square
+
+    @classmethod
+    def of(cls, tile: Planes, light: Real) -> _BlockMeans:
+        """Take the means of a tile whose colours have the mean `light`."""
+        shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
+        planes = np.empty((len(tile), *shape), dtype=np.float32)
+        luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        _block_means(tile, ONE / light, planes, luma, square)
+        return cls(planes, luma, square)
+
+
+@jit
+def _block_means(  # noqa: C901 - one pass over memory
+    tile: Real, gains: Real, planes: Real, luma: Real, square: Real
+) -> None:
+    """Means over blocks of 4 pixels of planes times `gains`, of their mean, and of its square."""
+    channels, height, width = tile.shape
+    share = ONE / np.float32(channels)
+    line = np.empty(width, np.float32)
+    sums = np.empty((channels + 2, width), np.float32)
+    for row in range(luma.shape[0]):
+        low, high = 4 * row, min(4 * row + 4, height)
+        sums[:] = ZERO
+        for i in range(low, high):
+            line[:] = ZERO
+            for c in range(channels):
+                for j in range(width):
+                    value = tile[c, i, j] * gains[c]
+                    sums[c, j] += value
+                    line[j] += value * share
+            for j in range(width):
+                sums[channels, j] += line[j]
+                sums[channels + 1, j] += line[j] * line[j]
+        for col in range(luma.shape[1]):
+            left, right = 4 * col, min(4 * col + 4, width)
+            size = np.float32((high - low) * (right - left))
+            for c in range(channels + 2):
+                total = ZERO
+                for j in range(left, right):
+                    total += sums[c, j]
+                if c < channels:
+                    planes[c, row, col] = total / size
+                elif c == channels:
+                    luma[row, col] = total / size
+                else:
+                    square[row, col] = total / size

@@ -34,7 +34,7 @@ from lab.kernels import gaussian
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
-from lensmodel.correction.tiles.lattice import cells
+from lensmodel.correction.lattice import cells
 from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
 

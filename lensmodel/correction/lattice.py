@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,12 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition
 
-CELLS_PER_HALF_DIAGONAL = 18.0
+_CELLS_PER_HALF_DIAGONAL: Final = 18.0
 """Half the frame's diagonal over the side of a cell (chosen: cells of 200 pixels at 24 megapixels, over which
 a PSF hardly changes; more cells are mostly halo)."""
-MIN_PITCH, MAX_PITCH = 96, 208
+_MIN_PITCH, _MAX_PITCH = 96, 208
 """Bounds of a cell's side in pixels: smaller ones are all halo, larger ones blur the PSF's change."""
-RAMP = 16
+_RAMP: Final = 16
 """Width in pixels over which neighbouring cells fade into each other (chosen: narrower, a seam may show
 between their PSFs; what is wider is computed twice)."""
 
@@ -35,20 +36,15 @@ class Roi:
     width: int
 
     @classmethod
-    def of(cls, frame: Frame, roi: Roi | tuple[int, int, int, int] | None) -> Roi:
+    def of(cls, frame: Frame, roi: tuple[int, int, int, int] | None) -> Roi:
         """Check a window `(top, left, height, width)` against the frame; None is all of it."""
         if roi is None:
             return cls(0, 0, frame.height, frame.width)
-        window = roi if isinstance(roi, Roi) else cls(*roi)
-        inside = (
-            window.top >= 0
-            and window.left >= 0
-            and window.height >= 1
-            and window.width >= 1
-            and window.top + window.height <= frame.height
-            and window.left + window.width <= frame.width
-        )
-        if not inside:
+        window = cls(*roi)
+        if not (
+            0 <= window.top < window.top + window.height <= frame.height
+            and 0 <= window.left < window.left + window.width <= frame.width
+        ):
             raise InvalidInputError(f"{window} does not lie in a photo of {frame.height} x {frame.width}")
         return window
 
@@ -102,22 +98,15 @@ class Cell:
 
 def usual_pitch(frame: Frame, factor: int = 1) -> int:
     """Side of a cell in pixels: a fixed share of the field, times `factor`, within practical bounds."""
-    share = factor * frame.half_diagonal / CELLS_PER_HALF_DIAGONAL
-    return int(np.clip(share, MIN_PITCH, factor * MAX_PITCH))
+    share = factor * frame.half_diagonal / _CELLS_PER_HALF_DIAGONAL
+    return int(np.clip(share, _MIN_PITCH, factor * _MAX_PITCH))
 
 
 def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     """Cut a frame into cells, row by row.
 
     The lattice depends on the frame only, never on the requested part or on the available memory,
-    so a preview shows the same pixels as the whole picture.
-
-    Parameters
-    ----------
-    frame : Frame
-        Size of the photo.
-    pitch : int or None
-        Side of a cell; None takes `usual_pitch`.
+    so a preview shows the same pixels as the whole picture. The `pitch` is the side of a cell in pixels.
     """
     pitch = usual_pitch(frame) if pitch is None else pitch
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
@@ -139,7 +128,7 @@ def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], flo
     """First pixel, weights and centre of each piece of an axis."""
     count = max(1, round(extent / pitch))
     edges = [round(i * extent / count) for i in range(count + 1)]
-    half = min(RAMP // 2, (edges[1] - edges[0]) // 2)
+    half = min(_RAMP // 2, (edges[1] - edges[0]) // 2)
     pieces = []
     for low, high in itertools.pairwise(edges):
         start = low if low == 0 else low - half

@@ -1,20 +1,78 @@
-"""Half-quadratic steps, compiled: three colours of one tile, with transforms into given buffers."""
+"""Half-quadratic splitting, compiled: gradients shrunk towards zero, then planes solved for, in turns.
+
+D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors", NIPS 2009, eq. 3 to 5.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
-from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
+from lensmodel.correction.transforms import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
 
-_REACH: Final = np.float32(1.0 / 24.0)  # one over the largest argument of `methods.shrinkage`
+_DEGREE: Final = (
+    9  # of the polynomial: a shorter one misses the bend at the jump, each term costs a step (chosen)
+)
+_LARGEST: Final = 24.0  # argument, in widths of the shrinkage: beyond, hardly anything is taken off (chosen)
+_REACH: Final = np.float32(1.0 / _LARGEST)
+_RAMP: Final = 0.1
+"""Share of the jump over which the answer rises from 0 instead (chosen: with none, rounding decides what is
+kept, and steps that follow make a visible pixel of it; a wide one is no longer the prior's own answer)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shrinkage:
+    """The minimiser of t |w|^alpha + (w - v)² / 2, by one polynomial for all t.
+
+    With s = t^(1 / (2 - alpha)) the substitution w = s u leaves t = 1::
+
+        prox_t(v) = s prox_1(v / s),      prox_1(v) = v - p(1 / v)  beyond the jump, else 0
+
+    What is subtracted from v is smooth in 1 / v, so a short polynomial p suffices: unlike a table it
+    runs in vector registers. Beyond 24 s the subtraction is held constant.
+    """
+
+    alpha: float  # exponent of the hyper-Laplacian in (0, 1]; 1 is soft thresholding
+    edge: np.float32  # 1 / v for t = 1 where the answer begins to rise
+    steepness: np.float32  # slope of the ramp that begins there, per 1 / v
+    terms: Real  # coefficients of p, highest power first
+
+    @classmethod
+    @lru_cache(maxsize=16)  # one fit per exponent, not one per tile
+    def of(cls, alpha: float) -> Shrinkage:
+        """Fit the polynomial to the answers found by Newton steps."""
+        if not 0.0 < alpha <= 1.0:
+            raise InvalidInputError(f"alpha must lie in (0, 1], got {alpha}")
+        # Where the energies of w = 0 and of the other minimum are equal the answer jumps.
+        jump_w = (2.0 * (1.0 - alpha)) ** (1.0 / (2.0 - alpha))
+        jump = jump_w + alpha * jump_w ** (alpha - 1.0) if alpha < 1.0 else 1.0
+        low, high = 1.0 / _LARGEST, 1.0 / jump
+        nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+        inverse = low + (high - low) * (nodes + 1.0) / 2.0
+        v = 1.0 / inverse
+        w = v.copy()
+        for _ in range(40):
+            slope = alpha * w ** (alpha - 1.0) + w - v
+            bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
+            w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
+        terms = np.polynomial.Polynomial.fit(inverse, v - w, _DEGREE).convert().coef[::-1]
+        steepness = jump / (1.0 - 1.0 / (1.0 + _RAMP))
+        return cls(alpha, np.float32(1.0 / jump), np.float32(steepness), terms.astype(np.float32))
+
+    def scale(self, threshold: Real) -> Real:
+        """The scale s for a threshold t."""
+        return np.asarray(np.power(threshold, 1.0 / (2.0 - self.alpha)), dtype=np.float32)
 
 
 @jit
-def _shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  # noqa: ANN401 - float32
+def shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  # noqa: ANN401 - float32
+    """Shrink one gradient; see `Shrinkage`."""
     size = max(abs(v), np.float32(1e-20))
     below = scale / size
     inverse = min(max(below, _REACH), edge)
@@ -50,16 +108,16 @@ def _shrink_row(
     f0, f1, f2 = factors[0], factors[1], factors[2]
     for j in range(scale.size):
         r, g, b, s = slopes[0, j], slopes[1, j], slopes[2, j], scale[j]
-        p = _shrink(t00 * r + t01 * g + t02 * b, s * f0, edge, steepness, terms)
-        q = _shrink(t10 * r + t11 * g + t12 * b, s * f1, edge, steepness, terms)
-        o = _shrink(t20 * r + t21 * g + t22 * b, s * f2, edge, steepness, terms)
+        p = shrink(t00 * r + t01 * g + t02 * b, s * f0, edge, steepness, terms)
+        q = shrink(t10 * r + t11 * g + t12 * b, s * f1, edge, steepness, terms)
+        o = shrink(t20 * r + t21 * g + t22 * b, s * f2, edge, steepness, terms)
         kept[0, j] = t00 * p + t10 * q + t20 * o
         kept[1, j] = t01 * p + t11 * q + t21 * o
         kept[2, j] = t02 * p + t12 * q + t22 * o
 
 
 @jit
-def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
+def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
     x: Real,
     scale: Real,
     factors: Real,
@@ -108,7 +166,7 @@ def _wiener(
     variance: Number,
     P: Complex,
 ) -> None:
-    """Spectrum of the Wiener estimate; see `wiener.wiener_spectrum`."""
+    """Spectrum of the Wiener estimate; see `scene_power.wiener_spectrum`."""
     height, half = Y.shape
     blurred_prior = np.float64(0.0)
     for i in range(height):
@@ -200,7 +258,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
             X[c] = P
         to_plane(P, x[c])
     for step in range(couplings.shape[0]):
-        pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
+        _pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
         for c in range(channels):
             if drift.shape[0] > 0 and turns[step]:
                 _drifted(x[c], drift[c], down, across, work, D, E[c])

@@ -1,4 +1,4 @@
-"""What compiled loops share: types, constants, transforms and small filters."""
+"""What compiled loops share: types, constants, transforms on given buffers, and small filters."""
 
 from __future__ import annotations
 

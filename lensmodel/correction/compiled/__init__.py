@@ -1,1 +1,0 @@
-"""Compiled loops that several modules share, or that are as long as a method."""

@@ -1,1 +1,0 @@
-"""A photo in tiles: their lattice, the canvas of the transforms, and what surrounds each."""

@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import uploads
-from sqlalchemy import Engine, create_engine
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.sandbox.child import Outcome
 from app.sandbox.runner import Budget
-from app.store import LensName, Store, database
+from app.store import LensName, Store
 from app.store.database import new_id, upgrade
 from app.store.lenses import LensState
 from app.store.owners import ANY_OWNER
@@ -140,10 +139,10 @@ class Steps:
         return self.store.lenses.samples_of(self.lens_id(photo))
 
 
-@pytest.fixture(scope="session")
-def usual_settings() -> Settings:
-    """Read and check the environment once: for each test anew it takes as long as a small test."""
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
     return Settings(
+        data_dir=tmp_path / "data",
         min_free_mb=0,
         task_user="none",  # trying others out takes a process for each folder
         task_niceness=0,  # tests wait for photos too: beside other programs they would starve
@@ -152,39 +151,12 @@ def usual_settings() -> Settings:
     )
 
 
-@pytest.fixture
-def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
-    return usual_settings.model_copy(update={"data_dir": tmp_path / "data"})
-
-
-@pytest.fixture(scope="session", autouse=True)
-def statements_compiled_once() -> Iterator[None]:
-    """Let all engines of SQLite share what they make of statements.
-
-    Each test opens six of them, three of its own and three of its application; each would compile every
-    statement anew, which takes longer than the test.
-    """
-    first = create_engine("sqlite://", query_cache_size=5000)
-    first.connect().close()  # now its dialect knows the version
-
-    def sharing(url: Any, **options: Any) -> Engine:
-        engine = create_engine(url, **options)
-        if engine.dialect.name == first.dialect.name:
-            engine.dialect, engine._compiled_cache = first.dialect, first._compiled_cache
-        return engine
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(database, "create_engine", sharing)
-        yield
-
-
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Migrate once: the tests copy the file."""
     folder = tmp_path_factory.mktemp("empty")
-    opened = Store(Settings(data_dir=folder))
-    upgrade(opened.database)
-    opened.close()
+    with closing(Store(Settings(data_dir=folder))) as opened:
+        upgrade(opened.database)
     return folder / "app.db"
 
 
@@ -232,20 +204,14 @@ class TasksHere:
 
 
 @pytest.fixture
-def context(settings: Settings, store: Store) -> Any:
-    """Give what the jobs of a worker share, whose tasks run in this process."""
-    from app.jobs.context import JobContext  # noqa: PLC0415 - as above
-
-    sandbox = TasksHere(settings.data_dir / "scratch")
-    return JobContext(settings, store, Storage(settings.storage, create=False), sandbox)
-
-
-@pytest.fixture
-def reading(store: Store, context: Any) -> Iterator[None]:
+def reading(settings: Settings, store: Store, storage: Storage) -> Iterator[None]:
     """Read the profiles that are sent meanwhile, as a worker does."""
+    from app.jobs.context import JobContext  # noqa: PLC0415 - as above
     from app.jobs.queue import durable, end_job  # noqa: PLC0415 - as above
     from app.jobs.work import work_on  # noqa: PLC0415 - as above
 
+    sandbox: Any = TasksHere(settings.data_dir / "scratch")
+    context = JobContext(settings, store, storage, sandbox)
     work = durable("photo", partial(work_on, context), partial(end_job, store))
     ended = threading.Event()
 

@@ -27,8 +27,10 @@ from app.http import views
 from app.jobs import tasks
 from app.jobs.answers import (
     CORRECTED,
+    INSPECTED,
     KERNELS,
     SAMPLES,
+    SELECTED,
     SHOWN,
     SIDES,
     THUMBNAIL,
@@ -614,39 +616,16 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
     assert not list(bench.storage.listed(f"corrections/{key}/"))
 
 
-NO_ZONES: dict[str, Any] = {"zones": {}}
-
-
-@pytest.mark.parametrize(
-    "answer",
-    [
-        {"file": "../elsewhere.jpg", "report": NO_ZONES},
-        {"file": "result.jpg", "report": {"zones": {"elsewhere": {}}}},
-        {"file": "result.jpg", "report": {"zones": {"mid": {"reasons": ["x"] * 100}}}},
-        {"file": "result.jpg", "report": NO_ZONES | {"audit": NO_ZONES | {"tiles": [{"row": 1}]}}},
-        {"file": "result.jpg", "report": NO_ZONES | {"audit": {"zones": {"mid": {"tiles": "many"}}}}},
-    ],
-)
-def test_a_file_from_elsewhere_or_a_report_that_no_correction_makes_ends_it(
-    bench: Bench, answer: dict[str, Any]
-) -> None:
+def test_a_child_cannot_hand_in_a_file_from_elsewhere(bench: Bench) -> None:
     def write(arguments: dict[str, Any], folder: Path) -> Outcome:
         (folder.parent / "elsewhere.jpg").write_bytes(b"another picture")
-        write_result(arguments, folder)
-        return ok(answer)
+        return ok({"file": "../elsewhere.jpg", "report": {"zones": {}}})
 
     bench.let("correct", write)
 
     row = bench.correct(bench.ask(bench.counted()))
 
     assert (row.state, row.error_code) == ("failed", "internal_error")
-
-
-def test_the_report_of_a_correction_is_taken() -> None:
-    zones = {"center": ZoneReport(cells=2, expected_gain_db=1.0, psf_error=0.1)}
-    answer = {"file": "result.png", "report": codec.to_json({"zones": zones, "nothing_to_correct": False})}
-
-    assert checked(CORRECTED, answer) == answer
 
 
 def unmeasured(store: Store) -> list[tuple[str | int, ...]]:
@@ -673,7 +652,7 @@ def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(bench
     def paused(arguments: dict[str, Any], folder: Path) -> Outcome:
         bench.correct(key)  # of the worker that took over
         (folder / "result.jpg").write_bytes(b"another picture")
-        return ok({"file": "result.jpg", "report": NO_ZONES})
+        return ok({"file": "result.jpg", "report": {"zones": {}}})
 
     bench.let("correct", paused, write_result)
     row = bench.correct(key)
@@ -746,32 +725,57 @@ def spoilt(answer: Any, path: str, value: object) -> Any:
     return whole
 
 
-SELECTION = {"patches": [patch(0)], "rejected": [], "lateral": None}
+SELECTION: dict[str, Any] = {"patches": [patch(0)], "rejected": [], "lateral": None}
 WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "reason": "flat"}
+CORRECTION = {"file": "a.jpg", "report": {"zones": {"mid": {}}, "audit": {"zones": {}, "tiles": []}}}
 
 
 @pytest.mark.parametrize(
-    ("task", "answer"),
+    ("kind", "answer"),
     [
-        ("inspect", []),
-        ("inspect", spoilt(INFO, "width", 2**40)),
-        ("inspect", spoilt(INFO, "width", "600")),
-        ("inspect", spoilt(INFO, "metadata.aperture", 1e300)),
-        ("inspect", spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
-        ("select", spoilt(SELECTION, "patches", [patch(0)] * 2001)),
-        ("select", spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
-        ("select", spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
-        ("select", spoilt(SELECTION, "patches.0.row", 2**70)),
-        ("select", spoilt(SELECTION, "lateral", {"red": [1.0]})),
+        (INSPECTED, []),
+        (INSPECTED, spoilt(INFO, "width", 2**40)),
+        (INSPECTED, spoilt(INFO, "width", "600")),
+        (INSPECTED, spoilt(INFO, "metadata.aperture", 1e300)),
+        (INSPECTED, spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
+        (SELECTED, spoilt(SELECTION, "patches", [patch(0)] * 2001)),
+        (SELECTED, spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
+        (SELECTED, spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
+        (SELECTED, spoilt(SELECTION, "patches.0.row", 2**70)),
+        (SELECTED, spoilt(SELECTION, "lateral", {"red": [1.0]})),
+        (CORRECTED, spoilt(CORRECTION, "report.zones", {"elsewhere": {}})),
+        (CORRECTED, spoilt(CORRECTION, "report.zones.mid", {"reasons": ["x"] * 100})),
+        (CORRECTED, spoilt(CORRECTION, "report.audit.tiles", [{"row": 1}])),
+        (CORRECTED, spoilt(CORRECTION, "report.audit.zones", {"mid": {"tiles": "many"}})),
     ],
 )
-def test_an_answer_that_no_task_gives_ends_the_photo(bench: Bench, task: str, answer: Any) -> None:
-    bench.let(task, ok(answer))
+def test_what_no_task_gives_is_no_answer(kind: Any, answer: Any) -> None:
+    with pytest.raises(JobFailedError) as caught:
+        checked(kind, answer)
+
+    assert caught.value.code == "internal_error"
+    assert len(caught.value.detail) < 300
+
+
+def test_what_tasks_give_are_answers() -> None:
+    zones = {"center": ZoneReport(cells=2, expected_gain_db=1.0, psf_error=0.1)}
+    report = codec.to_json({"zones": zones, "nothing_to_correct": False})
+    corrected = {"file": "result.png", "report": report}
+
+    for kind, answer in ((SELECTED, SELECTION), (CORRECTED, CORRECTION), (CORRECTED, corrected)):
+        assert checked(kind, answer) == answer
+
+
+@pytest.mark.parametrize("task", ["locate", "inspect", "select"])
+def test_a_task_that_gives_no_answer_ends_its_photo(bench: Bench, task: str) -> None:
+    bench.let(task, ok({"patches": "many"}))
 
     ended = bench.work()
 
-    assert (ended.state, ended.error_code) == ("failed", "internal_error")
-    assert len(ended.error_detail) < 300
+    if task == "locate":  # nor is it searched for its place
+        assert (ended.state, ended.location) == ("counted", "unknown")
+    else:
+        assert (ended.state, ended.error_code) == ("failed", "internal_error")
 
 
 def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(bench: Bench) -> None:

@@ -352,14 +352,10 @@ _OTHER_COLOURS: Final = {
 def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Header:
     """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF."""
     reader = TiffReader.open(buffer)
-    chain = [] if reader is None else list(reader.chain())
-    if reader is None or not chain:
+    every = [] if reader is None else list(reader.walk(SUB_DIRECTORIES))
+    if reader is None or not every:
         raise TruncatedImageError("the TIFF has no readable directory; copy it again from the camera or card")
-    every = list[tuple[int, Tags]]()
-    for offset, tags in chain:
-        children = tags.integers(SUB_DIRECTORIES, 16)
-        every += [(offset, tags), *((below, reader.directory(below)[0]) for below in children)]
-    first = chain[0][1]
+    first = every[0][1]
     if _DNG_VERSION in first:
         kind = "dng"
     elif any(t.integer(262) in _RAW_PHOTOMETRIC or t.integer(259) in _RAW_COMPRESSION for _, t in every):
@@ -377,7 +373,7 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     )
     check_size(header.width, header.height, len(buffer), limits)
     if kind == "tiff":
-        if len(chain) >= MAX_DIRECTORIES:
+        if len(every) >= MAX_DIRECTORIES:
             raise UnsupportedFormatError(
                 f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo"
             )

@@ -23,7 +23,7 @@ import numpy as np
 
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import MAX_BLOCK_BYTES, opened_header, png_chunks
-from lensmodel.photo.tiff import ENTRY, EXIF, GPS, MAX_DIRECTORIES, SUB_DIRECTORIES, Buffer, TiffReader, Value
+from lensmodel.photo.tiff import ENTRY, EXIF, GPS, SUB_DIRECTORIES, Buffer, TiffReader, Value
 from lensmodel.photo.values import Limits
 
 # Bounds against files made to cost time (chosen): Exif blocks, of which a photo has one and each preview;
@@ -93,16 +93,7 @@ def gps_directory(path: Path) -> dict[int, Value]:
 
 def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
     """Yield the GPS directories of a TIFF structure: of its chain, and of what hangs on that."""
-    waiting, visited = [reader.first], set[int]()
-    while waiting and len(visited) < MAX_DIRECTORIES:
-        offset = waiting.pop()
-        if offset in visited or offset <= 0:
-            continue
-        visited.add(offset)
-        tags, following = reader.directory(offset)
-        waiting.append(following)
-        for tag in (SUB_DIRECTORIES, EXIF):
-            waiting += tags.integers(tag, MAX_DIRECTORIES)
+    for _, tags in reader.walk(SUB_DIRECTORIES, EXIF):
         yield from _directory(buffer, reader, tags.integer(GPS))
 
 

@@ -148,15 +148,19 @@ class TiffReader:
         complete = len(table) == count * ENTRY and len(tail) == 4
         return tags, struct.unpack(self.order + "I", tail)[0] if complete else 0
 
-    def chain(self) -> Iterator[tuple[int, Tags]]:
-        """Yield place and tags of the directories linked from the first one; a loop ends the chain."""
-        offset, seen = self.first, set[int]()
-        while offset and offset not in seen and len(seen) < MAX_DIRECTORIES:
+    def walk(self, *pointers: int) -> Iterator[tuple[int, Tags]]:
+        """Yield place and tags of the first directory and of those that it and others point to, each once."""
+        waiting, seen = [self.first], set[int]()
+        while waiting and len(seen) < MAX_DIRECTORIES:
+            offset = waiting.pop(0)
+            if offset <= 0 or offset in seen:
+                continue
             seen.add(offset)
             tags, following = self.directory(offset)
             if tags:
                 yield offset, tags
-            offset = following
+            waiting.append(following)
+            waiting += [below for tag in pointers for below in tags.integers(tag, MAX_DIRECTORIES)]
 
     def below(self, tags: Tags, pointer: int) -> Tags:
         """Read the directory that a tag (EXIF, GPS, part of a maker note) points to; empty without one."""

@@ -32,13 +32,6 @@ def numbers(path: Path) -> np.ndarray:
     return photo.shown(developed.planes, developed.encoding)
 
 
-def test_a_preview_before_the_photo_is_not_the_photo() -> None:
-    shown = numbers(REPORTS / "thumbnail-first.tif")
-
-    with tifffile.TiffFile(REPORTS / "thumbnail-first.tif") as file:
-        assert np.abs(shown.astype(int) - file.pages[1].asarray()).max() <= 1
-
-
 def _previews_without_a_mark(path: Path) -> None:
     with tifffile.TiffWriter(path) as file:
         file.write(PIXELS[::4, ::4], photometric="rgb", metadata=None)
@@ -161,13 +154,6 @@ def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
         photo.inspect(tmp_path / "x.dng")
 
 
-def test_stray_bytes_between_segments_are_passed_over_as_viewers_do() -> None:
-    with Image.open(REPORTS / "stray-bytes-between-segments.jpg") as image:
-        truth = np.asarray(image.convert("RGB"))
-
-    assert np.abs(numbers(REPORTS / "stray-bytes-between-segments.jpg").astype(int) - truth).max() <= 1
-
-
 @pytest.mark.parametrize("stray", [b"\0", b"ab\0c", b"\xff\xff\xff", b"\xff\0\0", b"\xff\xd0"])
 @pytest.mark.parametrize("segment", [1, 2])
 def test_stray_bytes_hide_nothing_that_follows_them(stray: bytes, segment: int, tmp_path: Path) -> None:
@@ -180,9 +166,11 @@ def test_stray_bytes_hide_nothing_that_follows_them(stray: bytes, segment: int, 
         at += 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
     (tmp_path / "x.jpg").write_bytes(data[:at] + stray + data[at:])
 
-    info = photo.inspect(tmp_path / "x.jpg")
+    developed = photo.develop(tmp_path / "x.jpg")
 
-    assert (info.width, info.height, info.metadata.camera_model) == (64, 48, "T-1")
+    with Image.open(tmp_path / "x.jpg") as image:
+        assert np.abs(photo.shown(developed.planes, developed.encoding) - np.int16(image)).max() <= 1
+    assert developed.info.metadata.camera_model == "T-1"
 
 
 def test_a_jpeg_of_stray_bytes_alone_ends_inside_its_header(tmp_path: Path) -> None:
@@ -212,34 +200,12 @@ def _with_segments(path: Path, segments: bytes, camera: str | None = None) -> Pa
     return path
 
 
-def test_a_jpeg_with_a_large_header_is_read_whole(tmp_path: Path) -> None:
-    path = _with_segments(tmp_path / "x.jpg", _segments(0xE5, *[bytes(65_000)] * 140), camera="T-1")
-
-    info = photo.inspect(path)
-
-    assert (info.width, info.height, info.metadata.camera_model) == (64, 48, "T-1")
-
-
 @pytest.mark.parametrize("parts", [_segments(0xE5, *[b""] * 50_000), b"\0".join([b""] * 200_000)])
 def test_a_jpeg_header_of_very_many_parts_is_refused(parts: bytes, tmp_path: Path) -> None:
     first = _segments(0xE5, b"")
 
     with pytest.raises(NotAnImageError, match="within 32768 segments"):
         photo.inspect(_with_segments(tmp_path / "x.jpg", first + parts))
-
-
-def test_exif_of_a_jpeg_is_read_within_bounds_and_without_a_warning(tmp_path: Path) -> None:
-    many = 2000  # entries that each say to hold what lies beyond the file
-    entries = b"".join(struct.pack("<HHII", tag, 7, 1 << 30, 8) for tag in range(2000, 2000 + many))
-    hostile = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", many) + entries + bytes(4)
-    path = _with_segments(tmp_path / "x.jpg", _segments(0xE1, hostile), camera="T-1")
-
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        info = photo.inspect(path)
-
-    assert info.metadata.camera_model == "T-1"
-    assert not said
 
 
 def overlapping(kind: bytes, tags: int = 4000, most: int = 16_000) -> bytes:
@@ -251,6 +217,8 @@ def overlapping(kind: bytes, tags: int = 4000, most: int = 16_000) -> bytes:
 HOSTILE = {
     "Exif": _segments(0xE1, overlapping(b"Exif\0\0")),
     "Exif in many parts": _segments(0xE1, overlapping(b"Exif\0\0"), *[b"Exif\0\0" + bytes(65_000)] * 100),
+    "Exif of values beyond the file": _segments(0xE1, overlapping(b"Exif\0\0", most=1 << 30)),
+    "large header": _segments(0xE5, *[bytes(65_000)] * 140),
     "list of pictures": _segments(0xE2, overlapping(b"MPF\0")),
 }
 
@@ -269,6 +237,7 @@ def test_what_stands_beside_a_jpeg_costs_nothing_while_it_is_decoded(case: str, 
     tracemalloc.stop()
 
     assert developed.planes.shape == (3, 48, 64)
+    assert developed.info.metadata.camera_model == "T-1"
     assert most < 4 * size + (16 << 20)
 
 

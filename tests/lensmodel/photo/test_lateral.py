@@ -84,12 +84,6 @@ def test_flat_planes_claim_nothing() -> None:
     assert (found.red, found.blue, found.red_points) == (IDENTITY, IDENTITY, 0)
 
 
-def test_clipped_planes_claim_nothing() -> None:
-    found = estimate_lateral(photo(), FRAME, clip=0.1)
-
-    assert found.red_points == 0
-
-
 def test_a_channel_that_clips_below_the_others_is_judged_by_its_own_level() -> None:
     planes = photo()
     planes[0] = np.minimum(planes[0], 0.15)  # most of red

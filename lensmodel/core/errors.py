@@ -22,10 +22,6 @@ class InvalidInputError(LensModelError):
     code: ClassVar[str] = "invalid_parameter"
 
 
-class InvalidKernelError(InvalidInputError):
-    """An array that cannot be a PSF."""
-
-
 class UnknownMethodError(InvalidInputError):
     """A name that is in no registry; the text lists the known ones."""
 

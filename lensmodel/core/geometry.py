@@ -40,11 +40,9 @@ def block_means(plane: NDArray[_Number], side: int) -> NDArray[_Number]:
 class Frame:
     """The sensor frame of a photo, in sensor orientation."""
 
-    height: int  # size in pixels
+    height: int  # pixels
     width: int
-    # Half diagonal in pixels of the larger frame of which this one is the middle, as in crop mode: r is
-    # counted in it. None where this is the whole frame.
-    circle_px: float | None = None
+    circle_px: float | None = None  # half diagonal of a larger frame of which this is the middle: unit of r
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 1:
@@ -89,24 +87,12 @@ class Frame:
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centres of equal cells of a picture.
-
-    Parameters
-    ----------
-    rows, cols : int
-        Number of cells, at least 1.
-    aspect : float
-        Width over height of the picture.
+    """Return the field positions of the centres of equal cells of a picture, `aspect` its width over height.
 
     Returns
     -------
     r, phi : ndarray of float64, shape (rows, cols)
         Half diagonals, and radians; row 0 is the top in sensor orientation.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are no cells, or the aspect is not positive.
     """
     if rows < 1 or cols < 1 or not aspect > 0.0:
         raise InvalidInputError(f"a grid needs cells and an aspect, got {rows} x {cols}, aspect {aspect}")

@@ -1,4 +1,4 @@
-"""How inner loops are compiled; imported only where Numba is installed."""
+"""How inner loops are compiled."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def jit(function: F) -> F:
     """Compile without the interpreter's lock, keep the machine code on disk."""
-    return cast(
-        "F",
-        numba.njit(
-            cache=True, nogil=True, fastmath={"nsz", "contract", "reassoc", "arcp"}, error_model="numpy"
-        )(function),
-    )
+    fastmath = {"nsz", "contract", "reassoc", "arcp"}
+    compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy")(function)
+    return cast("F", compiled)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its parts are loaded when they are needed: processes that compute nothing do not wait
 
-from lensmodel.core.errors import InvalidInputError, InvalidKernelError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 
 WING_LEVEL = 0.01
@@ -28,9 +28,9 @@ def as_kernel(values: npt.ArrayLike) -> Kernel:
     """Check and normalise an array to a kernel of sum 1, read-only, not yet centred."""
     kernel = np.array(values, dtype=np.float64)  # a copy of our own, never the caller's
     if kernel.ndim != 2 or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0:
-        raise InvalidKernelError(f"kernel must be square with an odd side, got shape {kernel.shape}")
+        raise InvalidInputError(f"kernel must be square with an odd side, got shape {kernel.shape}")
     if not np.isfinite(kernel).all() or kernel.min() < 0 or kernel.sum() <= 0:
-        raise InvalidKernelError("kernel must be finite, non-negative and not all zero")
+        raise InvalidInputError("kernel must be finite, non-negative and not all zero")
     kernel /= kernel.sum()
     kernel.setflags(write=False)
     return kernel
@@ -66,11 +66,9 @@ def centred(kernel: npt.ArrayLike) -> Kernel:
     """Shift the centre of mass onto the middle pixel.
 
     Whole pixels are moved first, and what leaves the array is lost; the rest is a cubic-spline shift.
-    Clipping its undershoot moves the centre a little, so the shift is repeated until less than a
-    thousandth of a pixel is left.
     """
     current = np.array(as_kernel(kernel))
-    for _ in range(12):
+    for _ in range(12):  # clipping the spline's undershoot moves the centre a little
         row, col = centroid(current)
         if max(abs(row), abs(col)) < _CENTRED_PX:
             break
@@ -193,7 +191,8 @@ class EncodedPatch:
 class PsfSample:
     """One local PSF estimate: what was seen, where, at which settings, how sure.
 
-    The samples of the regression [1]_; what makes one is up to `estimator`.
+    Values that are out of their range raise `InvalidInputError`. Source: M. Hirsch, B. Schölkopf,
+    "Self-Calibration of Optical Lenses", ICCV 2015, sections 5 and 6.
 
     Parameters
     ----------
@@ -219,17 +218,6 @@ class PsfSample:
         Relative L2 distance to the truth that the method expects of it; None where it says nothing.
     half_diagonal_px : float or None
         Half the diagonal of the frame in pixels; None where unknown.
-
-    Raises
-    ------
-    InvalidKernelError
-        If the kernel cannot be a PSF.
-    InvalidInputError
-        If another value is out of its range.
-
-    References
-    ----------
-    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 5 and 6.
     """
 
     kernel: Kernel

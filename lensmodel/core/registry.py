@@ -18,20 +18,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Named factories of one kind.
+    """Named factories of one kind, those of installed packages included.
 
-    `register` adds to it for the whole process. An installed package makes its methods known to every
-    process, those of the command and of the service too, by entry points::
-
-        [project.entry-points."lensmodel.estimators"]
-        mine = "my_package:MyEstimator"
+    `group` names their entry points; these are loaded when they are first asked for, and never replace an
+    entry that is there. `register` adds to it for this process.
     """
 
     kind: str  # what the entries are, for error messages
-    # factories by name; each returns an entry from keyword parameters
-    entries: Mapping[str, Callable[..., T]]
-    # Entry points of this group in installed packages are entries too; empty for none. They are loaded when
-    # they are first asked for, and never replace an entry that is there.
+    entries: Mapping[str, Callable[..., T]]  # by name; each returns an entry from keyword parameters
     group: str = ""
 
     def __post_init__(self) -> None:

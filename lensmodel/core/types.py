@@ -45,24 +45,17 @@ def ignore_step(done: int, total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FieldPosition:
-    """A place in the image field, in sensor orientation: (r, phi) of the PSF function [1]_.
+    """A place in the image field, in sensor orientation: (r, phi) of the PSF function.
+
+    Source: M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.
 
     Parameters
     ----------
     r : float
-        Distance to the image centre over the half diagonal: 0 centre, 1 corner.
+        Distance to the image centre over the half diagonal: 0 centre, 1 corner; `InvalidInputError` outside.
     phi : float
         Angle in radians, counter-clockwise from the right: 0 right, +pi/2 towards row 0.
         Stored wrapped into (-pi, pi].
-
-    Raises
-    ------
-    InvalidInputError
-        If `r` lies outside 0..1 or `phi` is not finite.
-
-    References
-    ----------
-    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.
     """
 
     r: float
@@ -84,9 +77,10 @@ class FieldPosition:
 
 @dataclass(frozen=True, slots=True)
 class LensSettings:
-    """How the lens was set: the variables Φ of the PSF function f(u, v, r, phi, Φ) [1]_.
+    """How the lens was set: the variables Φ of the PSF function f(u, v, r, phi, Φ).
 
-    `None` means unknown, which is not zero: an unknown variable takes no part in distances.
+    `None` means unknown, which is not zero: an unknown variable takes no part in distances. Other values out
+    of their range raise `InvalidInputError`.
 
     Parameters
     ----------
@@ -98,15 +92,6 @@ class LensSettings:
         Focus distance in metres, above 0; infinity is allowed.
     channel : {"r", "g", "b"}
         Color channel.
-
-    Raises
-    ------
-    InvalidInputError
-        If a value is out of its range, or there is no such channel.
-
-    References
-    ----------
-    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.
     """
 
     aperture: float | None = None
@@ -130,46 +115,23 @@ class LensSettings:
         return None if self.aperture is None else 2.0 * math.log2(self.aperture)
 
     def with_channel(self, channel: Channel) -> LensSettings:
-        """Return the same settings for another color channel.
-
-        Parameters
-        ----------
-        channel : {"r", "g", "b"}
-
-        Returns
-        -------
-        LensSettings
-
-        Raises
-        ------
-        InvalidInputError
-            If there is no such channel.
-        """
+        """Return the same settings for another color channel."""
         return replace(self, channel=channel)
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of one plane's noise as a function of its level, var(y) = shot * y + read [1]_.
+    """Variance of one plane's noise as a function of its level, var(y) = shot * y + read.
 
-    Both are in linear units where saturation is 1.
+    Both are in linear units where saturation is 1; `InvalidInputError` if one is negative or not finite.
+    Source: A. Foi et al., "Practical Poissonian-Gaussian noise modeling and fitting", IEEE TIP 17, 2008.
 
     Parameters
     ----------
     shot : float
-        One over the full-well count in electrons; not negative.
+        One over the full-well count in electrons.
     read : float
-        Squared standard deviation of the read noise; not negative.
-
-    Raises
-    ------
-    InvalidInputError
-        If a term is negative or not finite.
-
-    References
-    ----------
-    .. [1] A. Foi et al., "Practical Poissonian-Gaussian noise modeling and fitting", IEEE TIP 17, 2008,
-       eq. 1 and 2.
+        Squared standard deviation of the read noise.
     """
 
     shot: float
@@ -182,49 +144,14 @@ class NoiseModel:
             )
 
     def variance(self, level: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the variance at each level.
-
-        Parameters
-        ----------
-        level : ndarray of float, any shape
-            Linear light; below 0 counts as 0.
-
-        Returns
-        -------
-        ndarray of float64, same shape
-        """
+        """Return the variance at each level of linear light; levels below 0 count as 0."""
         return self.shot * np.maximum(np.asarray(level, dtype=np.float64), 0.0) + self.read
 
     def sigma_at(self, level: float) -> float:
-        """Return the standard deviation at one level.
-
-        Parameters
-        ----------
-        level : float
-            Linear light; below 0 counts as 0.
-
-        Returns
-        -------
-        float
-        """
+        """Return the standard deviation at one level of linear light; a level below 0 counts as 0."""
         return math.sqrt(self.shot * max(level, 0.0) + self.read)
 
     @classmethod
     def white(cls, sigma: float) -> NoiseModel:
-        """Make noise that does not depend on the level.
-
-        Parameters
-        ----------
-        sigma : float
-            Its standard deviation, where saturation is 1.
-
-        Returns
-        -------
-        NoiseModel
-
-        Raises
-        ------
-        InvalidInputError
-            If it is not finite.
-        """
+        """Make noise of a standard deviation that does not depend on the level."""
         return cls(shot=0.0, read=sigma * sigma)

@@ -132,7 +132,7 @@ def test_ncc_of_two_gaussians_is_the_closed_form() -> None:
     "bad", [np.ones((4, 4)), np.ones((3, 5)), -np.ones((3, 3)), np.full((3, 3), np.nan), np.zeros((3, 3))]
 )
 def test_arrays_that_are_no_psf_are_refused(bad: np.ndarray) -> None:
-    with pytest.raises(errors.InvalidKernelError):
+    with pytest.raises(errors.InvalidInputError):
         psf.as_kernel(bad)
 
 

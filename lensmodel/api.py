@@ -97,24 +97,19 @@ def calibrate(
         f-number of the photos that do not say their own: what a photo says goes first. The same goes for
         `focal_mm`, the focal length in mm, and `focus_m`, the focus distance in metres.
     estimator : str or PsfEstimator
-        A name in `estimators`, or an object of one's own with the same methods. It is sent to worker
-        processes; one that they cannot load, as of a class in a notebook, runs in threads of this process.
-        None takes that of `model`.
+        A name in `estimators`, or an object of one's own; one that worker processes cannot load, as of a
+        class in a notebook, runs in threads of this process. None takes that of `model`.
     selector : str or Selector
-        A name in `selectors`, or an object of one's own, which scores the windows of a photo by how much they
-        tell about the blur.
+        A name in `selectors`, or an object of one's own.
     model : {"default", "paper"} or ModelSettings, optional
-        "paper" learns a new lens the paper's own way, with nothing else mixed in, and corrects with it so:
-        to compare with, not for photos to keep. Or the choices of the regression. A lens that is given keeps
-        its own.
+        "paper" learns a new lens the paper's own way, and corrects with it so: to compare with, not for
+        photos to keep. Or the choices of the regression. A lens that is given keeps its own.
     kernel_size : int, optional
-        Largest odd side of the estimated kernels in pixels, 3 to 55; by default 55, and 31 of an estimator of
-        one's own.
+        Largest odd side of the estimated kernels in pixels, 3 to 55; by default 55, of an own estimator 31.
     any_lens : bool
         Take photos that seem to be of another lens as well.
     patches : int, optional
-        Parts of a photo that are looked at; fewer are faster and know less. By default 96, and 24 where
-        kernels are estimated one by one.
+        Parts of a photo that are looked at; by default 96, and 24 where kernels are estimated one by one.
     workers : int, optional
         Processes; all cores by default. The result does not depend on it.
     executor : concurrent.futures.Executor, optional
@@ -124,22 +119,14 @@ def calibrate(
         `event.total` patches, `event.detail`; raising `CancelledError` there stops the work. None shows the
         progress in a terminal or notebook.
 
-    Returns
-    -------
-    Lens
-
     Raises
     ------
     FileNotFoundError
         If one of the files is not there; nothing is begun then.
     InvalidInputError
-        If a value is out of its range, or both `lens` and `model` are given.
-    UnknownMethodError
-        If there is no estimator, selector or model of that name.
+        If a value is out of its range, both `lens` and `model` are given, or no method has that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
-    CancelledError
-        As `on_event` raised it.
     """
     _require_workers(workers)
     on_event = on_event or _show_event
@@ -194,10 +181,9 @@ def correct(
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
-    Non-blind deconvolution with the PSF of each place (Hirsch and Schölkopf, ICCV 2015, section 7). How far
-    it goes where PSF or photo are unsure, and what it holds back, are rules of this project. The photo itself
-    tells of its lens too: its patches join the samples for its own correction. With the method "paper", a
-    lens that was learned the paper's way is corrected without all of that.
+    Non-blind deconvolution with the PSF of each place (Hirsch and Schölkopf, ICCV 2015, section 7), the
+    gentler the less sure PSF and photo are. The photo's own patches join the samples for its correction. With
+    the method "paper", a lens that was learned the paper's way is corrected without all of that.
 
     Parameters
     ----------
@@ -219,15 +205,13 @@ def correct(
     bounds : Bounds, optional
         What to allow beside edges and in flat areas.
     file_format : {"tiff16", "tiff32", "png16", "png8", "jpeg", "dng"}, optional
-        By default what the ending of `output` says (`FORMATS`), and for a TIFF of floating-point numbers the
-        same again.
+        By default what the ending of `output` says, and for a TIFF of floating-point numbers the same again.
     color_space : {"same", "srgb", "camera-linear"}
         Colors of the written file.
     quality : int
         Of a JPEG, 1..100.
     least_gain_db : float, optional
-        Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`), which a forecast decides
-        before the work where it can; None always writes.
+        Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
     keep_location : bool
         Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
@@ -244,19 +228,13 @@ def correct(
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such photo or profile, or no folder for `output`; another `OSError` if one cannot be
-        read or written.
-    UnreadablePhotoError
-        If the file cannot be decoded.
-    ImageTooLargeError
-        If the photo has more pixels than are read.
+    OSError
+        If photo or profile cannot be read, or `output` not be written.
+    UnreadablePhotoError, ImageTooLargeError
+        If the file cannot be decoded, or has more pixels than are read.
     InvalidInputError
-        If a value is out of its range, the ending of `output` is unknown, or it is the photo itself.
-    UnknownMethodError
-        If there is no method of that name.
-    CancelledError
-        If `on_step` raised it.
+        If a value is out of its range, the ending of `output` is unknown, it is the photo itself, or no
+        method has that name.
     """
     _require_workers(workers)
     given = LensSettings(aperture, focal_mm, focus_m)
@@ -337,9 +315,7 @@ def correct_photo(
 ) -> correction.Corrected:
     """Remove the blur of the lens from a developed photo.
 
-    The less sure a PSF is, by the error that the model expects, the gentler the correction. A lens that was
-    learned the paper's way is corrected the paper's way: its PSFs are taken as right, and Richardson-Lucy
-    deconvolution is all that is done.
+    The paper's way with a lens that was learned so, its PSFs are taken as right.
     """
     whole, developed = developed.frame, placed(developed, model)
     if lateral is not None and developed.frame != whole:

@@ -64,9 +64,8 @@ Sampler = Callable[[str, Admit], Sequence[PsfSample]]
 class Calibration:
     """A lens that learns from one photo after the other, kept in a store.
 
-    `begin` are the choices of the regression of a new lens; a known one keeps its own. `pool` estimates the
-    cells of all photos, where they are estimated here; without one each photo starts and ends processes of
-    its own. `replace` drops what was learned blindly at the settings of new, measured samples.
+    `begin` are the choices of the regression of a new lens; `pool` estimates the cells of all photos;
+    `replace` drops what was learned blindly at the settings of new, measured samples.
     """
 
     def __init__(

@@ -130,10 +130,9 @@ def squares_of(edges: Sequence[FoundEdge]) -> list[tuple[FoundEdge, ...]]:
 
 def _share_corner(a: FoundEdge, b: FoundEdge, side: float) -> bool:
     """Whether two edges meet in a corner and each lies on the dark (-1) or bright (1) side of the other."""
-    if _angle_between(a.response.normal, b.response.normal) < _CROSSING:
+    between, normals = np.subtract(b.middle, a.middle), [_unit(e.response.normal) for e in (a, b)]
+    if abs(normals[0] @ normals[1]) > math.cos(_CROSSING):
         return False
-    between = np.subtract(b.middle, a.middle)
-    normals = [_unit(e.response.normal) for e in (a, b)]
     if side * float(between @ normals[0]) <= 0.0 or side * float(-between @ normals[1]) <= 0.0:
         return False
     # the lines p n = p_a n_a and p n = p_b n_b cross here, (row, col)
@@ -144,12 +143,6 @@ def _share_corner(a: FoundEdge, b: FoundEdge, side: float) -> bool:
 def _unit(normal: float) -> NDArray[np.float64]:
     """Unit vector (row, col) of an angle."""
     return np.array([-math.sin(normal), math.cos(normal)])
-
-
-def _angle_between(first: float, second: float) -> float:
-    """Angle between two normals, whichever side is bright: 0 to pi/2."""
-    folded = abs(first - second) % math.pi
-    return min(folded, math.pi - folded)
 
 
 # --- what is fitted to --------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise, product
 from typing import ClassVar, Final
 
 import numpy as np
@@ -265,23 +266,23 @@ def _detailed(
     opened: LinearPhoto, closed: LinearPhoto, side: int, across: int, down: int, margin: int
 ) -> list[tuple[int, int]]:
     """Corners of the windows with most fine detail, one in each cell of the frame."""
-    step = side // 4
     plane = np.asarray(closed.planes[1])
     fine = np.square(plane - ndimage.gaussian_filter(plane, 1.5))
     clipped = (plane >= closed.clip[1]) | (np.asarray(opened.planes[1]) >= opened.clip[1])
     fine[ndimage.maximum_filter(clipped, 5)] = 0.0
     energy = ndimage.uniform_filter(np.minimum(fine, 20.0 * float(fine.mean())), side, mode="constant")
-    height, width = plane.shape
+
+    def starts(length: int, cells: int) -> list[NDArray[np.intp]]:
+        edges = [i * length // cells for i in range(cells + 1)]
+        last = length - side - margin
+        ranges = [np.arange(max(a - side // 4, margin), b, side // 4) for a, b in pairwise(edges)]
+        return [each[each <= last] for each in ranges if (each <= last).any()]
+
     corners = []
-    for i in range(down):
-        for j in range(across):
-            rows = np.arange(max(i * height // down - side // 4, margin), (i + 1) * height // down, step)
-            cols = np.arange(max(j * width // across - side // 4, margin), (j + 1) * width // across, step)
-            rows, cols = rows[rows + side + margin <= height], cols[cols + side + margin <= width]
-            if rows.size and cols.size:
-                nearby = energy[np.ix_(rows + side // 2, cols + side // 2)]
-                k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
-                corners.append((int(rows[k]), int(cols[l])))
+    for rows, cols in product(starts(plane.shape[0], down), starts(plane.shape[1], across)):
+        nearby = energy[np.ix_(rows + side // 2, cols + side // 2)]
+        k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
+        corners.append((int(rows[k]), int(cols[l])))
     return list(dict.fromkeys(corners))
 
 

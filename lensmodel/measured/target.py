@@ -22,13 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import ClassVar, Final
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.signal.windows import tukey
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
@@ -99,9 +99,9 @@ class Target:
             for corner in window_corners((height, width), self.side, _TRIED * across, _TRIED * down, 0)
             if placed.holds(*corner, self.side, size // 2)
         ]
-        corners = _spread(held, across, down)
-        if not corners:
+        if not held:
             raise NotEnoughEvidenceError(_TOO_SMALL)
+        corners = _spread(held, across, down)
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         tones = tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
         placed = replace(placed, tones=tones)
@@ -130,20 +130,12 @@ class Target:
         best = solve_window(window, placed, size)
         for part in _SMALLER:
             side = round(self.side * part)
-            few = _pixels(window.photo, window.channel, side) < _LEAST_PIXELS * size * size
+            few = window.measured.sum() * (side / self.side) ** 2 < _LEAST_PIXELS * size * size
             if best.solved.misfit <= EXPLAINED or few:
                 break
             row, col = (at + (self.side - side) // 2 for at in window.corner)
             best = solve_window(Window.of(window.photo, window.channel, (row, col), side), placed, size)
         return best.window.psf(best.kernel, best.solved.error, FLOOR, _SURE)
-
-
-def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
-    """How many pixels of a window the sensor measures in a channel."""
-    if photo.cfa is None:
-        return float(side * side)
-    sites = sum(row.count(CHANNELS.index(channel)) for row in photo.cfa)
-    return side * side * sites / 4.0
 
 
 def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -> PlacedPage:
@@ -177,8 +169,6 @@ def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -
 
 def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tuple[int, int]]:
     """Choose of all windows that show noise those nearest to an even grid over them."""
-    if not held:
-        return []
     places = np.array(held)
     first, last = places.min(axis=0), places.max(axis=0)
     parts = [np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5]) for count in (down, across)]
@@ -214,8 +204,12 @@ class PlacedPage:
         # turned or aslant, a page has frequencies along the pixels' axes that pixels do not hold
         sides = [fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape]
         places = [at - _SPARE + np.arange(n * _FINE) / _FINE for at, n in zip((row, col), sides, strict=True)]
-        plane = self._toned(self.page.at(*self.warp(*np.meshgrid(*places, indexing="ij")))) - MEAN
-        plane *= _taper(sides[0] * _FINE)[:, None] * _taper(sides[1] * _FINE)
+        shown = self.page.at(*self.warp(*np.meshgrid(*places, indexing="ij")))
+        first, second, third = (np.float32(t) for t in self.tones)
+        plane = shown * (first + shown * (second + shown * third)) - MEAN
+        # falling to 0 within the spare samples at both ends, the rim makes no frequencies
+        down, along = (tukey(n * _FINE, 2.0 * _SPARE / n).astype(np.float32) for n in sides)
+        plane *= down[:, None] * along
         for axis, n in enumerate(sides):
             plane = scipy.signal.resample(plane, n, axis=axis)
         inner = plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]]
@@ -225,16 +219,6 @@ class PlacedPage:
         """Whether a window of the photo, with its margin, shows noise and nothing else."""
         steps = np.linspace(-margin, side - 1 + margin, 9)
         return self.page.holds_noise(*self.warp(*np.meshgrid(row + steps, col + steps, indexing="ij")))
-
-    def _toned(self, reflectance: NDArray[np.float32]) -> NDArray[np.float32]:
-        first, second, third = (np.float32(t) for t in self.tones)
-        return np.asarray(reflectance * (first + reflectance * (second + reflectance * third)))
-
-
-@cache
-def _taper(length: int) -> NDArray[np.float32]:
-    """1 in the middle, falling to 0 within the spare samples at both ends: the rim makes no frequencies."""
-    return np.asarray(scipy.signal.windows.tukey(length, 2.0 * _SPARE * _FINE / length), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

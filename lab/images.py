@@ -16,8 +16,8 @@ from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame, zone_of
-from lensmodel.core.types import ZONES, Direction, Planes, Zone
-from lensmodel.quality.edge import Box, EdgeResponse, direction_of, slanted_edge
+from lensmodel.core.types import ZONES, Direction, FieldPosition, Planes, Zone
+from lensmodel.quality.edge import Box, EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 
@@ -278,6 +278,14 @@ def measure_edges(plane: NDArray[np.floating], boxes: Sequence[Box]) -> tuple[Ed
     if not measured:
         raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
     return tuple(measured)
+
+
+def direction_of(normal: float, place: FieldPosition) -> Direction:
+    """Say which contrast an edge shows; only within 10 degrees of u or v it is tangential or sagittal."""
+    least = math.cos(math.radians(10.0))  # (chosen)
+    if abs(math.cos(normal - place.phi)) >= least:
+        return "tangential"
+    return "sagittal" if abs(math.sin(normal - place.phi)) >= least else "oblique"
 
 
 def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:

@@ -29,7 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.types import Direction, FieldPosition
 
 Box = tuple[int, int, int, int]
 """(row, col, height, width) in pixels of the frame."""
@@ -42,9 +41,6 @@ _MIN_ROWS: Final = 10  # that a line is fitted to: fewer do not tell which of th
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
 _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
 _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)
-
-_ALONG: Final = math.cos(math.radians(10.0))
-"""Edges whose normal lies further from u and v belong to neither (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,11 +246,3 @@ def _spectrum(esf: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     known = np.sinc(2.0 * frequencies / OVERSAMPLING) * np.sinc(frequencies / OVERSAMPLING)
     mtf = spectrum[inside] / spectrum[0] / np.maximum(known, 1.0 / _MAX_CORRECTION)
     return np.asarray(frequencies, dtype=np.float64), np.asarray(mtf, dtype=np.float64)
-
-
-def direction_of(normal: float, place: FieldPosition) -> Direction:
-    """Say which contrast an edge shows; only within 10 degrees of u or v it is tangential or sagittal."""
-    turned = normal - place.phi
-    if abs(math.cos(turned)) >= _ALONG:
-        return "tangential"
-    return "sagittal" if abs(math.sin(turned)) >= _ALONG else "oblique"

@@ -39,7 +39,6 @@ LEAST_ON_A_CHART: Final = 4
 _MEAN: Final = 4  # pixels along the side of a mean
 _WINDOW: Final = SIDES[-1] // _MEAN  # of the smallest crop, in means of pixels
 _STRIDE: Final = _WINDOW // 4  # a quarter of a window: no edge is missed between two (chosen)
-_STRIP: Final = 1024  # rows at once: no copy of the frame is made
 _LEAST_STEP: Final = 0.02  # of full scale
 _LEAST_COHERENCE: Final = 0.9  # of the structure tensor: one straight edge and nothing else (chosen)
 # ISO 12233 wants slants; along pixels and diagonals the super-sampling fails
@@ -73,18 +72,18 @@ class FoundEdge:
         return row + (height - 1) / 2.0, col + (width - 1) / 2.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Segment:
     """Windows along one edge: its middle, its unit direction, (row, col), and half its length, pixels."""
 
-    middle: tuple[float, float]
-    along: tuple[float, float]
+    middle: NDArray[np.float64]
+    along: NDArray[np.float64]
     half: float
 
     def at(self, share: float) -> tuple[float, float]:
         """The point at a share of the half length from the middle."""
-        distance = share * self.half
-        return self.middle[0] + distance * self.along[0], self.middle[1] + distance * self.along[1]
+        row, col = (self.middle + share * self.half * self.along).tolist()
+        return row, col
 
 
 def find_edges(
@@ -93,19 +92,17 @@ def find_edges(
     """Find straight slanted edges with flat ground on both sides, as charts have them.
 
     Each is given once, by the largest box in its middle that holds nothing else; none where there are fewer
-    than four, or none across the others: such a photo shows no chart. The plane may be memory-mapped, it is
-    read once, a strip at a time.
+    than four, or none across the others: such a photo shows no chart.
     """
     if min(plane.shape) < SIDES[-1]:
         return ()
     found: list[FoundEdge] = []
     with np.errstate(all="ignore"):  # light beyond what float32 can square is no edge
-        segments = _segments(_means(plane))
+        segments = _segments(block_means(np.asarray(plane, dtype=np.float32), _MEAN))
     for number, segment in enumerate(segments[:_TRIED]):
         if number == _FIRST and len(found) < LEAST_ON_A_CHART:
             return ()
-        edge = _edge_on(plane, segment, noise, clip)
-        if edge is not None:
+        if (edge := _edge_on(plane, segment, noise, clip)) is not None:
             found.append(edge)
     usual = float(np.median([edge.response.step for edge in found])) if found else 0.0
     edges = tuple(edge for edge in found if edge.response.step > _LEAST_OF_USUAL * usual)
@@ -128,23 +125,6 @@ def _edge_on(
             if response is not None:
                 return FoundEdge((top, left, side, side), response, (segment.at(-1.0), segment.at(1.0)))
     return None
-
-
-def _measured(crop: NDArray[np.float64]) -> EdgeResponse | None:
-    try:
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a fit that is not determined is no edge either
-            response = slanted_edge(crop)
-    except (LensModelError, ArithmeticError, ValueError, IndexError):
-        return None
-    known = (response.mtf50, response.overshoot, response.undershoot, response.step, response.normal)
-    return response if all(map(math.isfinite, known)) else None
-
-
-def _means(plane: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Means of 4 x 4 pixels."""
-    strips = (plane[top : top + _STRIP].astype(np.float32) for top in range(0, len(plane), _STRIP))
-    return np.concatenate([block_means(strip, _MEAN) for strip in strips])
 
 
 def _segments(means: NDArray[np.float32]) -> list[_Segment]:
@@ -211,17 +191,13 @@ def _segment(points: NDArray[np.float64]) -> _Segment:
     along = np.linalg.svd(points - center)[2][0] if len(points) > 1 else np.array([1.0, 0.0])
     place = (points - center) @ along
     low, high = float(place.min()), float(place.max())
-    middle = center + (low + high) / 2.0 * along
-    return _Segment(
-        (float(middle[0]), float(middle[1])), (float(along[0]), float(along[1])), (high - low) / 2.0
-    )
+    return _Segment(center + (low + high) / 2.0 * along, along, (high - low) / 2.0)
 
 
 def _sums(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     """Sums over windows, a quarter of a window apart."""
-    parts = _WINDOW // _STRIDE
     blocks = _STRIDE**2 * block_means(plane, _STRIDE)
-    return np.asarray(sliding_window_view(blocks, (parts, parts)).sum(axis=(2, 3)), dtype=np.float32)
+    return sliding_window_view(blocks, (_WINDOW // _STRIDE,) * 2).sum(axis=(2, 3))
 
 
 def _edge_of(window: NDArray[np.floating], noise: NoiseModel, clip: float) -> EdgeResponse | None:
@@ -229,30 +205,38 @@ def _edge_of(window: NDArray[np.floating], noise: NoiseModel, clip: float) -> Ed
     crop = np.asarray(window, dtype=np.float64)
     if not np.isfinite(crop).all() or crop.max() >= 0.98 * clip or np.mean(crop <= 0.0) > 0.01:
         return None
-    response = _measured(crop)
-    if response is None or response.step < _LEAST_STEP:
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a fit that is not determined is no edge either
+            response = slanted_edge(crop)
+    except (LensModelError, ArithmeticError, ValueError, IndexError):
         return None
+    return response if _holds_nothing_else(crop, response, noise) else None
+
+
+def _holds_nothing_else(crop: NDArray[np.float64], response: EdgeResponse, noise: NoiseModel) -> bool:
+    """Whether an edge stands out, leans, is no wider than a third of its window, and explains it."""
+    step, esf = response.step, response.esf
+    known = (response.mtf50, response.overshoot, response.undershoot, step, response.normal)
+    if not all(map(math.isfinite, known)) or step < _LEAST_STEP:
+        return False
     slant = math.radians(response.angle_deg)
     if not _LEAST_SLANT <= slant <= _MOST_SLANT or max(response.overshoot, response.undershoot) > _OVERSHOOT:
-        return None
-    step = response.step
-    level = (response.esf - response.esf.min()) / step
+        return False
+    level = (esf - esf.min()) / step
     rising = response.esf_distance[(level > 0.15) & (level < 0.85)]  # between the overshoots
-    if rising.size and float(np.ptp(rising)) > min(crop.shape) / 3:
-        return None
-    third = response.esf.size // 6
-    for ground in (response.esf[: 2 * third], response.esf[-2 * third :]):
-        halves = ground[:third].mean() - ground[third:].mean()
-        if abs(float(halves)) > _UNEVEN * step:
-            return None
+    third = esf.size // 6
+    grounds = (esf[: 2 * third], esf[-2 * third :])
+    uneven = max(abs(float(ground[:third].mean() - ground[third:].mean())) for ground in grounds)
+    if (rising.size and float(np.ptp(rising)) > min(crop.shape) / 3) or uneven > _UNEVEN * step:
+        return False
     left = _unexplained(crop, response.normal)
     scatter = float(noise.variance(np.maximum(crop, 0.0)).mean())
-    explained = (
+    return (
         float(left.var()) < (_UNEXPLAINED * step) ** 2 + 2.0 * scatter
         # noise averages out over 8 x 8 pixels, what a photo shows besides the edge does not
         and float(block_means(left, 8).var()) < (_UNEXPLAINED / 2 * step) ** 2 + 4.0 * scatter / 64
     )
-    return response if explained else None
 
 
 def _unexplained(crop: NDArray[np.float64], normal: float) -> NDArray[np.float64]:

@@ -16,24 +16,13 @@ _FREQUENCIES: Final = 513  # from 0 to 1 cycle/pixel: steps of 1/512
 
 
 def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDArray[np.float64]:
-    """Contrast that a kernel leaves of waves whose normal has an angle.
+    """Contrast that a kernel leaves of waves whose normal has an angle, by frequency in cycles/pixel.
 
     It is the modulus of the transfer function along a line::
 
         MTF(f) = | sum k(row, col) exp(-2 pi i f (col cos(angle) - row sin(angle))) |
 
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    angle : float
-        Radians, counter-clockwise from the right. At field angle phi, `phi` gives the tangential
-        MTF (contrast along u) and `phi + pi/2` the sagittal one (along v).
-    frequencies : array_like, shape (n,)
-        Cycles/pixel.
-
-    Returns
-    -------
-    ndarray, shape (n,), 1 at zero frequency
+    At field angle phi, `phi` gives the tangential MTF (contrast along u), `phi + pi/2` the sagittal one.
     """
     k = as_kernel(kernel)
     f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))

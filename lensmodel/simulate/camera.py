@@ -133,7 +133,6 @@ def photograph(
     )
 
 
-DEFAULT_STEP: Final = 0.1  # distance in half diagonals of the nodes where kernels are exact
 _REFINED: Final = 2  # nodes of the windows per exact node
 
 
@@ -143,7 +142,7 @@ class BlurOptions:
 
     pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch in micrometres
     size: int = DEFAULT_SIZE  # odd side of the kernels in pixels
-    step: float = DEFAULT_STEP  # distance in half diagonals of the nodes where kernels are exact
+    step: float = 0.1  # distance in half diagonals of the nodes where kernels are exact
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.step <= 0.5:

@@ -8,33 +8,31 @@ behind the exit pupil is transformed, its intensity is integrated over square pi
 
 A ray through p lands at x = 2 lambda N grad W: a positive gradient outwards throws light outwards.
 
-|E|^2 is band limited to 1 / (lambda N). It is sampled finely enough to carry that band, the pixel
-is its exact spectrum sinc(fx) sinc(fy), and a matrix Fourier transform then evaluates the result
-at the middles of the pixels, wherever the kernel is to be centred. Nothing is interpolated, so
-nothing adds blur or ringing; summing an intensity oversampled k times instead would need k = 20
-at f/1.4, where the speckle of the PSF is 20 times finer than a pixel.
+|E|^2 is band limited to 1 / (lambda N). It is sampled finely enough to carry that band, the pixel is its
+exact spectrum sinc(fx) sinc(fy), and a matrix Fourier transform then evaluates the result at the middles of
+the pixels, wherever the kernel is to be centred. Nothing is interpolated, so nothing adds blur or ringing.
 
-Sources: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, ch. 5 and 6;
-R. Soummer et al., "Fast computation of Lyot-style coronagraph propagation", Optics Express 15,
-2007, eq. 1 (the matrix Fourier transform).
+Sources: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, ch. 5 and 6; R. Soummer et al., "Fast
+computation of Lyot-style coronagraph propagation", Optics Express 15, 2007, eq. 1 (the matrix Fourier
+transform).
 
-The wavefront is that of third-order theory with the faults of a single copy added. With the
-pupil p (right, up; |p| <= 1), the field h (right, up; |h| = r), and h' = h - decentring::
+The wavefront is that of third-order theory with the faults of a single copy added. With the pupil p (right,
+up; |p| <= 1), the field h (right, up; |h| = r), and h' = h - decentring::
 
     W = W040 |p|^4 + W131 (h'.p) |p|^2 + W222 (h'.p)^2 + W220 |h'|^2 |p|^2
         + (W020 + tilt.h + c1 t + c2 t^2) |p|^2                    t = (lambda - 540 nm) / 100 nm
         + (coma.p) |p|^2 + a (px^2 - py^2) + 2 b px py
 
-in waves of 540 nm at the open aperture N0. Stopping down to N shrinks the pupil by s = N0 / N, so
-that a term of degree n in p shrinks by s^n. Source: W. T. Welford, "Aberrations of Optical
-Systems", 1986, ch. 7 and 8; the faults of a copy after K. P. Thompson, JOSA A 22, 2005.
+in waves of 540 nm at the open aperture N0. Stopping down to N shrinks the pupil by s = N0 / N, so that a term
+of degree n in p shrinks by s^n. Source: W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 7 and 8;
+the faults of a copy after K. P. Thompson, JOSA A 22, 2005.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Final, Protocol, TypeAlias
@@ -58,8 +56,8 @@ def spectrum(channel: Channel) -> tuple[tuple[float, float], ...]:
     return (middle - _BAND_UM, 0.25), (middle, 0.5), (middle + _BAND_UM, 0.25)
 
 
-class CameraLens(Protocol):
-    """What a simulated camera needs to know of the lens in front of it; hashable."""
+class CameraLens(Hashable, Protocol):
+    """What a simulated camera needs to know of the lens in front of it; kernels are remembered by lens."""
 
     @property
     def focal_mm(self) -> tuple[float, ...]:
@@ -76,9 +74,6 @@ class CameraLens(Protocol):
     @property
     def serial(self) -> str:
         """As written into the metadata of its photos."""
-
-    def __hash__(self) -> int:
-        """Kernels are remembered by lens."""
 
     def widest(self, focal_mm: float | None = None) -> float:
         """Widest aperture at a focal length; None means the shortest."""
@@ -178,11 +173,9 @@ class SimulatedLens:
         )
         return response.centred(size, (-row / pitch_um, col / pitch_um), offset)
 
-    def field(
-        self, settings: LensSettings | None = None, *, pitch_um: float = DEFAULT_PITCH_UM
-    ) -> SimulatedField:
+    def field(self, settings: LensSettings | None = None) -> SimulatedField:
         """The exact PSF of every place and channel at these settings, remembering what was asked."""
-        return SimulatedField(self, settings or LensSettings(), pitch_um)
+        return SimulatedField(self, settings or LensSettings())
 
     def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
         """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
@@ -197,18 +190,15 @@ class SimulatedField:
 
     lens: SimulatedLens
     settings: LensSettings
-    pitch_um: float = DEFAULT_PITCH_UM  # pixel pitch of the camera in micrometres
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the exact kernel of odd side `size`; see `SimulatedLens.kernel`."""
-        return _kernel(self.lens, position, self.settings.with_channel(channel), size, self.pitch_um)
+        return _kernel(self.lens, position, self.settings.with_channel(channel), size)
 
 
 @lru_cache(maxsize=2048)  # 50 MB at most
-def _kernel(
-    lens: SimulatedLens, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float
-) -> Kernel:
-    return lens.kernel(position, settings, size, pitch_um=pitch_um)
+def _kernel(lens: SimulatedLens, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
+    return lens.kernel(position, settings, size)
 
 
 REFERENCE_UM: Final = 0.54  # wavelength in micrometres in which wavefront errors are counted

@@ -9,22 +9,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib import resources
+from itertools import product
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
-from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import FieldPosition, Planes, Zone
-from lensmodel.quality.edge import edge_area
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import Direction, FieldPosition, Planes
+from lensmodel.quality.edge import Box, edge_area
 
 DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 """Names of the photographs that come with the library, see lensmodel/demo_data/README.md."""
-
-Direction = Literal["tangential", "sagittal"]
 
 # Degrees: about the 5 of ISO 12233, both ways
 _SLANTS_DEG: Final = (5.0, -5.0, 7.0, -7.0, 4.0, -4.0, 9.0, -9.0)
@@ -74,23 +73,10 @@ def demo_scene(name: str) -> Planes:
 class ChartEdge:
     """One slanted edge of a chart."""
 
-    row: int  # box in the frame that holds the edge and flat ground on both sides, nothing else
-    col: int
-    height: int
-    width: int
+    box: Box  # in the frame, which holds the edge and flat ground on both sides, nothing else
     normal: float  # angle of the edge's normal from dark to bright, radians, counter-clockwise from the right
     position: FieldPosition  # of the middle of the box
     direction: Direction  # contrast along u (tangential) or v (sagittal)
-
-    @property
-    def box(self) -> tuple[int, int, int, int]:
-        """(row, col, height, width)."""
-        return self.row, self.col, self.height, self.width
-
-    @property
-    def zone(self) -> Zone:
-        """Zone of the field."""
-        return zone_of(self.position.r)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +118,7 @@ def edge_chart(frame: Frame, *, margin: int = 40, guard: int = 27) -> Chart:
         plane[top : top + tile, left : left + tile] = slanted_edge_scene(
             tile, tile, normal, dark=dark, bright=bright
         )
-        edges.append(ChartEdge(row + guard, col + guard, box, box, normal, position, direction))
+        edges.append(ChartEdge((row + guard, col + guard, box, box), normal, position, direction))
     return Chart(np.ascontiguousarray(np.broadcast_to(plane, (3, *plane.shape))), tuple(edges))
 
 
@@ -143,14 +129,13 @@ def _places(frame: Frame, tile: int) -> list[tuple[float, float, Direction]]:
         (0.0, -0.55 * tile, "tangential"),
         (0.0, 0.55 * tile, "sagittal"),
     ]
-    for up in (1.0, -1.0):
-        for right in (1.0, -1.0):
-            places += [
-                (up * (half_h - 0.5 * tile), right * (half_w - 0.5 * tile), "tangential"),
-                (up * (half_h - 1.5 * tile), right * (half_w - 0.5 * tile), "sagittal"),
-                (up * (half_h - 1.5 * tile), right * half_w / 2.0, "tangential"),
-                (up * (half_h - 2.5 * tile), right * half_w / 2.0, "sagittal"),
-            ]
+    for up, right in product((1.0, -1.0), (1.0, -1.0)):
+        places += [
+            (up * (half_h - 0.5 * tile), right * (half_w - 0.5 * tile), "tangential"),
+            (up * (half_h - 1.5 * tile), right * (half_w - 0.5 * tile), "sagittal"),
+            (up * (half_h - 1.5 * tile), right * half_w / 2.0, "tangential"),
+            (up * (half_h - 2.5 * tile), right * half_w / 2.0, "sagittal"),
+        ]
     return places
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
-from lensmodel.core.geometry import Frame
+from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import Kernel, LensSettings, Planes
 from lensmodel.quality.edge import edge_area
@@ -282,10 +282,13 @@ def test_chart_has_edges_of_both_directions_in_every_zone_and_all_corners() -> N
     frame = Frame(480, 720)
     chart = edge_chart(frame, margin=10, guard=20)
 
-    seen = {(e.zone, e.direction) for e in chart.edges}
+    zones = [zone_of(edge.position.r) for edge in chart.edges]
+    seen = {(zone, edge.direction) for zone, edge in zip(zones, chart.edges, strict=True)}
     assert seen == {(z, d) for z in ("center", "mid", "corner") for d in ("tangential", "sagittal")}
     corners = {
-        (e.position.phi > 0, abs(e.position.phi) > math.pi / 2) for e in chart.edges if e.zone == "corner"
+        (e.position.phi > 0, abs(e.position.phi) > math.pi / 2)
+        for zone, e in zip(zones, chart.edges, strict=True)
+        if zone == "corner"
     }
     assert len(corners) == 4
     assert chart.scene.shape == (3, 500, 740)
@@ -294,7 +297,8 @@ def test_chart_has_edges_of_both_directions_in_every_zone_and_all_corners() -> N
         assert abs(math.cos(edge.normal - along)) > math.cos(math.radians(10))
     boxes = np.zeros((480, 720), dtype=int)
     for edge in chart.edges:
-        boxes[edge.row : edge.row + edge.height, edge.col : edge.col + edge.width] += 1
+        row, col, height, width = edge.box
+        boxes[row : row + height, col : col + width] += 1
     assert boxes.max() == 1
 
 

@@ -15,7 +15,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.report import PsfGrid, export, exporters, psf_grid
+from lensmodel.report import PsfGrid, export, psf_grid
 from lensmodel.simulate import draw_lens
 
 SETTINGS = LensSettings(aperture=2.0)
@@ -109,16 +109,6 @@ def test_json_of_a_single_place_is_a_bare_matrix_with_the_top_row_first(tmp_path
     assert stored.shape == (5, 5)
     assert stored[0, 2] == 0.75
     assert stored[2, 4] == 0.25
-
-
-@pytest.mark.parametrize("name", sorted(exporters))
-def test_every_format_is_one_file_complete_or_absent(psfs: PsfGrid, tmp_path: Path, name: str) -> None:
-    target = tmp_path / f"psf.{name}"
-
-    export(target, psfs, name)
-
-    assert target.stat().st_size > 100
-    assert [p.name for p in tmp_path.iterdir()] == [target.name]
 
 
 def test_a_single_place_is_that_kernel(model: LensModel) -> None:

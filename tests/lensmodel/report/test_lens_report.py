@@ -304,15 +304,6 @@ def test_pages_are_written_in_each_format_and_the_same_each_time(soft: LensRepor
         assert picture.size[0] > 1000
 
 
-def test_scales_of_maps_have_round_ticks(soft: LensReport) -> None:
-    scales = [ax for figure in pages(soft)[1:] for ax in figure.axes if ax.get_label() == "<colorbar>"]
-
-    assert scales
-    for scale in scales:
-        step = float(np.diff(scale.get_xticks())[0])
-        assert round(step / 10.0 ** math.floor(math.log10(step)), 6) in {1.0, 2.0, 2.5, 5.0, 10.0}
-
-
 def test_maps_are_in_the_unit_that_was_asked_for(soft: LensReport) -> None:
     map_ = charts(soft, None, "lp/mm")[0]
 

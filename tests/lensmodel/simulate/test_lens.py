@@ -262,16 +262,6 @@ def test_drawn_lenses_have_realistic_widths(kind: str) -> None:
         assert corner > center
 
 
-def test_field_answers_what_the_lens_answers() -> None:
-    drawn = draw_lens(2)
-    wide_open = drawn.field(LensSettings(aperture=4.0))
-    position = FieldPosition(0.6, -1.0)
-    wanted = drawn.kernel(position, LensSettings(aperture=4.0, channel="b"), 21)
-
-    np.testing.assert_array_equal(wide_open.kernel_at(position, "b", 21), wanted)
-    assert wide_open.kernel_at(position, "b", 21) is wide_open.kernel_at(position, "b", 21)
-
-
 @pytest.mark.parametrize(
     ("request_", "said"),
     [

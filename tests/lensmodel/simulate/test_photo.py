@@ -194,19 +194,6 @@ def test_overexposure_clips_at_the_white_level() -> None:
     np.testing.assert_allclose(photo.sharp, 1.4, rtol=1e-6)
 
 
-def test_photo_knows_the_truth_and_repeats_by_seed() -> None:
-    camera = SimulatedCamera(64, 96)
-    scene = dead_leaves(64 + 10, 96 + 10, np.random.default_rng(3))
-    options = BlurOptions(size=SIZE, step=0.3)
-    first, again = (
-        photograph(scene, PERFECT, LensSettings(), camera, np.random.default_rng(7), options=options)
-        for _ in range(2)
-    )
-
-    np.testing.assert_array_equal(first.mosaic, again.mosaic)
-    assert (first.lens, first.camera) == (PERFECT, camera)
-
-
 @pytest.mark.parametrize(
     "wrong",
     [

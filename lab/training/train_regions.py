@@ -30,7 +30,8 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
 from lensmodel.patches.checks import details_of
 from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
-from lensmodel.patches.select import RMapSelector, first_reasons
+from lensmodel.patches.rmap import RMapSelector
+from lensmodel.patches.select import first_reasons
 from lensmodel.patches.windows import BLOCKS_A_SIDE, measure_blocks, windows_of
 from lensmodel.simulate import draw_lens
 

@@ -23,22 +23,15 @@ from lensmodel.patches.windows import CLIP_SHARE, Patch, Windows, polynomials
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
 BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
 BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
-
+# bands that blur takes away: lenses leave nearly all below 0.1, demosaicing little above 0.4
 EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
-"""Bands that blur takes away: lenses leave nearly all below 0.1, demosaicing little above 0.4."""
 
-NON_UNIFORMITY: Final = 0.005
-"""Relative standard deviation of the gain of a sensor's pixels: 0.3 to 1 percent by EMVA 1288."""
-
-DYNAMIC_RANGE: Final = 2.0**14.8
-"""Full level over the dark noise of the best sensors: less noise was eaten by rounding or denoising."""
+NON_UNIFORMITY: Final = 0.005  # relative deviation of the gain of pixels: 0.3 to 1 percent by EMVA 1288
+DYNAMIC_RANGE: Final = 2.0**14.8  # of the best sensors: less noise was eaten by rounding or denoising
 
 _JPEG_BLOCK = 8  # pixels: ITU-T T.81
 _MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
-_ON_THE_WAY = 24
-"""Points between a peak and the middle: a valley is wider than a twentieth of the way (chosen)."""
-
-
+_ON_THE_WAY = 24  # points from a peak to the middle: a valley is wider than a twentieth of it (chosen)
 _CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
 _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 
@@ -47,15 +40,12 @@ _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 class Details:
     """Second look at some windows; every array has one entry a window along axis 0."""
 
-    # (n, BANDS, SECTORS), natural logarithm of power over noise by radial band and angular sector
-    information: NDArray[np.float64]
+    information: NDArray[np.float64]  # (n, BANDS, SECTORS), natural logarithm of power over noise
     period: NDArray[np.float64]  # (n,), highest separate peak of the autocorrelation, 1 for a perfect period
     blockiness: NDArray[np.float64]  # (n,), steps on an 8 px grid over steps off it; 1 where there is none
     blob: NDArray[np.int64]  # (n,), pixels of the largest connected clipped area
-    # (n,), of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges
-    kurtosis: NDArray[np.float64]
-    # (n,), bits a frequency between 0.1 and 0.4 cycles/pixel, mean of log2(1 + S/N); 0 for noise
-    evidence: NDArray[np.float64]
+    kurtosis: NDArray[np.float64]  # (n,), of differences; 3 for a Gaussian, more for isolated edges
+    evidence: NDArray[np.float64]  # (n,), bits a frequency between 0.1 and 0.4 cycles/pixel; 0 for noise
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Details:
         """Return the entries that `index` picks."""
@@ -96,14 +86,16 @@ def look_at(
     detrended = (flat - grids.slopes @ (flat @ grids.slopes)).reshape(values.shape)
     # periodogram under a Hann window, scaled so that white noise gives its variance
     power = np.square(np.abs(fft.rfft2(detrended * grids.hann))) / float(np.square(grids.hann).sum())
+    areas = ndimage.label(values >= CLIP_SHARE * clip)[0]
+    squares = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()]) ** 2
     noise = max(sigma, coarse_sigma) ** 2
     noise += (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
     return Details(
         information=_information(power, sigma)[None],
         period=np.array([1.0 if repeats(patch) else _period(power, sigma)]),
         blockiness=np.array([_blockiness(values, corner)]),
-        blob=np.array([_largest_blob(values >= CLIP_SHARE * clip)], dtype=np.int64),
-        kurtosis=np.array([_kurtosis(values)]),
+        blob=np.bincount(areas.ravel())[1:].max(initial=0, keepdims=True),
+        kurtosis=np.array([float(np.mean(squares**2)) / max(float(np.mean(squares)) ** 2, 1e-30)]),
         evidence=np.array([_evidence(power, noise)]),
     )
 
@@ -114,13 +106,11 @@ class _Grids:
 
     slopes: NDArray[np.float64]  # (size^2, count), orthonormal polynomials up to `SLOPE_ORDER`
     hann: NDArray[np.float64]  # (size, size)
-    # (size, size // 2 + 1), number of the band of either kind and the sector of each frequency, -1 outside
-    bands: NDArray[np.intp]
-    evidence: NDArray[np.intp]
+    bands: NDArray[np.intp]  # (size, size // 2 + 1), number of band and sector of a frequency, -1 outside
+    evidence: NDArray[np.intp]  # the same of `EVIDENCE_EDGES`
     gradient: NDArray[np.float64]  # (size, size // 2 + 1), weights of the power of smoothed gradients
-    # of `_near_lags`: the window's own autocorrelation, 1 in the middle, and which lie beyond its core
-    taper: NDArray[np.float64]
-    far: NDArray[np.bool_]
+    taper: NDArray[np.float64]  # the Hann window's own autocorrelation at `_near_lags`, 1 in the middle
+    far: NDArray[np.bool_]  # which of these lie beyond the core
 
 
 @lru_cache(maxsize=4)
@@ -216,22 +206,8 @@ def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
     return float(np.mean(ratios))
 
 
-def _largest_blob(mask: NDArray[np.bool_]) -> int:
-    return int(np.bincount(ndimage.label(mask)[0].ravel())[1:].max(initial=0))
-
-
-def _kurtosis(values: NDArray[np.float64]) -> float:
-    squares = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()]) ** 2
-    square = float(np.mean(squares))
-    return float(np.mean(squares**2)) / max(square * square, 1e-30)
-
-
-LEAST_PATCHES: Final = 6
-"""Patches that lie apart: a plane over the field has three unknowns, so many again tell if it fits."""
-
-LEAST_PARTS: Final = 3
-"""Parts of the picture that they lie in: three places off one line determine a plane over the field."""
-
+LEAST_PATCHES: Final = 6  # that lie apart: a plane over the field has three unknowns, as many tell if it fits
+LEAST_PARTS: Final = 3  # of the picture that they lie in: three places off one line determine a plane
 PARTS: Final = 9  # the centre, the four quarters of the picture around it, and the outer end of each
 
 
@@ -244,18 +220,12 @@ def part_of(position: FieldPosition) -> int:
     return 1 + quarter + (4 if zone == "corner" else 0)
 
 
-def apart(patches: Sequence[Patch]) -> list[Patch]:
-    """Patches half a side or more from each other, taken greedily in their order."""
-    kept: list[Patch] = []
-    for patch in patches:
-        if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size / 2 for k in kept):
-            kept.append(patch)
-    return kept
-
-
 def require_enough(patches: Sequence[Patch], *, least: int = LEAST_PATCHES) -> None:
     """Refuse a photo whose detail is too little, or all in one place."""
-    single = apart(patches)
+    single: list[Patch] = []  # those half a side or more from each other
+    for patch in patches:
+        if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size / 2 for k in single):
+            single.append(patch)
     parts = len({part_of(patch.position) for patch in single})
     if len(single) < least:
         places = "one place" if len(single) == 1 else f"{len(single)} places"

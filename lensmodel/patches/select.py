@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from lensmodel.core.types import FieldPosition, NoiseModel, Plane, StepHook, ign
 from lensmodel.patches import checks, spread
 from lensmodel.patches.checks import Details
 from lensmodel.patches.good_regions import GoodRegionsSelector
+from lensmodel.patches.rmap import RMapSelector, edge_score
 from lensmodel.patches.windows import (
     BLOCKS_A_SIDE,
     MAX_REJECTIONS,
@@ -33,25 +33,19 @@ logger = logging.getLogger(__name__)
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
 CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen): a few specular points do little harm
-BLOB_LIMIT: Final = 20
-"""Connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)."""
+BLOB_LIMIT: Final = (
+    20  # connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)
+)
 DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
-FLAT_CONTRAST: Final = 4.0
-"""Variance of signal over that of noise: below, noise decides the estimate (chosen)."""
-FLAT_EIGENVALUE: Final = 10.0
-"""Smaller eigenvalue of the structure tensor over that of noise: ten times that of chance (chosen)."""
-ONE_DIRECTION_RATIO: Final = 0.05
-"""Smaller eigenvalue of the structure tensor over the larger: a line has next to nothing (chosen)."""
+FLAT_CONTRAST: Final = 4.0  # variance of signal over noise: below, noise decides the estimate (chosen)
+FLAT_EIGENVALUE: Final = 10.0  # smaller eigenvalue of the structure tensor over that of noise (chosen)
+ONE_DIRECTION_RATIO: Final = 0.05  # the same over the larger one: a line has next to nothing (chosen)
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
-PERIOD_LIMIT: Final = 0.8
-"""See `Details.period`: a repetition is as alike as that, other scenes seldom (chosen)."""
-BLOCKINESS_LIMIT: Final = 1.8
-"""See `Details.blockiness`, 1 without any: chance gives a little more, and twice is plain to see (chosen)."""
+PERIOD_LIMIT: Final = 0.8  # a repetition is as alike as that, other scenes seldom (chosen)
+BLOCKINESS_LIMIT: Final = 1.8  # chance gives a little more than 1, and twice is plain to see (chosen)
 JPEG_WEIGHT: Final = 0.3  # JPEG files were sharpened and gamma-coded: their patches count for less
-EVIDENCE_FLOOR: Final = 0.25
-"""Bits a frequency from 0.1 to 0.4 cycles/pixel: signal as strong as noise over a quarter of them."""
-SHORTLIST_A_SECTOR: Final = 8
-"""Windows that the costlier scores look at: several times as many as are taken (chosen)."""
+EVIDENCE_FLOOR: Final = 0.25  # bits a frequency: signal as strong as noise over a quarter of them
+SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at: several times those taken (chosen)
 
 _ADVICE: Final[dict[str, str]] = {
     "flat": "take a scene with more fine detail, at a lower ISO",
@@ -68,48 +62,16 @@ class Selector(Protocol):
     """Says how much each window tells about the PSF (Hirsch and Schölkopf, ICCV 2015, section 5.2)."""
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
-        """Score the windows of a photo.
+        """Score the n windows of a photo, shape (n,), 0..1: higher tells more.
 
-        Parameters
-        ----------
-        windows : Windows
-            n windows: where they lie, their edges, noise and clipping.
-        looked : Details
-            A second look at the same windows: spectrum, periods, blocks of JPEG.
-
-        Returns
-        -------
-        ndarray of float64, shape (n,)
-            0..1; higher tells more.
+        `windows` tells where they lie, their edges, noise and clipping, `looked` their spectra, periods and
+        blocks of JPEG.
         """
-
-
-@dataclass(frozen=True, slots=True)
-class RMapSelector:
-    """Edges in every direction where the r-map is high, and signal at every frequency.
-
-    With e the energy of the kept edges over that of noise in eight directions, e_(2) its second
-    smallest entry, and S/N the spectrum over noise in 3 bands by 8 sectors::
-
-        score = ( log10 e_(2) + mean log10 max(S/N, 1) ) / full_marks
-    """
-
-    full_marks: float = 8.0  # what counts as 1
-
-    def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
-        """Return one score a window; see `Selector`."""
-        information = np.maximum(looked.information, 0.0).mean(axis=(1, 2)) / np.log(10.0)
-        return np.clip((edge_score(windows) + information) / self.full_marks, 0.0, 1.0)
 
 
 selectors: Registry[Selector] = Registry(
     "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}, "lensmodel.selectors"
 )
-
-
-def edge_score(windows: Windows) -> NDArray[np.float64]:
-    """Decimal logarithm of the second weakest direction's edge energy over noise, at least 0."""
-    return np.log10(np.maximum(np.sort(windows.directions, axis=1)[:, 1], 1.0))
 
 
 def select(
@@ -169,6 +131,7 @@ def select(
 
 
 def _block_side(frame: Frame, size: int) -> int:
+    """Side of the blocks of windows of `size` pixels, or of those that fit."""
     if size < SMALLEST_PATCH:
         raise InvalidInputError(f"patches need at least {SMALLEST_PATCH} px, got {size}")
     shorter = min(frame.height, frame.width)

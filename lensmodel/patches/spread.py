@@ -23,15 +23,13 @@ from lensmodel.photo.values import LinearPhoto
 
 RINGS: Final = 8  # of equal width in r: as many as are needed to follow blur along the radius (chosen)
 OCTANTS: Final = 8  # eighths of a turn, by definition
-PATCHES_A_CELL: Final = 3
-"""Of all asked for, on average: more leave places without any, one alone is a poor estimate (chosen)."""
+PATCHES_A_CELL: Final = 3  # on average: more leave places without any, one alone is a poor estimate (chosen)
 MOST_A_CELL: Final = 4  # pooling the normal equations of four patches is worth most of what twelve give
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
 CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre, where blur changes less (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
 SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
-MOST_STEPS: Final = 4
-"""Distances to the nearest seed count in window sides up to this; beyond, the better one wins (chosen)."""
+MOST_STEPS: Final = 4  # window sides to the nearest seed that count; beyond, the better one wins (chosen)
 
 
 def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) -> NDArray[np.intp]:
@@ -51,8 +49,7 @@ def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) 
 def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
     """Choose up to `count` windows in field cells: their numbers, and those of their cells.
 
-    First the seeds, one a cell, from the rings and octants that have the fewest so far. Then every cell in
-    turn takes its best remaining neighbour, up to four.
+    First the seeds, one a cell; then every cell in turn takes its best remaining neighbour, up to four.
     """
     order = _by_score(windows, score)
     # Half a window's distance between any two chosen; a whole one between the seeds, if there is room.
@@ -83,6 +80,7 @@ def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> 
 
 
 def _seeds(windows: Windows, order: NDArray[np.intp], count: int) -> list[int]:
+    """First windows of cells, from the rings and octants that have the fewest so far."""
     ring, octant = _sector_of(windows)
     # The rings share by area, as far as the photo has anything there: the model needs the corners.
     share = (np.arange(RINGS) + 0.5) * (np.bincount(ring, minlength=RINGS) > 0)

@@ -65,28 +65,21 @@ class Selection:
     rejected: tuple[Rejection, ...]
 
 
-ORIENTATIONS: Final = 8
-"""Bins of gradient direction over half a turn: each must hold edges enough for a histogram (chosen)."""
-
-BLOCKS_A_SIDE: Final = 4
-"""Of a window, and windows start at every block: finer starts find nearly the same ones (chosen)."""
-
+ORIENTATIONS: Final = 8  # bins of gradient direction over half a turn, with edges enough in each (chosen)
+BLOCKS_A_SIDE: Final = 4  # of a window, which starts at any: finer starts find nearly the same ones (chosen)
 WIDTH_BINS: Final = 28
-WIDTH_STEP_PX: Final = 0.2
-"""Histogram of edge widths, 0 to 5.6 px (chosen: finer than the widths of sharp and soft photos differ)."""
-
-EDGE_SIGMAS: Final = 4.0
-"""Of a gradient's noise, above which a pixel is an edge: noise exceeds it in one of 3000 (chosen)."""
-WIDTH_SIGMAS: Final = 10.0
-"""The same where a width is measured: noise must not move where an edge ends (chosen)."""
-CLIP_SHARE: Final = 0.98
-"""Of the clipping level: noise and demosaicing leave clipped pixels a little below it (chosen)."""
-DARK_SNR: Final = 5.0
-"""A pixel below this ratio of level to noise is dark: ten would throw out half a photo of 1 % noise."""
+WIDTH_STEP_PX: Final = 0.2  # of a histogram of edge widths, 0 to 5.6 px (chosen: finer than photos differ)
+EDGE_SIGMAS: Final = (
+    4.0  # of a gradient's noise, above which a pixel is an edge: one of 3000 by chance (chosen)
+)
+WIDTH_SIGMAS: Final = (
+    10.0  # the same where a width is measured: noise must not move where an edge ends (chosen)
+)
+CLIP_SHARE: Final = 0.98  # noise and demosaicing leave clipped pixels a little below the level (chosen)
+DARK_SNR: Final = 5.0  # level over noise below which a pixel is dark: ten is half a photo of 1 % noise
 
 _MARGIN = 18  # half an r-map window and the smoothing
-_STRIP_PIXELS = 2_000_000
-"""Pixels at once, 8 MB a plane of float32: the calls cost little beside the work (chosen)."""
+_STRIP_PIXELS = 2_000_000  # at once, 8 MB a plane of float32: the calls cost little beside the work (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,20 +89,16 @@ class BlockSums:
     side: int  # side of a block in pixels
     row: int  # top-left pixel of block (0, 0)
     col: int
-    # (n, m, ORIENTATIONS, R_BINS), squared modulus of the edge gradients by direction and r
-    energy: NDArray[np.float32]
+    energy: NDArray[np.float32]  # (n, m, ORIENTATIONS, R_BINS), squared modulus of the edge gradients
     tensor: NDArray[np.float64]  # (n, m, 3), structure tensor of the edge gradients: rr, rc, cc
     level: NDArray[np.float64]  # (n, m), sums of the values and of their squares
     square: NDArray[np.float64]
-    # (n, m), pixels above 98 percent of the clip level, below `DARK_SNR`, and not finite
-    clipped: NDArray[np.float64]
+    clipped: NDArray[np.float64]  # (n, m), pixels above `CLIP_SHARE`, below `DARK_SNR`, and not finite
     dark: NDArray[np.float64]
     missing: NDArray[np.float64]
     widths: NDArray[np.int64]  # (n, m, WIDTH_BINS), histogram of local edge widths
-    # (n, m, ORIENTATIONS, 2), count and sum of squared widths by gradient direction
-    width_sums: NDArray[np.float64]
-    # (GROUPS, R_BINS), edge pixels of the whole plane by orientation group and r
-    histogram: NDArray[np.int64]
+    width_sums: NDArray[np.float64]  # (n, m, ORIENTATIONS, 2), count and sum of squared widths by direction
+    histogram: NDArray[np.int64]  # (GROUPS, R_BINS), edge pixels of the whole plane
 
 
 def intensity_scale(plane: Plane) -> float:
@@ -235,14 +224,9 @@ def _level_of_snr(noise: NoiseModel, snr: float) -> float:
     return half + float(np.sqrt(half * half + snr * snr * noise.read))
 
 
-SLOPE_ORDER: Final = 2
-"""Order of the polynomial that is taken off first: vignetting, a sky, shading of a wall are no detail."""
-
-MIN_RIDGE_PIXELS: Final = 30
-"""Fewer edge pixels do not give a width: nine of them would lie below its quantile (chosen)."""
-
-WIDTH_QUANTILE: Final = 0.3
-"""Soft edges of the scene widen the upper half of the widths, not the lower (chosen)."""
+SLOPE_ORDER: Final = 2  # of the polynomial that is taken off first: a sky or shading is no detail
+MIN_RIDGE_PIXELS: Final = 30  # fewer do not give a width: nine of them would lie below its quantile (chosen)
+WIDTH_QUANTILE: Final = 0.3  # soft edges of the scene widen the upper half of the widths (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,26 +238,21 @@ class Windows:
     cols: NDArray[np.int64]
     r: NDArray[np.float64]  # (n,), field position of the centres
     phi: NDArray[np.float64]
-    # (n, ORIENTATIONS), edge energy by gradient direction where r is high enough, over the energy of noise
-    directions: NDArray[np.float64]
-    # (n,), mean r weighted by edge energy, and the share of the energy where r is high enough
-    r_mean: NDArray[np.float64]
-    r_kept: NDArray[np.float64]
+    directions: NDArray[
+        np.float64
+    ]  # (n, ORIENTATIONS), edge energy where r is high enough, over that of noise
+    r_mean: NDArray[np.float64]  # (n,), mean r weighted by edge energy
+    r_kept: NDArray[np.float64]  # (n,), share of the energy where r is high enough
     eigenvalues: NDArray[np.float64]  # (n, 2), of the structure tensor, smaller first, over that of noise
-    # (n,), variance of the signal over variance of the noise; a slope, as of a sky, is no signal
-    contrast: NDArray[np.float64]
+    contrast: NDArray[np.float64]  # (n,), variance of the signal, without slopes, over that of the noise
     level: NDArray[np.float64]  # (n,), mean level and the noise's standard deviation there
     sigma: NDArray[np.float64]
     clipped: NDArray[np.float64]  # (n,), shares of the pixels
     dark: NDArray[np.float64]
     missing: NDArray[np.float64]
-    # (n,), width of the sharper edges as the sigma of a Gaussian in pixels; NaN where edges are few
-    width: NDArray[np.float64]
-    # (n,), the same of the window's widest quarter: a depth step inside the window shows there
-    widest: NDArray[np.float64]
-    # (n, 2), cosine and sine parts, over twice the angle in image axes (columns to rows), of the squared edge
-    # width relative to its mean; zero where unknown
-    elongation: NDArray[np.float64]
+    width: NDArray[np.float64]  # (n,), of the sharper edges, sigma of a Gaussian in pixels; NaN where few
+    widest: NDArray[np.float64]  # (n,), the same of the widest quarter: a depth step inside shows there
+    elongation: NDArray[np.float64]  # (n, 2), cosine and sine of the squared width over twice the angle
 
     def __len__(self) -> int:
         return int(self.rows.size)

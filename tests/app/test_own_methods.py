@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import Service, write_photo
+from running import PROGRAM, running, write_photo
 
 import lensmodel
 from lensmodel.core import registry
@@ -83,13 +83,10 @@ def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("own_methods", None)
 
 
-def test_methods_of_a_package_are_known_by_their_names(installed: Path) -> None:
+def test_methods_of_a_package_are_known_by_their_names_and_correct(installed: Path) -> None:
     assert "careful" in lensmodel.estimators
     assert "everywhere" in list(lensmodel.selectors)
     assert lensmodel.estimators.create("careful").name == "careful"
-
-
-def test_a_method_of_a_package_corrects(installed: Path) -> None:
     spots = np.ones((4, 5, 5))
     lens = lensmodel.Lens.from_kernels(spots, [0.1, 0.5, 0.9, 0.5], [0.0, 1.0, 2.0, -2.0], aperture=2.0)
     planes = np.random.default_rng(1).random((3, 64, 64), dtype=np.float32)
@@ -113,49 +110,27 @@ def test_a_package_replaces_nothing(installed: Path) -> None:
     assert list(taken) == ["broken", "careful"]
 
 
-def _environment(package: Path) -> dict[str, str]:
-    paths = [str(package), str(HERE.parents[1])]
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
-    return {**kept, "PYTHONPATH": os.pathsep.join(paths)}
-
-
 @pytest.mark.slow
-def test_the_command_learns_by_methods_of_a_package(package: Path, tmp_path: Path) -> None:
-    write_photo(tmp_path / "a.dng", 1)
+def test_command_and_service_work_by_methods_of_a_package(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = write_photo(tmp_path / "a.dng", 1)
+    paths = [str(package), str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    words = ["calibrate", "a.dng", "-p", "a.lensprofile", "--json"]
+    words += ["--estimator", "careful", "--selector", "everywhere"]
 
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "lensmodel", "calibrate", "a.dng", "-p", "a.lensprofile", "--json"),
-            *("--estimator", "careful", "--selector", "everywhere"),
-        ],
-        cwd=tmp_path,
-        env=_environment(package),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = subprocess.run([*PROGRAM, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
 
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["samples"] > 0
     assert lensmodel.Lens.load(tmp_path / "a.lensprofile").model.samples[0].estimator == "careful/1"
 
-
-@pytest.mark.slow
-def test_the_service_works_by_methods_of_a_package(package: Path, tmp_path: Path) -> None:
-    path = os.environ.get("PYTHONPATH", "")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("PYTHONPATH", os.pathsep.join([str(package), path]))
-        service = Service(tmp_path / "data", LENS_ESTIMATOR="careful")
-        service.start()
-    try:
+    with running(tmp_path / "data", LENS_ESTIMATOR="careful") as service:
         formats = service.get("/v1/formats")
-        assert {"careful"} <= set(formats["estimators"])
-        assert {"everywhere"} <= set(formats["selectors"])
-        photo = service.upload(write_photo(tmp_path / "a.dng", 1), selector="everywhere")
-        assert service.job(photo["id"])["state"] == "succeeded"
-        answer = service.http.post("/v1/corrections", json={"photo_id": photo["id"], "method": "adjoint"})
-        assert service.job(answer.json()["id"])["state"] == "succeeded"
-        refused = service.http.post("/v1/corrections", json={"photo_id": photo["id"], "method": "none"})
+        assert ("careful" in formats["estimators"], "everywhere" in formats["selectors"]) == (True, True)
+        wish = {"photo_id": service.calibrated(photo, selector="everywhere")["id"]}
+        made = service.http.post("/v1/corrections", json={**wish, "method": "adjoint"}).json()
+        assert service.job(made["id"])["state"] == "succeeded"
+        refused = service.http.post("/v1/corrections", json={**wish, "method": "none"})
         assert "adjoint" in refused.json()["detail"]
-    finally:
-        service.close()

@@ -5,27 +5,25 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
-import logging
 import os
 import re
 import shlex
 import shutil
 import signal
 import subprocess
-import sys
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
+import in_process
 import numpy as np
 import pytest
 import typer
 from deadline import stretched
 from PIL import Image
-from running import scene, write_light, write_photo
+from running import PROGRAM, scene, write_light, write_photo
 from scipy import ndimage
 from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
@@ -34,22 +32,20 @@ from app.blobs.storage import Storage
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.accounts import Accounts
-from app.store.database import Database, upgrade
+from app.store.database import upgrade
 from app.store.tables import KeyRow
 from lab import targets
 from lab.kernels import gaussian
 from lab.lens_test import MARGIN, squares_chart
-from lensmodel.cli.main import OnDemand, app, main
+from lensmodel.cli.main import OnDemand, app
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.measured.page import TargetPage
 from lensmodel.model import LensModel, LensProfile, save_profile
 
-HERE = Path(__file__).parents[1]
+HERE = Path(__file__).parents[3]
 PATIENCE_S = 240.0
-LONG_S = 3600.0
 ROOT: Any = typer.main.get_command(app)
 
 
@@ -65,15 +61,11 @@ def commands(group: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any
             yield from commands(command, (*names, name))
 
 
-def examples_of(command: Any) -> list[str]:
-    return re.findall(r"^\s*lensmodel (.+?)\s*$", command.help or "", re.MULTILINE)
-
-
 COMMANDS = dict(commands(ROOT))
-EXAMPLES = {line: name for name, command in COMMANDS.items() for line in examples_of(command)}
+EXAMPLE = re.compile(r"^\s*lensmodel (.+?)\s*$", re.MULTILINE)
+EXAMPLES = {line: name for name, command in COMMANDS.items() for line in EXAMPLE.findall(command.help or "")}
 
-
-PAGES = [HERE.parents[1] / "README.md", *(HERE.parents[1] / "docs").rglob("*.md")]
+PAGES = [HERE / "README.md", *(HERE / "docs").rglob("*.md")]
 PRINTED = r"^ {4,}(?:\.venv/bin/)?lensmodel ([a-z][^\\\n#]*[^\\\s#])[ ]*(?:#.*)?$"  # not those of two lines
 DOCUMENTED = {line for page in PAGES for line in re.findall(PRINTED, page.read_text("utf-8"), re.MULTILINE)}
 
@@ -95,12 +87,6 @@ def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: s
     assert inspect.cleandoc(command.help or "").splitlines()[0] == listed.help
 
 
-def test_five_commands_are_for_everyone_and_twelve_in_panels_of_their_own() -> None:
-    panels = Counter(command.rich_help_panel for command in ROOT.commands.values())
-
-    assert panels == {None: 5, "Research": 6, "Administration": 6}
-
-
 def test_correct_shows_ten_options_and_all_of_them_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
     shown = {}
     for flag in ("--help", "--help-all"):
@@ -114,16 +100,11 @@ def test_correct_shows_ten_options_and_all_of_them_if_asked(capsys: pytest.Captu
 
 
 def test_the_short_name_o_is_where_to_write_in_every_command() -> None:
-    found = {
-        name: parameter
-        for name, command in COMMANDS.items()
-        for parameter in command.params
-        if "-o" in parameter.opts
-    }
+    found = [option for command in COMMANDS.values() for option in command.params if "-o" in option.opts]
 
     assert len(found) > 5
-    assert all("--output" in parameter.opts for parameter in found.values())
-    assert all(parameter.help.startswith("Where to write: ") for parameter in found.values())
+    assert all("--output" in option.opts for option in found)
+    assert all(option.help.startswith("Where to write: ") for option in found)
 
 
 def test_an_option_that_does_not_exist_would_be_noticed() -> None:
@@ -154,13 +135,6 @@ QUICK = {
     "backup my-backup",
 }
 """One of each command that takes a second at most; the others are run among the slow tests."""
-
-ALONE = {"config"}
-"""Of the quick ones, those that have a process of their own, as all slow ones do: it takes a second."""
-
-
-def marked(lines: Iterable[str]) -> list[Any]:
-    return [pytest.param(k, id=k, marks=[] if k in QUICK else [pytest.mark.slow]) for k in lines]
 
 
 def write_what_measures(folder: Path) -> None:
@@ -198,10 +172,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(folder / "one.dng", folder / "linear" / "one-corrected.dng")
     kernels = np.stack([gaussian(31, np.eye(2) * (0.8 + 0.3 * k)) for k in range(4)])
     np.savez(folder / "mine.npz", psf=kernels)
-    places = [FieldPosition(r, phi) for r in (0.1, 0.3, 0.5, 0.7, 0.9) for phi in (-2.4, -0.8, 0.8, 2.4)]
-    stars = np.stack([gaussian(15, np.eye(2) * (1.0 + place.r)) for place in places])
+    r, phi = map(np.ravel, np.meshgrid((0.1, 0.3, 0.5, 0.7, 0.9), (-2.4, -0.8, 0.8, 2.4)))
     np.savez(
-        folder / "stars.npz", psf=stars, r=[place.r for place in places], phi=[place.phi for place in places]
+        folder / "stars.npz", psf=np.stack([gaussian(15, np.eye(2) * (1.0 + x)) for x in r]), r=r, phi=phi
     )
     samples = [
         PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
@@ -212,15 +185,12 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     known = LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"})
     save_profile(folder / "my-24mm.lensprofile", known)
     save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**lens, "serial": "L-43"}))
-    database = Database(f"sqlite:///{folder / 'lensmodel-data' / 'app.db'}")
-    upgrade(database)
-    Accounts(database).create_key("anna", ["write"])
-    with database.writing() as session:
-        session.execute(update(KeyRow).values(prefix="abcd2345"))
-    database.close()
     settings = Settings(data_dir=folder / "lensmodel-data")
     with contextlib.closing(Store(settings)) as store:
         upgrade(store.database)
+        store.accounts.create_key("anna", ["write"])
+        with store.database.writing() as session:
+            session.execute(update(KeyRow).values(prefix="abcd2345"))
         backup(store.database, Storage(settings.storage), folder / "my-backup")
     return folder
 
@@ -231,78 +201,41 @@ def folder(prepared: Path, tmp_path: Path) -> Path:
     return tmp_path / "work"
 
 
-@pytest.fixture
-def in_this_process(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Callable[[list[str]], tuple[int, str, str]]]:
-    """Run `main` in the folder of the examples; what it does to this process is undone."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for name in set(os.environ) - set(environment(folder)):
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("HOME", str(folder))
-    monkeypatch.chdir(folder)
-
-    def run(words: list[str]) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["lensmodel", *words])
-        status = 0
-        try:
-            main()
-        except SystemExit as end:
-            status = int(end.code or 0)
-        return status, *capsys.readouterr()
-
-    yield run
-    root.handlers[:], root.level = handlers, level
-    for number, handler in signals.items():
-        signal.signal(number, handler)
-
-
-def in_a_process(words: list[str], folder: Path) -> tuple[int, str, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "lensmodel", *words],
-        cwd=folder,
-        env=environment(folder),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LONG_S,
-    )
-    return done.returncode, done.stdout, done.stderr
-
-
 def environment(folder: Path) -> dict[str, str]:
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("LENS_", "LENSMODEL_"))}
-    return {**kept, "PYTHONPATH": str(HERE.parents[1]), "HOME": str(folder)}
+    return {**kept, "PYTHONPATH": str(HERE), "HOME": str(folder)}
 
 
 @pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
     "line",
-    marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and k not in NOT_RUN),
+    [
+        pytest.param(line, id=line, marks=[] if line in QUICK else [pytest.mark.slow])
+        for line in EXAMPLES
+        if EXAMPLES[line] != "serve" and line not in NOT_RUN
+    ],
 )
-def test_example_runs(
-    line: str,
-    folder: Path,
-    in_this_process: Callable[[list[str]], tuple[int, str, str]],
-) -> None:
+def test_example_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
     if "auto" in words:
         words += ["--learn-from", "1"]
     if EXAMPLES[line] == "measure":
         write_what_measures(folder)
-    quick = line in QUICK and line not in ALONE
-    status, said, errors = in_this_process(words) if quick else in_a_process(words, folder)
+    if line in QUICK:
+        for name in set(os.environ) - set(environment(folder)):
+            monkeypatch.delenv(name)
+        monkeypatch.setenv("HOME", str(folder))
+        done = in_process.lensmodel(*words, cwd=folder)
+    else:
+        started: dict[str, Any] = {"cwd": folder, "env": environment(folder), "capture_output": True}
+        done = subprocess.run([*PROGRAM, *words], **started, text=True, check=False, timeout=3600.0)
 
-    assert status == 0, errors
-    assert said
-    for flag in ("-o", "--output", "--profile", "--json"):
-        for at in (
-            k for k, word in enumerate(words[:-1]) if word == flag and not words[k + 1].startswith("-")
-        ):
-            assert (folder / words[at + 1]).exists(), flag
-    if "--json" in words and (words[-1] == "--json"):
-        json.loads(said)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+    for flag, value in pairwise(words):
+        if flag in {"-o", "--output", "--profile", "--json"} and not value.startswith("-"):
+            assert (folder / value).exists(), flag
+    if words[-1] == "--json":
+        json.loads(done.stdout)
 
 
 @pytest.mark.slow
@@ -310,7 +243,7 @@ def test_example_runs(
 def test_example_serves_and_prints_its_address_last_until_it_is_told_to_stop(line: str, folder: Path) -> None:
     words = [word.replace("~", str(folder)) for word in shlex.split(line)]
     with subprocess.Popen(
-        [sys.executable, "-m", "lensmodel", *words, *([] if "--port" in words else ["--port", "0"])],
+        [*PROGRAM, *words, *([] if "--port" in words else ["--port", "0"])],
         cwd=folder,
         env=environment(folder),
         stdout=subprocess.PIPE,

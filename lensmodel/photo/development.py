@@ -21,7 +21,7 @@ from lensmodel.core.errors import (
 )
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
-from lensmodel.photo.containers import check_size, opened_header
+from lensmodel.photo.containers import COPY_AGAIN, check_size, opened_header
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
@@ -66,9 +66,7 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
     if header.kind == "jpeg" and header.channels == 4:
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
     if not header.whole:
-        raise TruncatedImageError(
-            f"the {header.kind.upper()} ends before its picture does; copy it again from the camera or card"
-        )
+        raise TruncatedImageError(f"the {header.kind.upper()} ends before its picture does; {COPY_AGAIN}")
     if min(width, height) < MIN_SIDE:
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"

@@ -16,6 +16,7 @@ from lensmodel.core.errors import LensModelError, RawDecodeError, TruncatedImage
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, curves_of, matrix3
+from lensmodel.photo.containers import COPY_AGAIN
 from lensmodel.photo.dng import Opcode, demosaiced, packed_opcodes, read_opcodes
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
@@ -50,7 +51,7 @@ def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
             head = file.read(16)
         if isinstance(error, rawpy.LibRawIOError) or any(head.startswith(m, at) for at, m in _KNOWN_WHOLE):
             raise TruncatedImageError(
-                "the RAW file is damaged, or ends before its data do; copy it again from the camera or card"
+                f"the RAW file is damaged, or ends before its data do; {COPY_AGAIN}"
             ) from error
         raise UnsupportedFormatError(
             "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"

@@ -45,21 +45,14 @@ from lensmodel.quality.edge_finder import FoundEdge, find_edges
 # Relative L2 that no square shows of itself: kernels are no mixtures of three Gaussians (chosen: half of the
 # squares of five traced lenses are off by .07 to .24)
 FLOOR: Final = 0.15
-# Cycles/pixel: steps far below what a kernel resolves (chosen)
-_FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)
+_FREQUENCIES: Final = np.linspace(0.0, 0.5, 26)  # cycles/pixel: finer than a kernel resolves (chosen)
 _SLICE_ERROR: Final = 0.02  # of a transfer function: of an edge of 64 lines at 1 percent noise
-# Edges closer in direction say nearly the same of a kernel; those of a square cross at 90 degrees (chosen)
-_CROSSING: Final = math.radians(45.0)
-# A corner of a square lies at most so much further out than the middles of windows that hold one edge and
-# nothing else: a side of the smallest (chosen)
-_CORNER_PX: Final = 64.0
-# Pixels from an edge that its line spread is read at: further out is noise; nearer, halos are cut (chosen)
-_REACH_PX: Final = 16.0
+_CROSSING: Final = math.radians(45.0)  # edges closer in direction say nearly the same of a kernel (chosen)
+_CORNER_PX: Final = 64.0  # of a corner from the end of its edges: a side of the smallest window (chosen)
+_REACH_PX: Final = 16.0  # from an edge that its line spread is read at: further out is noise (chosen)
 _TAPER_PX: Final = 4.0  # pixels over which it fades: a sudden end would ring (chosen)
-_LEAST_PX: Final = (
-    0.15  # standard deviation of a Gaussian: what is narrower looks the same to pixels (chosen)
-)
-# Pixels around a corner that are compared: so many standard deviations, within limits (chosen)
+_LEAST_PX: Final = 0.15  # standard deviation of a Gaussian: narrower looks the same to pixels (chosen)
+# Pixels around a corner that are compared: standard deviations, within limits (chosen)
 _HALF_WIDTHS, _LEAST_HALF, _MOST_HALF = 3.0, 6, 20
 _SPARE_PX: Final = 16  # around them, which the blur of the rim of what is drawn reaches (chosen)
 # Where the fit begins: widths of the core and of the wider Gaussian over that of the square, weights of the

@@ -35,36 +35,26 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import block_means
 from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.measurer import MeasuredPsf, at_each, require
-from lensmodel.measured.registration import Warp, match, matched
+from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
-# Error that no window shows of itself; chosen: a lens at f/8 is that far from diffraction at pixels of 4.5
-# um
-FLOOR: Final = 0.05
-USUAL_F_NUMBER: Final = 8.0  # Aperture of the closed photo where it does not say: the sharpest of most lenses
+FLOOR: Final = 0.05  # error that no window shows of itself: of a lens at f/8 against diffraction (chosen)
+USUAL_F_NUMBER: Final = 8.0  # of the closed photo where it does not say: the sharpest of most lenses
 _USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
-_CLEAR: Final = 8.0  # standard deviations, as in `target`, for the same reason
-# Pixels of a window: the kernel changes within a larger one, a smaller one determines it too badly (chosen)
-_SIDE: Final = 160
+_SIDE: Final = 160  # pixels of a window: the kernel changes in a larger one, a smaller tells less (chosen)
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
-# Least difference of the apertures: blur that both photos share is missing in the kernel (chosen)
-_STOPS_APART: Final = 2.0
-# Expected relative L2 from which on a window is dropped: a blind kernel is as good (chosen)
-_SURE: Final = 0.3
-# Photos are shrunk so far for the first match: a nudged tripod is within reach, the blur is gone (chosen)
-_COARSE: Final = 4
-# Frequencies along an axis: its lags have to hold two kernels, and the spectra are smooth (chosen)
-_NOISE_GRID: Final = 128
-# Of frequency, 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)
-_RINGS: Final = 16
+_STOPS_APART: Final = 2.0  # least: blur that both photos share is missing in the kernel (chosen)
+_SURE: Final = 0.3  # expected relative L2 from which on a window is dropped: blind ones are as good (chosen)
+_COARSE: Final = 4  # photos are shrunk so far for the first match: a nudged tripod is within reach (chosen)
+_NOISE_GRID: Final = 128  # frequencies along an axis: its lags have to hold two kernels (chosen)
+_RINGS: Final = 16  # of 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)
 # Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
 # error for the lens of development (third order, 4). Measured once, no command repeats it
 _ALIASED: Final = 0.03
 _SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
-_FEWEST: Final = 64  # points that a fit of brightness takes: some ten for each of its six terms (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +98,7 @@ class AperturePair:
         shift, clarity = match(
             *(block_means(np.asarray(each, np.float64), _COARSE) for each in (plane, reference))
         )
-        if clarity < _CLEAR:
+        if clarity < CLEAR:
             raise NotEnoughEvidenceError(
                 "the two photos do not show the same scene; take them from a tripod, one after the other"
             )
@@ -126,10 +116,7 @@ class AperturePair:
         half = self.side // 2
         corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
         for degree in (1, 1, 3):
-            warp = matched(
-                warp, shown, plane, corners, self.side,
-                least_clarity=_CLEAR, degree=degree, on_step=on_step,
-            )  # fmt: skip
+            warp = matched(warp, shown, plane, corners, self.side, degree, on_step)
         return warp
 
     def _window(self, closed: LinearPhoto, warp: Warp, window: Window, size: int) -> MeasuredPsf:
@@ -246,13 +233,11 @@ def _power_by_frequency(window: NDArray[np.floating]) -> Callable[[NDArray[np.fl
 
 def _falloff(window: Window, scene: _Scene, around: int) -> NDArray[np.float64]:
     """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
-    side, good = len(window.light), window.measured
+    side, good = len(window.light), window.require_measured()
     basis = window_terms(side, around)
     # smoothed, the two differ by the light alone, however one of them is blurred
     smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
     inner = slice(around, around + side)
-    if good.sum() < _FEWEST:
-        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
     columns = (basis[inner, inner] * smooth[inner, inner, None])[good]
     terms, *_ = np.linalg.lstsq(columns, window.light[good], rcond=None)
     light = basis @ terms
@@ -303,10 +288,8 @@ def diffraction_otf(
     return np.asarray(round_pupil * np.sinc(rows) * np.sinc(cols), dtype=np.float64)
 
 
-# Pixels, side of a place: a larger one is nowhere without detail, a smaller one by chance too quiet (chosen)
-_BLOCK: Final = 64
-# Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more
-_FINE: Final = (0.4, 0.5)
+_BLOCK: Final = 64  # pixels: a larger one is nowhere without detail, a smaller by chance too quiet (chosen)
+_FINE: Final = (0.4, 0.5)  # cycles/pixel: below, lenses leave more
 _DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
 
 

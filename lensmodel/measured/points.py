@@ -31,17 +31,14 @@ from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
 from lensmodel.measured.solve import NEAR_CLIP, Solved, Window, solve
 from lensmodel.photo import LinearPhoto
 
-# Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by over a
-# dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals
+# Error that no cell shows of itself (chosen): three times that of one kernel, which may change in the cell
 FLOOR: Final = 0.1
 _FEWEST: Final = 2  # Lights a cell must have: one alone may be a double star
 # Least share of lone bright spots (chosen: 30 photos have less than .04, stars .4; no command repeats it)
 _ISOLATED: Final = 0.05
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
-# Of stacking at improved centres: each stack is sharper by those before it, and soon they rest (chosen)
-_ROUNDS: Final = 3
-# Expected relative error beyond which a kernel helps no model, whose blind ones are no worse (chosen)
-_SURE: Final = 0.45
+_ROUNDS: Final = 3  # of stacking at improved centres: soon they rest (chosen)
+_SURE: Final = 0.45  # expected error beyond which a kernel helps no model: blind ones are no worse (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,8 +216,7 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
 
 
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
-# Of its flux, that another light beside it may have: a fainter one is an error like those of noise (chosen)
-_NEIGHBOUR: Final = 0.1
+_NEIGHBOUR: Final = 0.1  # of its flux, that another light beside it may have: fainter is noise (chosen)
 _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
 
 
@@ -230,9 +226,8 @@ def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     strips = np.array_split(plane, shape[0])
     cells = np.array([[np.median(part) for part in np.array_split(s, shape[1], axis=1)] for s in strips])
     cells = ndimage.median_filter(cells, 3, mode="nearest")
-    places = [(np.arange(n) + 0.5) * count / n - 0.5 for n, count in zip(plane.shape, shape, strict=True)]
-    grid = np.meshgrid(*places, indexing="ij")
-    sky = ndimage.map_coordinates(cells, grid, order=1, mode="nearest")
+    factors = np.divide(plane.shape, cells.shape)
+    sky = ndimage.zoom(cells, factors, order=1, mode="nearest", grid_mode=True)
     left = plane - sky
     scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
     return sky, max(scatter, 1e-7)

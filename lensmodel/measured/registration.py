@@ -22,15 +22,13 @@ from scipy import fft, ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame, block_means
-from lensmodel.core.types import StepHook, ignore_step
+from lensmodel.core.types import StepHook
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
-# Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle
-DEGREE: Final = 5
+DEGREE: Final = 5  # radial distortion of two coefficients, and a decentred middle
 _FEWEST_MATCHES: Final = 6  # points, twice as many as a polynomial of first order needs (chosen)
-# Matches within a tenth of a pixel of the smooth field of all others pass in any case: with less, good ones
-# are dropped where nearly all are good (chosen)
-_TRUSTED_PX: Final = 0.1
+_TRUSTED_PX: Final = 0.1  # matches so near the field of all others pass: with less, good ones go (chosen)
+CLEAR: Final = 8.0  # standard deviations of a peak: peaks of 10 000 lags of noise reach 4 to 5
 _REMEDY: Final = "photograph it flat, in focus and without anything before it"
 
 
@@ -127,10 +125,8 @@ def matched(
     plane: NDArray[np.floating],
     corners: list[tuple[int, int]],
     side: int,
-    *,
-    least_clarity: float,
     degree: int,
-    on_step: StepHook = ignore_step,
+    on_step: StepHook,
 ) -> Warp:
     """Bend a warp to the matches of all windows that are clear; each calls `on_step(0, 1)`."""
     pixels, shifts = [], []
@@ -138,7 +134,7 @@ def matched(
         on_step(0, 1)
         seen, shown = plane[row : row + side, col : col + side], render(warp, (row, col), (side, side))
         shift, clarity = match(seen, shown)
-        if clarity >= least_clarity:
+        if clarity >= CLEAR:
             pixels.append((row + (side - 1) / 2.0, col + (side - 1) / 2.0))
             shifts.append(shift)
     if len(pixels) < _FEWEST_MATCHES:
@@ -151,19 +147,14 @@ def matched(
 
 
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
-# Of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
-_DARK: Final = 0.45
-# Area over that of the ellipse of the same second moments, 1 of an ellipse: noise frays discs, letters and
-# corners have less (chosen)
+_DARK: Final = 0.45  # of the surroundings' mean level, which is grey (chosen: discs are black)
+# Area over that of the ellipse of its second moments: noise frays discs, letters have less (chosen)
 _ROUND: Final = 0.85
 _LEAST_PX: Final = 20  # area of a disc: below it no shape is seen (chosen)
 _MOST_SHARE: Final = 0.004  # same, of the picture: a page that fills it has less than a tenth (chosen)
-# Clearest discs that are looked at for the four marks: ten others in the picture do no harm, and their
-# thousand choices of four are still quick (chosen)
-_CANDIDATES: Final = 14
+_CANDIDATES: Final = 14  # discs looked at for the four marks: ten others do no harm, and it is quick (chosen)
 _ALIKE: Final = 4.0  # the largest disc over the smallest in area: a page seen very much aslant
-# Least ratio of the light of paper and print: far more on any print, less on shadows and patterns (chosen)
-_PAPER_OVER_DISC: Final = 2.0
+_PAPER_OVER_DISC: Final = 2.0  # least ratio of their light: shadows and patterns have less (chosen)
 
 
 def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:

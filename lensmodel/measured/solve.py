@@ -63,13 +63,10 @@ def window_terms(side: int, margin: int) -> NDArray[np.float64]:
     return quadratic(t[:, None], t[None, :])
 
 
-# T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light
-PEAK: Final = 0.5
-# D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have
-REACH: Final = 2.5
+PEAK: Final = 0.5  # T: so much light has the middle of the sharpest kernel, a pixel and some diffraction
+REACH: Final = 2.5  # D in pixels: light 10 px away is expected below 3 percent, ten times that of wide halos
 _ROWS: Final = 2048  # of the design matrix at once: a whole window would take hundreds of megabytes (chosen)
-# Of the projected gradient, whose error falls with the square of their number: more only cost time (chosen)
-_STEPS: Final = 300
+_STEPS: Final = 300  # of the projected gradient: more only cost time (chosen)
 _STILL: Final = 1e-7  # of the light: no value moves by more
 _NO_KERNEL: Final = "no kernel explains this window; the latent picture does not match it"
 
@@ -265,17 +262,11 @@ def _error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
 # Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed; measured
 # once, no command repeats it)
 CHANGE: Final = 0.3
-# How far from the middle the centre of mass is expected, where the misfit does not tell: the match before it
-# is as sure; much more and the phase is left open (chosen)
-CENTRED_PX: Final = 0.3
-# Of the search for the phase, coarse to fine: the first crosses a pixel in four, each next one looks around
-# where the last ended (chosen)
-_STEPS_PX: Final = (0.25, 0.1, 0.04)
-# Largest phase along an axis: kernels come here centred, a whole pixel is another match (chosen)
-_MOST_PX: Final = 1.0
+CENTRED_PX: Final = 0.3  # expected distance of the centre of mass from the middle: that of the match (chosen)
+_STEPS_PX: Final = (0.25, 0.1, 0.04)  # of the search for the phase, coarse to fine (chosen)
+_MOST_PX: Final = 1.0  # largest phase along an axis: a whole pixel is another match (chosen)
 _MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
-# Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)
-_SEARCHED: Final = 100
+_SEARCHED: Final = 100  # steps from one phase to the next: only the order of their misfits counts (chosen)
 
 
 def _on_its_grid(
@@ -330,9 +321,9 @@ def _moved(
 
 # `latent(shift, margin)`: the sharp picture of a window, moved down and right by `shift` pixels
 Latent = Callable[[tuple[float, float], int], NDArray[np.floating]]
-SMALL: Final = 15  # Side of the kernel by which the middle is found: its wings hardly move it
-# Share of the clipping level above which a pixel is not believed: the sensor bends before it clips
-NEAR_CLIP: Final = 0.97
+SMALL: Final = 15  # side of the kernel by which the middle is found: its wings hardly move it
+NEAR_CLIP: Final = 0.97  # of the clipping level, above which no pixel is believed: sensors bend before it
+_FEWEST: Final = 64  # pixels of a window to fit its light to: five to ten for each term (chosen)
 _MOST_SHIFT: Final = 3.0  # pixels; beyond, the small kernel is cut off
 
 
@@ -356,6 +347,12 @@ class Window:
             rows, cols = (row + np.arange(side)) % 2, (col + np.arange(side)) % 2
             measured &= np.asarray(photo.cfa)[rows[:, None], cols[None, :]] == index
         return cls(photo, channel, corner, light, measured)
+
+    def require_measured(self) -> NDArray[np.bool_]:
+        """Return which pixels were measured; raises where these are too few to fit its light to."""
+        if int(self.measured.sum()) < _FEWEST:
+            raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+        return self.measured
 
     @property
     def noise(self) -> NoiseModel:

@@ -34,7 +34,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
 from lensmodel.measured.measurer import MeasuredPsf, at_each, require
 from lensmodel.measured.page import DETAILS, MEAN, TargetPage
-from lensmodel.measured.registration import Warp, find_marks, homography_of, match, matched
+from lensmodel.measured.registration import CLEAR, Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
     SMALL,
     Solved,
@@ -47,21 +47,15 @@ from lensmodel.measured.solve import (
 )
 from lensmodel.photo import LinearPhoto
 
-# Error that no window shows of itself: what the smooth models of light, tones and place leave out (chosen)
-FLOOR: Final = 0.02
-# Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
-# too low is no reason to cut it (chosen)
+FLOOR: Final = 0.02  # error that no window shows of itself: of the models of light, tones and place (chosen)
+# Residuals over the noise above which a window is cut: for noise stated a tenth too low it is not (chosen)
 EXPLAINED: Final = 1.15
 _TOO_SMALL: Final = "the page is too small in the photo; go nearer until it nearly fills the frame"
-_CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
-# Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
-_SIDE: Final = 144
+_SIDE: Final = 144  # pixels of a window: wide enough for the largest kernel, small enough for one (chosen)
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
-# Shares of the side, tried where whole windows do not fit: the kernel changes less in them (chosen)
-_SMALLER: Final = (2 / 3, 1 / 2)
+_SMALLER: Final = (2 / 3, 1 / 2)  # of the side: the kernel changes less in such windows (chosen)
 _LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
-# In the middle of the frame, where the lens is sharpest: more lie further out (chosen)
-_TONE_WINDOWS: Final = 6
+_TONE_WINDOWS: Final = 6  # in the middle of the frame, where the lens is sharpest (chosen)
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 
 
@@ -121,7 +115,7 @@ class Target:
         for degree in (1, 3, 5, 5):
             warp = matched(
                 warp, lambda bent, at, shape: replace(placed, warp=bent).window(*at, shape),
-                plane, corners, side, least_clarity=_CLEAR, degree=degree, on_step=on_step,
+                plane, corners, side, degree, on_step,
             )  # fmt: skip
         return replace(placed, warp=warp)
 
@@ -159,7 +153,7 @@ def _identified(photo: LinearPhoto, details: Sequence[int], on_step: StepHook) -
             _, clarity = match(plane[row : row + side, col : col + side], shown)
             if best is None or clarity > best[0]:
                 best = clarity, placed
-    if best is None or best[0] < _CLEAR:
+    if best is None or best[0] < CLEAR:
         raise NotEnoughEvidenceError(
             "no known target is seen; photograph the page that `lensmodel target` writes, printed without "
             "stretching it, whole and in focus"
@@ -176,19 +170,14 @@ def _spread(held: Sequence[tuple[int, int]], across: int, down: int) -> list[tup
     return sorted({held[int(np.argmin(np.hypot(*(places - place).T)))] for place in wanted})
 
 
-# Standard deviation of q and c, see `tones_of`: what tones a print of unknown making may have (chosen: a
-# gamma of 1.3 has a q of 0.3)
+# Standard deviation of q and c, see `tones_of` (chosen: a gamma of 1.3 has a q of 0.3)
 TONE_SPREAD: Final = 0.3
 # z, z² and z³ of `tones_of` in powers of R, less their constants
 _POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
 _TINY: Final = 1e-20  # keeps a division finite
-# Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies: at 1, its dots
-# would alias, more costs time (chosen)
-_FINE: Final = 2
-# Pixels around a window, where the taper is: half of the largest kernel comes nearly as far (chosen)
-_SPARE: Final = 16
-# Of fitting light and tones in turn: the second corrects what the first took for the other (chosen)
-_LIGHT_ROUNDS: Final = 2
+_FINE: Final = 2  # samples a pixel that the page is drawn with: at 1, its dots would alias (chosen for time)
+_SPARE: Final = 16  # pixels around a window, where the taper is: as far as half of a kernel (chosen)
+_LIGHT_ROUNDS: Final = 2  # the second corrects what the first took for the kernel (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,14 +294,9 @@ def _tones_in(window: Window, placed: PlacedPage) -> tuple[NDArray[np.float64], 
     return separable.T @ separable * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])
 
 
-_FEWEST: Final = 64  # pixels: five times as many as there are terms
-
-
 def _fitted_light(window: Window, page: NDArray[np.floating], kernel: Kernel) -> NDArray[np.float64]:
     """Terms (6,) of a quadratic in row and column, whose mean over its square window is 1."""
-    side, measured = len(window.light), window.measured
-    if int(measured.sum()) < _FEWEST:
-        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+    side, measured = len(window.light), window.require_measured()
     outer, inner = window_terms(side, kernel.shape[0] // 2), window_terms(side, 0)
     lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
     basis = np.stack([*lit, *inner[measured].T], axis=-1)

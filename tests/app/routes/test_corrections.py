@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 from starlette.testclient import TestClient
-from states import FILE, Steps, finish, refusal, services_of, stored
+from states import FILE, Steps, finish, refusal, stored
 
 from app.routes.corrections import byte_range
 from app.runtime.settings import Settings
@@ -62,26 +62,18 @@ def test_the_same_wish_is_the_same_correction(client: TestClient, photo: str) ->
     assert third.json()["report"] == GAIN
 
 
-def test_bounds_make_another_correction(client: TestClient, store: Store, photo: str) -> None:
+def test_bounds_and_a_new_photo_of_the_lens_make_other_corrections(
+    client: TestClient, steps: Steps, store: Store, photo: str
+) -> None:
     bounds: list[dict[str, Any]] = [{}, {"halo": None, "denoise": 0.0}, {"halo": 0.2, "denoise": 0.5}]
     plain, unbound, bound = (post(client, photo_id=photo, **wish).json()["id"] for wish in bounds)
-
-    assert unbound == plain != bound
-    rows = [store.jobs.get(key, ANY_OWNER) for key in (plain, bound)]
-    assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
-        [None, 0.0],
-        [0.2, 0.5],
-    ]
-
-
-def test_a_new_photo_of_the_lens_makes_another_correction(
-    client: TestClient, steps: Steps, photo: str
-) -> None:
-    first = post(client, photo_id=photo).json()["id"]
     steps.counted()
+    renewed, pinned = (post(client, photo_id=photo, **of).json()["id"] for of in ({}, {"lens_version": 1}))
 
-    assert post(client, photo_id=photo).json()["id"] != first
-    assert post(client, photo_id=photo, lens_version=1).json()["id"] == first
+    assert plain == unbound == pinned
+    assert len({plain, bound, renewed}) == 3
+    params = [row.params for key in (plain, bound) if (row := store.jobs.get(key, ANY_OWNER))]
+    assert [(each.get("halo"), each["denoise"]) for each in params] == [(None, 0.0), (0.2, 0.5)]
 
 
 def test_a_photo_with_other_settings_is_corrected_anew(
@@ -143,7 +135,9 @@ def test_a_preview_is_its_pages_own_which_deletes_it_while_another_asks(
     assert opened == same
 
 
-def test_the_result_waits_for_the_work(client: TestClient, store: Store, photo: str) -> None:
+def test_the_result_waits_for_the_work_which_is_cancelled_once(
+    client: TestClient, store: Store, photo: str
+) -> None:
     made = post(client, photo_id=photo).json()
     run = store.jobs.start(made["id"], 1)
     assert run is not None
@@ -151,11 +145,13 @@ def test_the_result_waits_for_the_work(client: TestClient, store: Store, photo: 
 
     early = client.get(f"/v1/corrections/{made['id']}/result")
     job = client.get(made["links"]["job"]).json()
+    cancelled, again = (client.post(f"/v1/jobs/{made['id']}/cancel") for _ in range(2))
 
     assert refusal(early) == (409, "not_ready")
-    assert made["links"]["result"] is None
     assert (job["stage"], job["progress"]) == ("correcting", {"done": 3, "total": 8, "unit": "tiles"})
-    assert job["links"]["result"] is None
+    assert made["links"]["result"] is job["links"]["result"] is None
+    assert (cancelled.json()["state"], again.status_code) == ("cancelled", 409)
+    assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"
 
 
 def test_a_failed_correction_says_why_and_can_be_asked_for_again(
@@ -171,28 +167,24 @@ def test_a_failed_correction_says_why_and_can_be_asked_for_again(
     assert post(client, photo_id=photo).json()["id"] != made["id"]
 
 
-def test_the_result_is_the_file_that_was_made(client: TestClient, finished: str) -> None:
-    shown = client.get(f"/v1/corrections/{finished}").json()
+def test_the_result_is_the_file_that_was_made_and_parts_of_it_join_to_the_whole(
+    client: TestClient, finished: str
+) -> None:
+    address = client.get(f"/v1/corrections/{finished}").json()["links"]["result"]
 
-    answer = client.get(shown["links"]["result"])
+    def part(span: str, **headers: str) -> Any:
+        return client.get(address, headers={"Range": f"bytes={span}", **headers})
+
+    answer, tag = client.get(address), f'"{hashlib.sha256(FILE).hexdigest()}"'
+    first, rest = part("0-99"), part("100-", **{"If-Range": tag})
+    changed, beyond = part("100-", **{"If-Range": '"other"'}), part("99999-")
 
     assert (answer.status_code, answer.content) == (200, FILE)
-    assert answer.headers["content-type"] == "image/tiff"
-    assert answer.headers["etag"] == f'"{hashlib.sha256(FILE).hexdigest()}"'
+    assert (answer.headers["content-type"], answer.headers["etag"]) == ("image/tiff", tag)
     assert answer.headers["content-length"] == str(len(FILE))
     assert answer.headers["content-disposition"] == (
         "attachment; filename=\"Gr-e-p1-corrected.tif\"; filename*=UTF-8''Gr%C3%B6%C3%9Fe%20p1-corrected.tif"
     )
-
-
-def test_parts_of_the_result_join_to_the_whole(client: TestClient, finished: str) -> None:
-    def part(span: str, **headers: str) -> Any:
-        return client.get(f"/v1/corrections/{finished}/result", headers={"Range": f"bytes={span}", **headers})
-
-    first = part("0-99")
-    rest = part("100-", **{"If-Range": first.headers["etag"]})
-    changed, beyond = part("100-", **{"If-Range": '"other"'}), part("99999-")
-
     assert (first.status_code, first.headers["content-range"]) == (206, f"bytes 0-99/{len(FILE)}")
     assert first.content + rest.content == FILE
     assert (changed.status_code, changed.content) == (200, FILE)
@@ -200,13 +192,8 @@ def test_parts_of_the_result_join_to_the_whole(client: TestClient, finished: str
 
 
 def test_a_range_is_read_as_the_standard_says() -> None:
-    parts = {
-        "0-0": (0, 1),
-        "10-19": (10, 20),
-        "990-2000": (990, 1000),
-        "-10": (990, 1000),
-        "500-": (500, 1000),
-    }
+    parts = {"0-0": (0, 1), "10-19": (10, 20), "990-2000": (990, 1000)}
+    parts |= {"-10": (990, 1000), "500-": (500, 1000)}
     whole = ("bytes=-5000", "bytes=20-10", "bytes=0-1,5-6", "bytes=-", "lines=1-2", "bytes=0-" + "9" * 5000)
 
     assert {span: byte_range(f"bytes={span}", 1000) for span in parts} == parts
@@ -227,15 +214,6 @@ def test_corrections_are_listed_by_photo_and_deleted_with_their_file(
     assert not (settings.data_dir / "blobs" / "corrections" / finished).exists()
 
 
-def test_a_running_correction_is_cancelled_once(client: TestClient, store: Store, photo: str) -> None:
-    made = post(client, photo_id=photo).json()
-    store.jobs.start(made["id"], 1)
-
-    assert client.post(f"/v1/jobs/{made['id']}/cancel").json()["state"] == "cancelled"
-    assert client.post(f"/v1/jobs/{made['id']}/cancel").status_code == 409
-    assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"
-
-
 def test_results_count_for_the_quota_and_expire(
     client: TestClient, finished: str, photo: str, store: Store
 ) -> None:
@@ -250,35 +228,20 @@ def test_results_count_for_the_quota_and_expire(
     assert store.jobs.ended_before(now() + timedelta(days=1)) == [finished]
 
 
-def test_nobody_has_more_unfinished_corrections_than_unfinished_photos(
+def test_requests_under_other_words_fill_neither_the_queue_nor_the_table(
     client: TestClient, photo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.routes.photos.MAX_UNFINISHED", 2)
-    answers = [post(client, photo_id=photo, nonce=word) for word in ("one", "two", "three")]
+    for limit in ("MAX_UNFINISHED", "MAX_PHOTOS"):
+        monkeypatch.setattr(f"app.routes.photos.{limit}", 2)
+    made = [post(client, photo_id=photo, nonce=word).json()["id"] for word in ("one", "two")]
 
-    assert [answer.status_code for answer in answers] == [202, 202, 429]
+    busy = post(client, photo_id=photo, nonce="three")
+    for correction_id in made:
+        assert client.post(f"/v1/jobs/{correction_id}/cancel").status_code == 202
+    full = post(client, photo_id=photo, nonce="three")
 
-
-def test_requests_that_are_cancelled_and_asked_for_under_other_words_fill_no_table(
-    client: TestClient, photo: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("app.routes.photos.MAX_PHOTOS", 2)
-    for word in ("one", "two"):
-        made = post(client, photo_id=photo, nonce=word).json()["id"]
-        assert client.post(f"/v1/jobs/{made}/cancel").status_code == 202
-
-    refused = post(client, photo_id=photo, nonce="three")
-
-    assert refusal(refused) == (429, "quota_exceeded")
-    assert "2 corrections are stored, and 2 are allowed: delete some" in refused.json()["detail"]
-    client.delete(f"/v1/corrections/{made}")
+    assert refusal(busy) == refusal(full) == (429, "quota_exceeded")
+    assert "2 corrections are being worked on, 2 may be" in busy.json()["detail"]
+    assert "2 corrections are stored, and 2 are allowed: delete some" in full.json()["detail"]
+    client.delete(f"/v1/corrections/{made[0]}")
     assert post(client, photo_id=photo, nonce="three").status_code == 202
-
-
-def test_nothing_is_corrected_where_the_disk_is_full(
-    client: TestClient, photo: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    free = (settings.min_free_mb << 20) - 1
-    monkeypatch.setattr(services_of(client).storage, "free_bytes", lambda: free)
-
-    assert refusal(post(client, photo_id=photo)) == (507, "quota_exceeded")

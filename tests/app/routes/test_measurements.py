@@ -32,30 +32,7 @@ from lensmodel.photo.values import Encoding, PhotoInfo
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
 
 
-def place(number: int, channel: str = "g", **changed: Any) -> dict[str, Any]:
-    entry = {"idx": number, "row": 10, "col": 20, "side": 144, "r": 0.3, "phi": 0.1 * number}
-    return entry | {"settings": {"channel": channel}, "error": 0.04} | changed
-
-
-def answered(folder: Path, listed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Write samples with the fields of `listed`, which may be nonsense."""
-    kernel, estimator = gaussian(15, np.eye(2)), "measured-target/1"
-    write_samples(folder, [PsfSample(kernel, FieldPosition(0.0, 0.0), estimator=estimator) for _ in listed])
-    entries = json.loads((folder / SAMPLES).read_text())
-    written = [entry | own for entry, own in zip(entries, listed, strict=True)]
-    (folder / SAMPLES).write_text(json.dumps(written))
-    return listed
-
-
-def test_what_a_child_measured_becomes_patches_with_samples(tmp_path: Path) -> None:
-    patches, samples = _measured(answered(tmp_path, [place(0), place(0, "r"), place(1)]), tmp_path)
-    assert len(patches) == 2
-    assert [(number, sample.settings.channel, sample.error) for number, sample in samples] == [
-        (0, "g", 0.04),
-        (0, "r", 0.04),
-        (1, "g", 0.04),
-    ]
-    assert {sample.estimator for _, sample in samples} == {"measured-target/1"}
+PLACE = {"idx": 0, "row": 10, "col": 20, "side": 144, "r": 0.3, "phi": 0.1, "error": 0.04}
 
 
 class AtTwoPlaces:
@@ -106,13 +83,15 @@ def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.Monk
     ],
 )
 def test_nonsense_of_a_child_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
+    said = PLACE | {"settings": {"channel": "g"}} | changed
+    with pytest.raises(JobFailedError):  # it gave no kernels
+        _measured([said], tmp_path)
+    write_samples(tmp_path, [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.0, 0.0), estimator="any/1")])
+    (entry,) = json.loads((tmp_path / SAMPLES).read_text())
+    (tmp_path / SAMPLES).write_text(json.dumps([entry | said]))
+
     with pytest.raises(JobFailedError, match="gave no kernels"):
-        _measured(answered(tmp_path, [place(0, **changed)]), tmp_path)
-
-
-def test_a_measurement_without_kernels_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(JobFailedError):
-        _measured([place(0)], tmp_path)
+        _measured([said], tmp_path)
 
 
 def send(client: TestClient, steps: Steps, **fields: str) -> tuple[Any, str]:

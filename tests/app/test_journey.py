@@ -33,7 +33,10 @@ from running import (
 )
 from servers import free_port
 
+import lensmodel
 from lensmodel.core.psf import rms_width
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.model.profile import read_profile
 
 SIGMA = 1.3
 
@@ -279,3 +282,21 @@ def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(service: Service
     assert status == 0, service.log.read_text()[-4000:]
     assert (left, file_left) == ([], False)
     assert (job["state"], len(events)) == ("succeeded", 1), job
+
+
+@pytest.mark.parametrize("blank", [0, pytest.param(60, marks=pytest.mark.slow)])
+def test_page_and_terminal_learn_one_lens_from_one_file(blank: int, tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "first.dng", 0, blank=blank)
+    with running(tmp_path / "data", LENS_PATCHES="0") as alone:
+        address = f"/v1/lenses/{alone.calibrated(photo)['lens_id']}/profile"
+        page = read_profile(io.BytesIO(alone.http.get(address).content), "the profile of the page").model
+
+    terminal = lensmodel.calibrate([photo], workers=1).model
+
+    learned = [[(s.position, s.estimator) for s in model.samples] for model in (page, terminal)]
+    assert learned[0] == learned[1]
+    places = [FieldPosition(r, phi) for r in (0.0, 0.5, 0.9) for phi in (0.3, 2.6, -1.9)]
+    for channel in CHANNELS:
+        of = places, LensSettings(2.8, channel=channel), 31
+        apart = np.subtract(list(page.kernels(*of)), list(terminal.kernels(*of)))
+        assert np.abs(apart).sum(axis=(-2, -1)).max() < 1e-4  # L1 of kernels of sum 1

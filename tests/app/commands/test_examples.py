@@ -206,7 +206,7 @@ def environment(folder: Path) -> dict[str, str]:
     return {**kept, "PYTHONPATH": str(HERE), "HOME": str(folder)}
 
 
-@pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
+@pytest.mark.parametrize(
     "line",
     [
         pytest.param(line, id=line, marks=[] if line in QUICK else [pytest.mark.slow])

@@ -34,6 +34,7 @@ def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
     assert (key["owner"], key["scope"], key["label"], key["state"]) == ("anna", "read", "notebook", "valid")
     assert text.strip().split("_", 2)[2] not in str(key)
     run(tmp_path, "revoke", text.strip())
+    run(tmp_path, "create", "--owner", "ben")
 
     states = [key["state"] for key in json.loads(run(tmp_path, "list", "--owner", "anna", "--json")[0])]
     assert states == ["revoked"]

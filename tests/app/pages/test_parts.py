@@ -157,10 +157,6 @@ def corrected(
 unchanged = pytest.mark.parametrize("corrected", [True], indirect=True, ids=["unchanged"])
 
 
-def no_decoder(*_: Any) -> Any:
-    raise AssertionError("a picture is decoded beside the keys of all owners")
-
-
 def test_tiles_before_and_after_show_one_place_and_are_not_decoded(
     client: TestClient, corrected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,22 +166,16 @@ def test_tiles_before_and_after_show_one_place_and_are_not_decoded(
     paths += [f"{base}/after/{name}.jpg" for name in others]
 
     with monkeypatch.context() as patch:
-        patch.setattr(Image, "open", no_decoder)
-        patch.setattr(Image, "fromarray", no_decoder)
+        patch.delattr(Image, "open")  # beside the keys of all owners
+        patch.delattr(Image, "fromarray")
         answers = [client.get(path) for path in paths]
 
     assert [answer.status_code for answer in answers] == [200] * len(paths)
     shown = [np.asarray(Image.open(io.BytesIO(answer.content))).astype(float) for answer in answers]
     assert np.array_equal(shown[0], shown[1])
     assert shown[0][5, 5].min() > 245
-    assert [picture.shape[:2] for picture in shown[2:]] == [
-        (700 - 512, 1300 - 1024),
-        (350, 650 - 512),
-        (175, 325),
-        (700, 1300),
-        (170, 255),
-        (170, 255),
-    ]
+    sizes = [(700 - 512, 1300 - 1024), (350, 650 - 512), (175, 325), (700, 1300), (170, 255), (170, 255)]
+    assert [picture.shape[:2] for picture in shown[2:]] == sizes
     assert (shown[6][5, 5].min() > 245, shown[7][5, 5].max() < 60) == (True, True)
     missing = ("0/9_9", "3/0_0", "places/9")
     assert [client.get(f"{base}/after/{name}.jpg").status_code for name in missing] == [404] * 3
@@ -207,16 +197,6 @@ def test_tiles_that_a_child_wrote_wrongly_are_refused(
         for name in ("whole", "0/0_0"):
             answer = client.get(f"/ui/corrections/{corrected['id']}/tiles/after/{name}.jpg")
             assert answer.status_code == 409, (change, name)
-
-
-def test_a_corrected_dng_is_looked_at_and_its_audit_told(
-    client: TestClient, corrected: dict[str, Any]
-) -> None:
-    page = client.get(f"/corrections/{corrected['id']}").text
-
-    assert 'id="viewer"' in page
-    assert "10 % of the correction was held back over the whole photo." in page
-    assert '<rect x="200" y="0" width="100" height="100" fill-opacity="0.44"/>' in page
 
 
 def held_tiles(audit: dict[str, Any], height: int, width: int, orientation: int) -> list[list[int]]:
@@ -253,16 +233,19 @@ def test_what_was_held_back_is_drawn_once_and_turned_as_the_photo_is(orientation
     assert drawn.min() == drawn.max() == 1
 
 
-def test_the_page_of_a_photo_shows_its_correction(
+def test_pages_of_a_photo_and_of_its_correction_compare_it(
     client: TestClient, corrected: dict[str, Any], store: Store
 ) -> None:
-    photo = corrected["photo_id"]
+    correction_id, photo = corrected["id"], corrected["photo_id"]
     assert store.photos.set_state(photo, ("counted",), "counted", kind="jpeg")
-    page = client.get(f"/photos/{photo}").text
+    before, after = client.get(f"/photos/{photo}").text, client.get(f"/corrections/{correction_id}").text
 
-    assert f'data-after="/ui/corrections/{corrected["id"]}/tiles/after"' in page
-    assert f'href="/v1/corrections/{corrected["id"]}/result" download' in page
-    assert '<option value="jpeg" selected>' in page
+    for page in (before, after):
+        assert f'data-after="/ui/corrections/{correction_id}/tiles/after"' in page
+        assert f'href="/v1/corrections/{correction_id}/result" download' in page
+    assert '<option value="jpeg" selected>' in before
+    assert "10 % of the correction was held back over the whole photo." in after
+    assert '<rect x="200" y="0" width="100" height="100" fill-opacity="0.44"/>' in after
 
 
 @unchanged

@@ -53,8 +53,8 @@ def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Noted:
     return arrange
 
 
-def test_a_counted_photo_shows_its_lens_and_patches(client: TestClient, steps: Steps) -> None:
-    photo = steps.counted()
+def test_a_counted_photo_shows_its_lens_and_patches_and_no_serial(client: TestClient, steps: Steps) -> None:
+    photo = steps.counted(serial="SECRET-77")
 
     shown = get(client, f"photos/{photo.public_id}")
 
@@ -62,19 +62,12 @@ def test_a_counted_photo_shows_its_lens_and_patches(client: TestClient, steps: S
     assert shown["patches"] == {"total": 2, "done": 2, "rejected": 1}
     assert shown["links"]["lens"] == f"/v1/lenses/{shown['lens_id']}"
     assert (shown["width"], shown["focal_length_mm"], shown["pixel_pitch_um"]) == (6000, 24.0, 6.0)
+    assert "SECRET-77" not in str((shown, get(client, f"jobs/{photo.public_id}")))
     patches = get(client, f"photos/{photo.public_id}/patches")["items"]
     assert [(patch["state"], patch["reason"]) for patch in patches] == [
         *[("done", None)] * 2,
         ("rejected", "flat"),
     ]
-
-
-def test_no_answer_about_a_photo_holds_the_serial(client: TestClient, steps: Steps) -> None:
-    photo = steps.receive()
-    steps.inspect(photo, serial="SECRET-77")
-
-    for kind in ("photos", "jobs"):
-        assert "SECRET-77" not in client.get(f"/v1/{kind}/{photo.public_id}").text
 
 
 def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -> None:
@@ -105,8 +98,11 @@ def test_excluding_a_photo_takes_it_out_of_the_lens_and_back(client: TestClient,
     assert refusal(change(client, steps.receive(), excluded=True)) == (409, "conflict")
 
 
-def test_a_photo_that_was_stored_can_still_teach_its_lens(client: TestClient, steps: Steps) -> None:
-    photo = stored(steps)
+def test_a_photo_that_was_stored_can_still_teach_its_lens_unless_its_file_is_gone(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo, gone = stored(steps), stored(steps)
+    assert store.photos.give_up_file(gone.public_id, ())
 
     begun = change(client, photo, calibrate=True, aperture=2.8)
     again = change(client, photo, calibrate=True)  # nothing begins twice
@@ -116,17 +112,10 @@ def test_a_photo_that_was_stored_can_still_teach_its_lens(client: TestClient, st
     row = steps.fresh(photo)
     assert (row.epoch, row.given["aperture"]) == (photo.epoch + 1, 2.8)
     assert change(client, photo, calibrate=False).status_code == 422
-
-
-def test_a_photo_whose_file_is_gone_cannot_teach(client: TestClient, steps: Steps, store: Store) -> None:
-    photo = stored(steps)
-    assert store.photos.give_up_file(photo.public_id, ())
-
-    answer = change(client, photo, calibrate=True)
-
-    assert refusal(answer) == (409, "conflict")
-    assert "send the same file again" in answer.json()["detail"]
-    assert get(client, f"photos/{photo.public_id}")["calibrate"] is False
+    refused = change(client, gone, calibrate=True)
+    assert refusal(refused) == (409, "conflict")
+    assert "send the same file again" in refused.json()["detail"]
+    assert get(client, f"photos/{gone.public_id}")["calibrate"] is False
 
 
 @pytest.mark.parametrize("way", ["lens_id", "lens_serial", "new_lens"])

@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import typer
 
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.files import as_usage, refuse_existing
-from lensmodel.cli.options import Force, choice
+from lensmodel.cli.options import Force
 from lensmodel.core.types import StepHook
 
 PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")  # beside pictures and stored results
@@ -43,7 +43,6 @@ bench = typer.Typer(
 
 @bench.command()
 def gallery(
-    context: typer.Context,
     data: Annotated[
         Path | None, typer.Option(envvar=DATA, help="Folder of test data with real photos.")
     ] = None,
@@ -65,7 +64,7 @@ def gallery(
     """
     from lab.gallery import page, pictures  # noqa: PLC0415 - see the top of the module
 
-    shown, began = Display.of(context), time.monotonic()
+    shown, began = Display(), time.monotonic()
     with as_usage():
         known = [] if data is None else pictures.real_pictures(data)
         chosen = pictures.chosen([*known, *pictures.simulated_pictures(output / page.CACHE)], only or [])
@@ -86,7 +85,6 @@ def told(shown: Display, began: float) -> Callable[[str, int, int], None]:
 
 @bench.command()
 def blind(
-    context: typer.Context,
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = "0.01,0.003",
     methods: Annotated[
@@ -96,7 +94,7 @@ def blind(
     scenes: Annotated[
         int | None, typer.Option(min=1, help="Windows, from the photographs in turn; default: one of each.")
     ] = None,
-    half: Annotated[Half, choice("--half", get_args(Half), "Of photographs and PSFs.")] = "test",
+    half: Annotated[Half, typer.Option(help="Of photographs and PSFs.")] = "test",
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Output = BENCHMARK,
     force: Force = False,
@@ -118,7 +116,7 @@ def blind(
     """
     from lab.blind import benchmark  # noqa: PLC0415 - see the top of the module
 
-    shown = Display.of(context)
+    shown = Display()
     refuse_existing(*(output / name for name in benchmark.FILES), force=force)
     levels = tuple(_parts("--noise must be numbers such as 0.01,0.003", noise, float))
     with _bar(shown, "cases") as on_step:
@@ -132,7 +130,6 @@ def blind(
 
 @bench.command()
 def model(
-    context: typer.Context,
     seeds: Annotated[str, typer.Option(help="Of lenses, first:last, the last excluded.")] = "1000:1004",
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
@@ -147,7 +144,7 @@ def model(
     """
     from lab.model_benchmark import run_model_benchmark, table  # noqa: PLC0415 - see the top of the module
 
-    shown, words = Display.of(context), "give --seeds like 1000:1004 and --photos like 1,5"
+    shown, words = Display(), "give --seeds like 1000:1004 and --photos like 1,5"
     lenses, counts = range(*_parts(words, seeds, int, ":", 2)), _parts(words, photos, int)
     with _bar(shown, "fits") as on_step:
         named = None if methods is None else _names(methods)
@@ -157,7 +154,6 @@ def model(
 
 @bench.command()
 def correct(
-    context: typer.Context,
     photo: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A photo of yours; default: one of the library's.")
     ] = None,
@@ -185,7 +181,7 @@ def correct(
     from lensmodel.photo import develop  # noqa: PLC0415 - same
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
-    shown = Display.of(context)
+    shown = Display()
     if photo is not None and not photo.is_file():
         raise UsageError(f"no photo called {photo}; check the name and the folder")
     words = "--roi must be four whole numbers T,L,H,W"
@@ -202,10 +198,9 @@ def correct(
 
 
 def reproduce(
-    context: typer.Context,
     output: Output = Path("reproduction"),
     size: Annotated[
-        Size, choice("--size", get_args(Size), "Four lenses on small photos, or ten on 5 megapixels.")
+        Size, typer.Option(help="Four lenses on small photos, or ten on 5 megapixels.")
     ] = "default",
     lens: Annotated[
         list[str] | None,
@@ -230,7 +225,7 @@ def reproduce(
 
     Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 wrong usage.
     """
-    shown = Display.of(context)
+    shown = Display()
     refuse_existing(*(output / name for name in PAGE), force=force)
     from lab.reproduce.cases import planned  # noqa: PLC0415 - see the top of the module
     from lab.reproduce.job import run_reproduction  # noqa: PLC0415 - same

@@ -55,7 +55,6 @@ _SIDE: Final = 180  # pixels of a crop (chosen)
 
 
 def demo(
-    context: typer.Context,
     output: Annotated[
         Path,
         typer.Option(
@@ -76,7 +75,7 @@ def demo(
 
     Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 wrong usage.
     """
-    shown = Display.of(context)
+    shown = Display()
     _refuse_what_others_wrote(output, force=force)
     began = time.monotonic()
     improved = run(output, lambda text: shown.progress_line(text, time.monotonic() - began))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
 from app.commands.service import Data, opened
 from lensmodel.cli.ending import UsageError
-from lensmodel.cli.options import Json, choice
+from lensmodel.cli.options import Json
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -48,11 +48,9 @@ def create(
         str, typer.Option(metavar="NAME", help="Whose photos the key opens; a new owner is created.")
     ] = "local",
     scope: Annotated[
-        str,
-        choice(
-            "--scope",
-            ("read", "write", "admin"),
-            "What it allows: read only reads, write also changes, admin may also erase the account.",
+        Literal["read", "write", "admin"],
+        typer.Option(
+            help="What it allows: read only reads, write also changes, admin may also erase the account."
         ),
     ] = "write",
     expires: Annotated[
@@ -91,7 +89,7 @@ def create(
     with opened(data) as (_, store, _):
         text = store.accounts.create_key(
             name,
-            [scope],  # type: ignore[list-item]  # the option takes no other
+            [scope],
             label=label,
             lasts=lasts,
             quota_bytes=None if quota_gb is None else int(quota_gb * GIB),

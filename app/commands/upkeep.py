@@ -14,7 +14,6 @@ from lensmodel.cli.options import Json, Quiet
 
 
 def doctor(
-    context: typer.Context,
     data: Data = None,
     deep: Annotated[
         bool, typer.Option("--deep", help="Also read each photo and kernel, and compare checksums.")
@@ -34,7 +33,7 @@ def doctor(
     """
     from app.runtime.doctor import examine  # noqa: PLC0415 - the list of commands does not wait for it
 
-    shown = Display.of(context, quiet=quiet, as_json=json_output)
+    shown = Display(quiet=quiet, as_json=json_output)
     with opened(data, existing=True) as (settings, store, storage):
         findings = examine(settings, store, storage, deep=deep)
     if json_output:
@@ -48,7 +47,6 @@ def doctor(
 
 
 def backup(
-    context: typer.Context,
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Folder of the backup; an older one there is updated.")
     ],
@@ -71,7 +69,7 @@ def backup(
     """
     from app.runtime import backup as copies  # noqa: PLC0415 - the list of commands does not wait for it
 
-    shown = Display.of(context, quiet=quiet)
+    shown = Display(quiet=quiet)
     with opened(data, existing=True) as (_, store, storage), shown.progress("blobs") as bar:
         result = copies.backup(
             store.database, storage, folder, lambda done, total: bar.show(completed=done, total=total)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from lensmodel.blind import estimators
-from lensmodel.blind.sampling import PRESETS, CalibrationEvent, configured
+from lensmodel.blind.sampling import CalibrationEvent, configured
 from lensmodel.calibration import AHEAD, Calibration
 from lensmodel.cli import files, options
 from lensmodel.cli.console import Display
@@ -22,17 +22,14 @@ from lensmodel.patches import selectors
 
 
 def calibrate(
-    context: typer.Context,
     photos: options.Photos,
-    profile: options.Profile = None,
+    profile: options.Profile,
     aperture: options.Aperture = None,
     model: Annotated[
-        str | None,
-        options.choice(
-            "--model",
-            tuple(PRESETS),
-            "paper: the paper's method alone, for comparison: kernels by Michaeli and Irani, their "
-            "regression, and correction by Richardson-Lucy. A profile keeps its model.",
+        Literal["default", "paper"] | None,
+        typer.Option(
+            help="paper: the paper's method alone, for comparison: kernels by Michaeli and Irani, their "
+            "regression, and correction by Richardson-Lucy. A profile keeps its model."
         ),
     ] = None,
     estimator: Annotated[
@@ -75,19 +72,16 @@ def calibrate(
 
         lensmodel calibrate holiday --profile my-24mm.lensprofile
 
-        lensmodel calibrate 'holiday/*.dng' one-more.dng --profile my-24mm.lensprofile --workers 1
+        lensmodel calibrate holiday one-more.dng --profile my-24mm.lensprofile --workers 1
 
         lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
 
     Exit status: 0 all photos counted, 1 some did not, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
-    target = files.named(profile)
-    paths = files.photos(photos)
-    if others := files.passed_over(photos):
-        shown.note(f"passed over: {others}")
-    files.refuse_photo(target, paths)
-    store = files.ProfileFile(target, model, force=force)
+    shown = Display(quiet=quiet, verbose=verbose, as_json=json_output)
+    paths = files.photos(photos, shown.note)
+    files.refuse_photo(profile, paths)
+    store = files.ProfileFile(profile, model, force=force)
     with files.as_usage():
         config = configured(
             store.model,
@@ -121,7 +115,7 @@ def calibrate(
     failed = [result for result in results if result["state"] == "failed"]
     shown.document(
         {
-            "profile": str(target) if lens else None,
+            "profile": str(profile) if lens else None,
             "photos": photo_count,
             "samples": len(lens.samples) if lens else 0,
             "coverage": coverage,
@@ -132,7 +126,7 @@ def calibrate(
     if lens is not None and len(failed) < len(results):
         cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
         places = sum(coverage.values())
-        shown.result(f"{target}: photos {photo_count}, blur measured at {places} places ({cover})")
+        shown.result(f"{profile}: photos {photo_count}, blur measured at {places} places ({cover})")
     if lens is None:
         shown.error(
             "no photo could be used, so there is no profile; the lines above say what each photo needs"

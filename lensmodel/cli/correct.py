@@ -1,36 +1,70 @@
-"""`lensmodel correct`: remove the blur of the lens from photos."""
+"""`lensmodel correct`: remove the blur of a lens from photos, by its profile or one learned from them."""
 
 from __future__ import annotations
 
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Final, Literal
 
 import typer
+from rich import box
+from rich.markup import escape
+from rich.table import Table
 
-from lensmodel.cli import files, folder, options, outputs
-from lensmodel.cli.console import Display
-from lensmodel.cli.ending import UsageError
-from lensmodel.core.types import LensSettings
+import lensmodel
+from lensmodel.api import FORMATS, SEEN_DB
+from lensmodel.blind.sampling import CalibrationEvent, configured
+from lensmodel.calibration import Calibration
+from lensmodel.cli import files, options
+from lensmodel.cli.console import Bar, Display, gain_words
+from lensmodel.cli.ending import UsageError, reason
+from lensmodel.cli.groups import PhotoGroup, Shot, groups
+from lensmodel.core.errors import (
+    InvalidInputError,
+    LensModelError,
+    NotEnoughEvidenceError,
+    UnreadablePhotoError,
+)
+from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction import Bounds, deconvolvers
+from lensmodel.correction.audit import HELD
 from lensmodel.lens import Lens
-from lensmodel.photo import OutputFormat
+from lensmodel.model.identity import Identity, difference
+from lensmodel.photo import OutputFormat, PhotoMetadata, inspect
+from lensmodel.photo.values import CORRECTED
 
-# Panels of the options that --help-all adds
-LEARNING, CORRECTING, WRITING, RUNNING = "Learning (--lens auto)", "Correcting", "Writing", "Running"
+EXTENSION: Final[dict[OutputFormat | None, str]] = {None: ".tif", "tiff32": ".tif", "png8": ".png"} | {
+    written: ending for ending, written in reversed(FORMATS.items())
+}
+FOLDER: Final = "corrected"  # Default folder of results, beside the photos
+PROFILES: Final = "lenses"
+# Photos that a group is learned from: five are the advice (docs/guide.md), three more for other apertures
+# (chosen); each takes about a minute
+LEARN_FROM: Final = 8
+# Expected error of the PSFs from which on a small gain is for want of knowledge (chosen)
+_UNSURE: Final = 0.5
+_SAID: Final = 3  # photos of a group that are left for one reason and named (chosen); -v names all
+# Columns for the names of a group (chosen): with them the table fits a terminal of 80
+_LENS_WIDTH: Final = 26
+# Panels of the options that few people need
+LEARNING, CORRECTING = "Learning (--lens auto)", "Correcting"
 
 
 def correct(
-    context: typer.Context,
     photos: options.Photos,
     profile: Annotated[
         Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The profile of their lens.")
     ] = None,
     lens: Annotated[
-        str | None,
+        Literal["auto"] | None,
         typer.Option(
-            metavar="auto|ID",
             help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
-            "correct those that visibly gain.",
+            "correct those that visibly gain."
         ),
     ] = None,
     output: Annotated[
@@ -54,10 +88,8 @@ def correct(
     ] = 1.0,
     file_format: Annotated[
         OutputFormat | None,
-        options.choice(
-            "--format",
-            get_args(OutputFormat),
-            "dng: linear, for a raw converter. Default: by the name after -o, else tiff16.",
+        typer.Option(
+            "--format", help="dng: linear, for a raw converter. Default: by the name after -o, else tiff16."
         ),
     ] = None,
     aperture: options.Aperture = None,
@@ -67,59 +99,63 @@ def correct(
             "--force", help="Replace existing files; with --profile, correct JPEGs whatever they gain."
         ),
     ] = False,
+    any_lens: options.AnyLens = False,
+    keep_location: Annotated[
+        bool,
+        typer.Option(
+            "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
+        ),
+    ] = False,
+    workers: options.Workers = None,
+    json_output: options.Json = False,
+    quiet: options.Quiet = False,
+    verbose: options.Verbose = 0,
     profiles: Annotated[
         Path | None,
-        options.rare(
-            LEARNING,
+        typer.Option(
             metavar="DIR",
+            rich_help_panel=LEARNING,
             help="Folder of the lens profiles. Default: a folder `lenses` in the output.",
         ),
     ] = None,
     learn_from: Annotated[
         int,
-        options.rare(LEARNING, min=1, metavar="N", help="Learn from at most this many photos of each group."),
-    ] = folder.LEARN_FROM,
-    any_lens: Annotated[bool, options.rare(LEARNING, options.ANY_LENS)] = False,
+        typer.Option(
+            min=1,
+            metavar="N",
+            rich_help_panel=LEARNING,
+            help="Learn from at most this many photos of each group.",
+        ),
+    ] = LEARN_FROM,
     method: Annotated[
         str | None,
-        options.rare(
-            CORRECTING,
+        typer.Option(
             metavar="NAME",
+            rich_help_panel=CORRECTING,
             help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
         ),
     ] = None,
     halo: Annotated[
         float | None,
-        options.rare(
-            CORRECTING,
+        typer.Option(
             metavar="SHARE",
+            rich_help_panel=CORRECTING,
             help="How far results may go beyond the photo's own range beside edges, as a share of that "
             "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
         ),
     ] = None,
     texture: Annotated[
         float,
-        options.rare(
-            CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."
+        typer.Option(
+            metavar="0..1", rich_help_panel=CORRECTING, help="How much of its faint texture a photo keeps."
         ),
     ] = 1.0,
     denoise: Annotated[
         float,
-        options.rare(
-            CORRECTING, min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."
+        typer.Option(
+            metavar="0..1", rich_help_panel=CORRECTING, help="How much of the photo's grain to take away."
         ),
     ] = 0.0,
-    keep_location: Annotated[
-        bool,
-        options.rare(
-            WRITING, "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
-        ),
-    ] = False,
-    workers: Annotated[int | None, options.rare(RUNNING, options.WORKERS)] = None,
-    json_output: Annotated[bool, options.rare(RUNNING, options.JSON)] = False,
-    quiet: Annotated[bool, options.rare(RUNNING, options.QUIET)] = False,
-    verbose: options.Verbose = 0,
-    help_all: options.HelpAll = False,
 ) -> None:
     """Remove the blur of the lens from photos.
 
@@ -142,43 +178,307 @@ def correct(
 
     Exit status: 0 done, 1 some photos failed, 2 wrong usage.
     """
-    del help_all
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
-    if halo is not None and not halo >= 0.0:
-        raise UsageError(f"--halo must not be negative, got {halo:g}")
+    shown = Display(quiet=quiet, verbose=verbose, as_json=json_output)
     if (profile is None) == (lens is None):
         raise UsageError(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
         )
-    if profile is None and lens != "auto":
-        raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
-    targets, twice = outputs.targets_of(files.photos(photos), output, file_format)
-    if others := files.passed_over(photos):
-        shown.note(f"passed over: {others}")
+    targets = targets_of(files.photos(photos, shown.note), output, file_format)
     with files.as_usage():  # before any work
         if method is not None:
             deconvolvers.create(method)
         LensSettings(aperture=aperture)
-    clashed = outputs.clashes(twice, shown)
-    given = {
-        "aperture": aperture,
-        "method": method,
-        "strength": strength,
-        "bounds": Bounds(halo, texture, denoise),
-        "file_format": file_format,
-        "keep_location": keep_location,
-        "workers": workers,
-    }
-    correction = outputs.Correction(targets, given, profile is None, any_lens, force, shown)
-    document: dict[str, Any] = {"profile": str(profile)}
+        given = {
+            "aperture": aperture,
+            "method": method,
+            "strength": strength,
+            "bounds": Bounds(halo, texture, denoise),
+            "file_format": file_format,
+            "keep_location": keep_location,
+            "workers": workers,
+        }
+    correction = Correction(targets, given, profile is None, any_lens, force, shown)
     if profile is None:
-        base = next(iter([*targets.values(), *twice])).parent
-        document = folder.correct_folder(correction, profiles or base / folder.PROFILES, learn_from)
+        base = next(iter(targets.values())).parent
+        document = correct_groups(correction, profiles or base / PROFILES, learn_from)
     else:
         known = Lens(files.profile_at(profile))
         with shown.progress(total=len(targets)) as bar:
-            document["results"] = correction.photos(list(targets), known, bar)
-    document["results"][:0] = clashed
+            results = correction.photos(list(targets), known, bar)
+        document = {"profile": str(profile), "results": results}
     shown.document(document)
     if any(result["state"] == "failed" for result in document["results"]):
         raise typer.Exit(1)
+
+
+def targets_of(
+    paths: Sequence[Path], output: str | None, file_format: OutputFormat | None
+) -> dict[Path, Path]:
+    """Return the file that each photo becomes.
+
+    `output` is that file itself where there is one photo and the name ends as a picture's does; where it ends
+    in a separator or is a folder already, it is a folder.
+    """
+    extension = EXTENSION[file_format]
+    if output is not None and len(paths) == 1 and _names_a_picture(output):
+        target = Path(output)
+        if file_format is not None and EXTENSION[FORMATS[target.suffix.lower()]] != extension:
+            raise UsageError(f"{target.name} is no name for --format {file_format}; end it in {extension}")
+        return {paths[0]: target}
+    targets = {}
+    for path in paths:
+        folder = path.parent / FOLDER if output is None else Path(output)
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"{folder} is a file; give a folder to -o")
+        targets[path] = folder / f"{path.stem}{CORRECTED}{extension}"
+    return targets
+
+
+def _names_a_picture(output: str) -> bool:
+    return (
+        Path(output).suffix.lower() in FORMATS and not output.endswith(os.sep) and not Path(output).is_dir()
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What a run of the command is to do with its photos."""
+
+    targets: Mapping[Path, Path]  # which file each photo becomes
+    options: Mapping[str, Any]  # of `lensmodel.correct`
+    sorted: bool  # by their lens; only those that gain are corrected
+    any_lens: bool
+    force: bool
+    display: Display
+    refused: dict[Path, LensModelError | OSError] = field(default_factory=dict)  # photos that taught nothing
+
+    def photos(
+        self, paths: Sequence[Path], lens: Lens | None, bar: Bar, *, begin: int = 0, more: bool = False
+    ) -> list[dict[str, Any]]:
+        """Correct the photos of a lens, one after the other; return what became of each, and tell it."""
+        results: list[dict[str, Any]] = []
+        tell = self.display.detail if self.sorted else self.display.note
+        left: Counter[str] = Counter()
+        for number, path in enumerate(paths, start=begin):
+            bar.show(description=f"correcting {path.name}", more=more)
+            target = self.targets[path]
+            result = self._photo(path, target, lens, partial(bar.part, number, more=more))
+            match result["state"]:
+                case "failed":
+                    self.display.error(f"{path}: {result['reason']}")
+                case "left":
+                    left[result["reason"]] += 1
+                    few = left[result["reason"]] <= _SAID
+                    (self.display.note if few else tell)(f"{path}: left as it is: {result['reason']}")
+                case "kept":
+                    tell(f"{target} is there already and was left alone; --force replaces it")
+                case _:
+                    if self.sorted:
+                        tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
+                    else:
+                        self.display.result(str(target))
+                    for remark in _remarks(result):
+                        tell(f"{path.name}, {remark}")
+            results.append({"photo": str(path), "output": str(target), **result})
+            bar.show(completed=number + 1, more=more)
+        return results
+
+    def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
+        """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
+        refused = self.refused.get(path)
+        little = refused is None or isinstance(refused, NotEnoughEvidenceError)
+        if isinstance(refused, UnreadablePhotoError) or (lens is None and refused is not None and not little):
+            return files.failed(refused)
+        if lens is None:
+            return {"state": "left", "reason": "no photo of its lens shows enough to learn the blur from"}
+        try:
+            if path.stem.endswith(CORRECTED):
+                raise InvalidInputError("it was corrected already; give the original")
+            if list(self.targets.values()).count(target) > 1:
+                raise InvalidInputError(
+                    f"another photo would become {target} too; correct them into different folders"
+                )
+            if target.exists() and not self.force:
+                return {"state": "kept"}
+            info = inspect(path)
+            self._require_lens(path, info.metadata, lens)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            lossy = info.kind == "jpeg"
+            least = SEEN_DB if self.sorted or (lossy and not self.force) else None
+            corrected = lensmodel.correct(
+                path, lens, target, least_gain_db=least, on_step=on_step, **self.options
+            )
+        except (LensModelError, OSError) as error:
+            return files.failed(error)
+        result = {
+            "state": "corrected",
+            "expected_gain_db": corrected.expected_gain_db,
+            "zones": corrected.zones,
+            "nothing_to_correct": corrected.nothing_to_correct,
+            "audit": corrected.audit,
+            "chroma_step": corrected.chroma_step,
+        }
+        if least is not None and corrected.expected_gain_db < least:
+            insist = "" if self.sorted else "; --force corrects it all the same"
+            result |= {"state": "left", "reason": f"{_why_left(corrected, lossy=lossy)}{insist}"}
+        return result
+
+    def _require_lens(self, path: Path, said: PhotoMetadata, lens: Lens) -> None:
+        """Refuse a photo of another lens, unless it is asked for; tell what the photo does not say."""
+        identity = Identity.of(said)
+        if why := difference(Identity.of_profile(lens.profile), identity):
+            why = f"it seems to be of another lens: {why}"
+            if not (self.any_lens or self.force):
+                raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
+            self.display.note(f"{path}: {why}; it is corrected all the same, as you asked")
+        elif not identity.names_lens and not self.sorted:  # else it was sorted by its camera
+            self.display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
+        if self.options["aperture"] is None and said.aperture is None:
+            self.display.note(
+                f"{path} does not say its aperture; all apertures of the profile are taken together"
+            )
+
+
+def _why_left(corrected: lensmodel.Corrected, *, lossy: bool) -> str:
+    """Say in a sentence why a photo is not worth correcting."""
+    zones = corrected.zones.values()
+    error = sum(zone.cells * zone.psf_error for zone in zones) / max(sum(zone.cells for zone in zones), 1)
+    why = (
+        "not enough is known about its lens yet; take more photos that are full of detail"
+        if error > _UNSURE
+        else "the camera has sharpened and compressed it, and no more can be restored safely"
+        if lossy
+        else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
+    )
+    return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
+
+
+def _remarks(result: Mapping[str, Any]) -> Iterator[str]:
+    """Say where nothing was done, where the audit held back more than a tenth, and where colour is coarse."""
+    if result["nothing_to_correct"]:
+        yield "nothing to correct: its pixels stayed as they were"
+        return
+    for zone, audit in result["audit"].zones.items():
+        if audit.held_back > HELD and audit.checks:
+            most = sorted(audit.checks, key=lambda name: -audit.checks[name])[:3]
+            part = f"{audit.held_back:.0%} of the correction was held back"
+            yield f"{ZONE_WORDS[zone]}: {part} ({', '.join(most)})"
+    rows, cols = result["chroma_step"]
+    if max(rows, cols) > 1:
+        yield (
+            f"the JPEG stores one colour for {rows} x {cols} pixels: "
+            "brightness is corrected pixel by pixel, colour no more finely than that"
+        )
+
+
+# --- photos sorted by their lens ---------------------------------------------------------------
+
+
+def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[str, Any]:
+    """Learn the lens of every group of photos, correct those that gain, and tell what became of each.
+
+    Lens profiles go to `profiles`; each group is learned from `most` photos.
+    """
+    shots: list[Shot] = []
+    results: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
+    display = correction.display
+    for path in correction.targets:
+        try:
+            shots.append(Shot.of(path))
+        except (LensModelError, OSError) as error:
+            results.append({"photo": str(path), "output": None, **files.failed(error)})
+            display.error(f"{path}: {reason(error)}")
+    lens_groups, unread = groups(shots), len(results)
+    counts = [min(most, group.scenes) for group in lens_groups]
+    with display.progress("learning", sum(counts) + len(shots)) as bar:
+        begins = accumulate(counts, initial=0)
+        learned = [
+            _learn(group, profiles, count, correction, bar, begin)
+            for group, count, begin in zip(lens_groups, counts, begins, strict=False)
+        ]
+        for group, count in zip(lens_groups, learned, strict=True):
+            target = group.profile_in(profiles)
+            lens = Lens(files.profile_at(target)) if target.exists() else None
+            begin = sum(counts) + len(results) - unread
+            more = group is not lens_groups[-1]  # photos of another kind, which may be left or take longer
+            done = correction.photos(group.paths, lens, bar, begin=begin, more=more)
+            results += done
+            rows.append(_row(group, None if lens is None else target, count, done))
+    if rows:
+        display.result(table_of(rows))
+    for row in rows:
+        if row["learned_from"] == 1:
+            display.note(
+                f"{row['camera']}, {row['lens']}: learned from one photo; with five or more its blur is "
+                "known better, and scenes do not pass for it"
+            )
+    if any(row["corrected"] for row in rows):
+        where = ", ".join(sorted({str(target.parent) for target in correction.targets.values()}))
+        display.note(f"corrected photos are in {where}, lens profiles in {profiles}")
+    return {"groups": rows, "results": results}
+
+
+def _learn(group: PhotoGroup, profiles: Path, most: int, correction: Correction, bar: Bar, begin: int) -> int:
+    """Learn the lens of a group; return from how many photos, now or in an earlier run."""
+    display, counted = correction.display, 0
+
+    def on_event(event: CalibrationEvent) -> None:
+        text = f"learning from {event.photo.name}: {event.stage}"
+        bar.part(begin + counted, event.done, event.total, description=text, more=True)
+
+    store = files.ProfileFile(group.profile_in(profiles))
+    config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
+    calibration = Calibration(store, config, any_lens=correction.any_lens)
+    paths = [shot.path for shot in group.to_learn_from()]
+    for event in calibration.learn(paths, on_event=on_event):
+        if event.error is None:
+            counted += 1
+        else:
+            correction.refused[event.photo] = event.error
+            display.detail(f"{event.photo}: {event.error}")
+        if counted == most:
+            break
+    bar.show(completed=begin + most, more=True)
+    refused = [correction.refused.get(path) for path in paths]
+    if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
+        reasons = set(map(str, refused))
+        why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
+        display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from{why}")
+    return counted
+
+
+def _row(
+    group: PhotoGroup, profile: Path | None, learned: int, results: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Say what became of the photos of a group."""
+    states = Counter(result["state"] for result in results)
+    gains = [result["expected_gain_db"] for result in results if result["state"] == "corrected"]
+    return {
+        "camera": group.camera,
+        "lens": group.lens,
+        "focal_length": group.focal,
+        "profile": None if profile is None else str(profile),
+        "photos": len(group.shots),
+        "learned_from": learned,
+        "corrected": states["corrected"],
+        "corrected_before": states["kept"],
+        "left": states["left"],
+        "failed": states["failed"],
+        "expected_gain_db": sum(gains) / len(gains) if gains else None,  # of this run
+    }
+
+
+def table_of(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """Return the table of groups, which fits a terminal of 80 columns."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("camera, lens, focal length", max_width=_LENS_WIDTH)
+    for head in ("photos", "learned\nfrom", "corrected", "left", "failed", "expected\ngain"):
+        table.add_column(head, justify="right")
+    for row in rows:
+        gain = row["expected_gain_db"]
+        corrected = row["corrected"] + row["corrected_before"]
+        counts = row["photos"], row["learned_from"], corrected, row["left"], row["failed"]
+        names = ", ".join((row["camera"], row["lens"], row["focal_length"]))
+        table.add_row(escape(names), *map(str, counts), "" if gain is None else gain_words(gain))
+    return table

@@ -1,11 +1,7 @@
-"""How a command ends when it cannot do what was asked.
+"""How a command ends when it cannot do what was asked, or is told to stop.
 
-Ctrl-C and SIGTERM end a command at once and leave nothing half done.
-
-The signal becomes an exception in the main thread, so that each `with` and `finally` on the way
+Ctrl-C and SIGTERM become an exception in the main thread, so that each `with` and `finally` on the way
 removes what is unfinished. Worker processes are killed first: pools wait for what they began.
-
-Which extra of the package brings a module that is missing.
 """
 
 from __future__ import annotations
@@ -19,7 +15,7 @@ import time
 from types import FrameType
 from typing import Final
 
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError
 
 
 class UsageError(InvalidInputError):
@@ -67,14 +63,11 @@ def _end_workers(number: int) -> None:
     os._exit(128 + number)
 
 
-def words_of(error: LensModelError | ModuleNotFoundError | OSError) -> str:
-    """Say why a command failed and what helps; nothing where that is a fault of the program."""
-    if isinstance(error, ModuleNotFoundError):
-        return remedy(error) or ""
-    if isinstance(error, LensModelError):
-        return str(error)
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}; check the path, its rights and the disk"
+def reason(error: Exception) -> str:
+    """Say why something could not be done and what helps; the system's errors in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the path, its rights and the disk"
+    return str(error)
 
 
 def remedy(missing: ModuleNotFoundError) -> str | None:

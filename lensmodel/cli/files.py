@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import glob
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
 from lensmodel.calibration import LensStore
-from lensmodel.cli.ending import UsageError
+from lensmodel.cli.ending import UsageError, reason
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.lens import Lens
 from lensmodel.model import LensProfile, load_profile
@@ -25,65 +24,46 @@ NOT_READ: Final = frozenset(
 _PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
 
 
-def photos(names: Iterable[str]) -> list[Path]:
-    """Turn files, folders and patterns into a list of photos without repeats.
+def photos(names: Iterable[Path], note: Callable[[str], None]) -> list[Path]:
+    """Turn files and folders into a list of photos without repeats; note what is passed over in folders.
 
-    Of one shot the RAW file counts, and no other picture of it. Of folders and patterns, corrected photos are
-    left out.
+    Of one shot the RAW file counts, and no other picture of it. Of folders, corrected photos are left out.
     """
     unique: dict[Path, None] = {}
-    for name in names:
-        path = Path(name).expanduser()
+    for path in names:
         if path.is_dir():
-            inside = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
-            matches = _originals(inside)
-            if not matches:
-                others = passed_over([name])
+            found, others = _originals(path), _passed_over(path)
+            if not found:
                 raise UsageError(
-                    f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
+                    f"no photo in the folder {path}; give one that holds RAW, TIFF, PNG or JPEG files"
                     + (f" (passed over: {others})" if others else "")
                 )
+            if others:
+                note(f"passed over: {others}")
+            unique.update(dict.fromkeys(found))
         elif path.is_file():
-            matches = [path]
+            unique[path] = None
         else:
-            matches = _originals(Path(p) for p in glob.glob(_pattern(path), recursive=True))  # noqa: PTH207 - absolute patterns too
-            if not matches:
-                raise UsageError(f"no photo called {name}; check the name and the folder")
-        unique.update(dict.fromkeys(matches))
+            raise UsageError(f"no photo called {path}; check the name and the folder")
     raw = {_shot(p) for p in unique if p.suffix.lower() in RAW_ENDINGS}
     return [p for p in unique if p.suffix.lower() in RAW_ENDINGS or _shot(p) not in raw]
 
 
-def passed_over(names: Iterable[str]) -> str:
-    """Say which pictures of folders are not taken for their kind, and which folders inside hold photos."""
-    folders = [path for path in (Path(name).expanduser() for name in names) if path.is_dir()]
-    inside = [path for folder in folders for path in folder.iterdir() if not path.name.startswith(".")]
+def _originals(folder: Path) -> list[Path]:
+    """Return the photos of a folder by name, without those that were corrected."""
+    photos = (p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+    return sorted(p for p in photos if p.is_file() and not p.stem.endswith(CORRECTED))
+
+
+def _passed_over(folder: Path) -> str:
+    """Say which pictures of a folder are not taken for their kind, and which folders inside hold photos."""
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     kinds = Counter(path.suffix[1:].upper() for path in inside if path.suffix.lower() in NOT_READ)
     said = [f"{kind} files, which are not read: {count}" for kind, count in sorted(kinds.items())]
-    deeper = [f"the photos in {path}: name it too" for path in sorted(inside) if _holds_photos(path)]
-    return "; ".join([*said, *deeper])
-
-
-def _holds_photos(path: Path) -> bool:
-    with suppress(OSError):  # no folder, or one of the system's, as `lost+found` of a memory card
-        return bool(_originals(each for each in path.iterdir() if each.suffix.lower() in ENDINGS))
-    return False
-
-
-def _originals(paths: Iterable[Path]) -> list[Path]:
-    return sorted(p for p in paths if p.is_file() and not p.stem.endswith(CORRECTED))
-
-
-def _pattern(path: Path) -> str:
-    """Take the part of a pattern that is there, such as a folder "[2024] trip", by its letters."""
-    there = next(parent for parent in (path, *path.parents) if parent.is_dir() or parent == parent.parent)
-    rest = str(path.relative_to(there))
-    if path.suffix.lower() in ENDINGS:  # cameras write them in capitals, people in small letters
-        ending = (
-            f"[{letter.lower()}{letter.upper()}]" if letter.isalpha() else letter for letter in path.suffix
-        )
-        rest = rest.removesuffix(path.suffix) + "".join(ending)
-    return str(Path(glob.escape(str(there))) / rest)
+    for path in inside:
+        with suppress(OSError):  # no folder, or one of the system's, as `lost+found` of a memory card
+            said += [f"the photos in {path}: name it too"] if _originals(path) else []
+    return "; ".join(said)
 
 
 def _shot(path: Path) -> tuple[Path, str]:
@@ -92,16 +72,6 @@ def _shot(path: Path) -> tuple[Path, str]:
     if Path(stem).suffix.lower() in RAW_ENDINGS:  # IMG_1.CR2.jpg
         stem = Path(stem).stem
     return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
-
-
-def named(profile: Path | None) -> Path:
-    """Where the lens is written; it has no usual place, since a person may have several."""
-    if profile is None:
-        raise UsageError(
-            "add --profile and the name of a file, for example --profile my-24mm.lensprofile: "
-            "what is learned of the lens is written there"
-        )
-    return profile
 
 
 def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
@@ -117,23 +87,13 @@ def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
         )
 
 
-def profile_at(path: Path, *, replaceable: bool = False) -> LensProfile:
-    """Open a profile; one that is not `replaceable` is only read."""
-    if path.is_dir():
-        raise UsageError(f"{path} is a folder; give the file of a lens profile")
+def profile_at(path: Path) -> LensProfile:
+    """Open a profile."""
     if not path.exists():
         raise UsageError(
             f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
         )
-    try:
-        return load_profile(path)
-    except InvalidInputError as error:
-        if not replaceable:
-            raise
-        with path.open("rb") as file:
-            damaged = file.read(2) == b"PK"  # a ZIP file, as profiles are
-        remedy = "--force replaces the file" if damaged else "name a new file after --profile"
-        raise InvalidInputError(f"{error}; {remedy}") from error
+    return load_profile(path)
 
 
 class ProfileFile(LensStore):
@@ -155,7 +115,7 @@ class ProfileFile(LensStore):
         stamp = _stamp(self._target)
         if stamp in {None, self._stamp_read}:
             return self._lens
-        lens = Lens(profile_at(self._target, replaceable=True))
+        lens = Lens(profile_at(self._target))
         learned = lens.model.mode
         if self._wanted not in {None, learned}:  # its kernels are the other model's: both would be mixed
             raise InvalidInputError(
@@ -181,10 +141,10 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def refuse_existing(*paths: Path | None, force: bool) -> None:
+def refuse_existing(*paths: Path, force: bool) -> None:
     """Make sure, before any work, that nothing is replaced that the user did not give up."""
     for path in paths:
-        if path is not None and not force and path.exists():
+        if not force and path.exists():
             raise UsageError(f"{path} is there already; --force replaces it")
 
 
@@ -195,15 +155,6 @@ def as_usage() -> Iterator[None]:
         yield
     except InvalidInputError as error:
         raise UsageError(str(error)) from error
-
-
-def reason(error: Exception) -> str:
-    """Say why a file could not be used; the system's errors in words."""
-    if isinstance(error, OSError) and error.strerror:
-        return (
-            f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the file, its folder and their rights"
-        )
-    return str(error)
 
 
 def failed(error: LensModelError | OSError) -> dict[str, Any]:

@@ -130,11 +130,6 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def configure(
-    context: typer.Context,
-    verbose: Annotated[
-        int, typer.Option("-v", "--verbose", count=True, help="More log lines; twice: all.")
-    ] = 0,
-    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="No progress, only errors.")] = False,
     version: Annotated[
         bool,
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
@@ -142,9 +137,7 @@ def configure(
 ) -> None:
     """Learn the blur of one copy of a lens from ordinary photos, and remove it."""
     del version
-    shown = Display(quiet, verbose)
-    shown.configure()
-    context.obj = shown
+    Display()
 
 
 def main() -> None:
@@ -158,8 +151,11 @@ def main() -> None:
             f"stopped by {name}; finished files are kept, nothing is half-written",
             128 + stopped.number,
         )
-    except (LensModelError, ModuleNotFoundError, OSError) as error:
-        text, status = ending.words_of(error), 2 if isinstance(error, UsageError) else 1
+    except (LensModelError, OSError) as error:
+        where = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
+        text, status = where + ending.reason(error), 2 if isinstance(error, UsageError) else 1
+    except ModuleNotFoundError as error:
+        text, status = ending.remedy(error) or "", 1
         if not text:
             raise
     else:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import typer
 
@@ -13,38 +13,23 @@ from lensmodel import measured as measuring
 from lensmodel.blind.sampling import configured
 from lensmodel.calibration import Admit, Calibration
 from lensmodel.cli import files, options
-from lensmodel.cli.console import Display, PacedProgress
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, places_of
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import develop
 
-KINDS: Final = ("target", "pair", "points", "edges")
-# What comes before the first place, by the way of measuring
-PREPARING: Final = {
-    "target": "finding the page",
-    "pair": "aligning the photos",
-    "points": "finding the points",
-    "edges": "finding the edges",
-}
-PAPERS: Final = ("a2", "a3", "a4", "letter", "tabloid")
 # Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo
 USUAL_DETAIL: Final = 4000
 
 
 def measure(
-    context: typer.Context,
     kind: Annotated[
-        str,
-        typer.Argument(
-            metavar=f"<{'|'.join(KINDS)}>",
-            parser=options.one_of("measure", KINDS),
-            help="What the photos show.",
-        ),
+        Literal["target", "pair", "points", "edges"], typer.Argument(help="What the photos show.")
     ],
     photos: options.Photos,
-    profile: options.Profile = None,
+    profile: options.Profile,
     aperture: options.Aperture = None,
     size: Annotated[
         int,
@@ -83,71 +68,54 @@ def measure(
 
     Exit status: 0 all photos were used, 1 some were not, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
-    target = files.named(profile)
-    paths = files.photos(photos)
-    files.refuse_photo(target, paths)
+    shown = Display(quiet=quiet, verbose=verbose, as_json=json_output)
+    paths = files.photos(photos, shown.note)
+    files.refuse_photo(profile, paths)
     with files.as_usage():
         groups = measuring.measurements_of(kind, paths)
-        store = files.ProfileFile(target)
+        store = files.ProfileFile(profile)
         config = configured(store.model, LensSettings(aperture=aperture))
         calibration = Calibration(store, config, any_lens=any_lens, replace=replace_blind)
     results: list[dict[str, Any]] = []
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):
-            on_step = partial(_show_step, bar, group[0].name, kind, number, len(groups))
-            on_step(0, 1)
-            method = partial(
+            bar.show(description=f"{group[0].name}: measuring", more=True)
+            sampler = partial(
                 measuring.samples_of_developed,
                 kind,
                 settings=config.settings,
                 size=size,
-                on_step=on_step,
+                on_step=partial(bar.part, number),
             )
+            result: dict[str, Any]
             try:
-                result = _added(calibration, group, method)
+                result = _added(calibration, group, sampler)
             except (LensModelError, OSError) as error:
-                result = {"state": "failed", "reason": files.reason(error)}
+                result = files.failed(error)
                 shown.error(f"{group[0]}: {result['reason']}")
             results.append({"photos": [str(path) for path in group], **result})
-            bar.show(description=f"{group[0].name}: {result['state']}", completed=number + 1)
-    shown.document({"profile": str(target) if target.exists() else None, "results": results})
-    for result in results:
-        if result["state"] == "measured":
-            shown.result(
-                f"{target}: {result['places']} places measured on {Path(result['photos'][0]).name} "
-                f"({result['estimator']}), expected error of a PSF {result['error']:.2f}"
-            )
-        elif result["state"] == "known":
-            shown.note(f"{result['photos'][0]}: the profile has it already")
+            bar.show(completed=number + 1)
+            if result["state"] == "measured":
+                shown.result(
+                    f"{profile}: {result['places']} places measured on {group[0].name} "
+                    f"({result['estimator']}), expected error of a PSF {result['error']:.2f}"
+                )
+            elif result["state"] == "known":
+                shown.note(f"{group[0]}: the profile has it already")
+    shown.document({"profile": str(profile) if profile.exists() else None, "results": results})
     if any(result["state"] == "failed" for result in results):
         raise typer.Exit(1)
 
 
-def _show_step(
-    bar: PacedProgress, name: str, kind: str, number: int, photos: int, done: int, total: int
-) -> None:
-    """Show how far photo `number` is; `done` 0 is before its first place."""
-    bar.part(
-        number,
-        done,
-        total,
-        description=f"{name}: {'measuring' if done else PREPARING[kind]}",
-        # the pace of a single photo is that of its places: reading it and finding the page has another
-        more=done == 0 and photos == 1,
-    )
-
-
 def _added(
-    calibration: Calibration, group: Sequence[Path], method: Callable[..., list[PsfSample]]
+    calibration: Calibration, group: Sequence[Path], sampler: partial[list[PsfSample]]
 ) -> dict[str, Any]:
     """Measure on the photos of one measurement and add to the lens; say what became of it."""
     samples: list[PsfSample] = []
 
     def measured(key: str, admit: Admit) -> list[PsfSample]:
         first = develop(group[0], on_info=lambda info: admit(info.metadata))
-        photos = [first, *map(develop, group[1:])]
-        samples.extend(method(photos, photo_id=key))
+        samples.extend(sampler([first, *map(develop, group[1:])], photo_id=key))
         return samples
 
     if calibration.add(group[0], measured) is None:
@@ -163,13 +131,13 @@ def _added(
 
 
 def target(
-    context: typer.Context,
     output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf.")],
     edges: Annotated[
         bool, typer.Option("--edges", help="35 dark squares, for `lensmodel measure edges`.")
     ] = False,
     paper: Annotated[
-        str, options.choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")
+        Literal["a2", "a3", "a4", "letter", "tabloid"],
+        typer.Option(help="Size of the paper, in landscape orientation."),
     ] = "a3",
     detail: Annotated[
         int,
@@ -180,8 +148,6 @@ def target(
         ),
     ] = USUAL_DETAIL,
     force: options.Force = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
 ) -> None:
     """Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.
 
@@ -191,8 +157,6 @@ def target(
 
         lensmodel target target.pdf
 
-        lensmodel target target.pdf --paper a4 --detail 2800
-
         lensmodel target squares.pdf --edges --paper letter
 
     Exit status: 0 written, 1 failed, 2 wrong usage.
@@ -200,15 +164,12 @@ def target(
     # takes long
     from lensmodel.measured import DETAILS, TargetPage, print_chart, print_target  # noqa: PLC0415
 
-    shown = Display.of(context, quiet=quiet, verbose=verbose)
     if detail not in DETAILS:
         raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
-    if output.is_dir():
-        raise UsageError(f"{output} is a folder; name a file ending in .pdf")
     files.refuse_existing(output, force=force)
     with files.as_usage():
         if edges:
             print_chart(output, paper=paper)
         else:
             print_target(output, TargetPage(detail), paper=paper)
-    shown.result(str(output))
+    Display().result(str(output))

@@ -20,7 +20,6 @@ from lensmodel.core.geometry import zone_of
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.psf import rms_width
 from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings
-from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
@@ -35,13 +34,12 @@ from lensmodel.report import (
 from lensmodel.report import export as write_psfs
 from lensmodel.report.tables import to_csv
 
-Aperture = Annotated[float | None, options.aperture_option("f-number; default: the widest that a photo had.")]
+Aperture = Annotated[float | None, options.aperture("f-number; default: the widest that a photo had.")]
 
 FORMS: Final = (".pdf", ".png", ".csv", ".json")
 
 
 def report(
-    context: typer.Context,
     profile: options.ProfileFile,
     output: Annotated[
         Path | None,
@@ -65,10 +63,7 @@ def report(
             help="A photo of this lens on which lateral colour is measured; may be repeated; needs --output.",
         ),
     ] = None,
-    json_output: options.Json = False,
     force: options.Force = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
 ) -> None:
     """Say how sharp a lens is, whether it is centred, and which photo would help most.
 
@@ -84,12 +79,9 @@ def report(
 
         lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile
 
-        lensmodel report my-24mm.lensprofile --json
-
     Exit status: 0 reported, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
-    targets = _targets(output)
+    shown, targets = Display(), _targets(output)
     if photo and output is None:
         raise UsageError("--photo needs --output: what it adds is written to files")
     files.refuse_existing(*targets, force=force)
@@ -101,7 +93,6 @@ def report(
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
     compared = None if against is None else compare(found, measured(against, aperture, [], whole=False))
-    shown.document(found if compared is None else to_json(found) | {"comparison": compared})
     at = found.tested[0].at or "unknown aperture"
     lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
     lines += [] if compared is None else [f"- {compared}"]
@@ -157,15 +148,16 @@ def _written(found: LensReport, form: str) -> bytes:
 
 
 def export(
-    context: typer.Context,
     profile: options.ProfileFile,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Where to write: a file.")],
-    file_format: Annotated[
-        str | None,
+    output: Annotated[
+        Path,
         typer.Option(
-            "--format", metavar=f"<{'|'.join(exporters)}>", help="Default: by the ending of the file name."
+            "--output",
+            "-o",
+            metavar="FILE",
+            help=f"Where to write: a file that ends in .{', .'.join(exporters)}.",
         ),
-    ] = None,
+    ],
     aperture: Aperture = None,
     channel: options.Channel = "g",
     rows: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Rows of the grid of places.")] = 5,
@@ -175,10 +167,7 @@ def export(
     r: Annotated[float | None, options.RADIUS] = None,
     phi: Annotated[float | None, options.ANGLE] = None,
     size: options.Size = 31,
-    json_output: options.Json = False,
     force: options.Force = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
 ) -> None:
     """Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.
 
@@ -186,68 +175,42 @@ def export(
 
         lensmodel export my-24mm.lensprofile -o my-24mm.npz
 
-        lensmodel export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json
-
-        lensmodel export my-24mm.lensprofile --aperture 2 -o wide-open.npz
+        lensmodel export my-24mm.lensprofile --aperture 2 --r 0.9 --phi 0.6 -o corner-for-art.json
 
     Exit status: 0 written, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
-    written = _format(output, file_format)
+    shown, file_format = Display(), output.suffix.lower().removeprefix(".")
+    if file_format not in exporters:
+        raise UsageError(f"give a name that ends in .{', .'.join(exporters)}, got {output.name}")
     files.refuse_existing(output, force=force)
     if phi is not None and r is None:
         raise UsageError("--phi needs --r: together they name a single place")
-    with files.as_usage():
-        place = None if r is None else FieldPosition(r, phi or 0.0)
+    place = None if r is None else FieldPosition(r, phi or 0.0)
     with shown.progress("computing its PSFs"):
         model = files.profile_at(profile).model
+        with files.as_usage():
+            settings = widest(model) if aperture is None else LensSettings(aperture=aperture)
         psfs = psf_grid(
             model,
-            _settings(model, aperture, channel),
+            settings.with_channel(channel),
             rows=rows,
             cols=cols,
             size=size,
             aspect=filled_aspect(model),
             at=place,
         )
-    write_psfs(output, psfs, written)
-    shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
+    write_psfs(output, psfs, file_format)
     shown.result(str(output))
 
 
-def _format(output: Path, named: str | None) -> str:
-    """Tell the format by the option and by the ending of the file; they must not contradict each other."""
-    ending = output.suffix.lower().removeprefix(".")
-    chosen = named or ending
-    if chosen not in exporters:
-        raise UsageError(
-            f"no export format {chosen!r}; add --format, or give a name that ends in "
-            + ", ".join(f".{name}" for name in exporters)
-        )
-    if ending in exporters and ending != chosen:
-        raise UsageError(
-            f"{output.name} ends as {ending} does, but --format says {chosen}; change one of them"
-        )
-    return chosen
-
-
-def _settings(model: LensModel, aperture: float | None, channel: options.Channel) -> LensSettings:
-    with files.as_usage():
-        chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
-    return chosen.with_channel(channel)
-
-
 def psf(
-    context: typer.Context,
     profile: options.ProfileFile,
     r: Annotated[float, options.RADIUS] = 0.0,
     phi: Annotated[float, options.ANGLE] = 0.0,
-    aperture: Annotated[float | None, options.aperture_option("f-number; default: all together.")] = None,
+    aperture: Annotated[float | None, options.aperture("f-number; default: all together.")] = None,
     channel: options.Channel = "g",
     size: options.Size = 55,
     json_output: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = 0,
 ) -> None:
     """Show what the lens makes of a point of light at one place in the picture.
 
@@ -261,14 +224,20 @@ def psf(
 
     Exit status: 0 answered, 1 the profile cannot be used, 2 wrong usage.
     """
-    shown = Display.of(context, quiet=quiet, verbose=verbose, as_json=json_output)
+    shown = Display(as_json=json_output)
     with files.as_usage():
         place = FieldPosition(r, phi)
         settings = LensSettings(aperture=aperture, channel=channel)
     with shown.progress("computing the PSF"):
         answer = files.profile_at(profile).model.query(place, settings, size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
-    shown.result(_psf_words(place, answer, tangential, sagittal))
+    shown.result(
+        f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
+        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; "
+        f"photos: {answer.photos}, {answer.effective_samples:.1f} effective samples, expected error "
+        f"{answer.predicted_error:.2f}{' (beyond what the photos cover)' if answer.extrapolated else ''}; "
+        f"answered by {answer.answered_by}"
+    )
     support = ("effective_samples", "photos", "extrapolated", "predicted_error", "nearest", "answered_by")
     shown.document(
         {
@@ -278,15 +247,4 @@ def psf(
             "mtf50": {"tangential": tangential, "sagittal": sagittal},
             "psf": {"shape": list(answer.kernel.shape), "dtype": "float32", "data": answer.kernel.tolist()},
         }
-    )
-
-
-def _psf_words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
-    beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
-    photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
-    return (
-        f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
-        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; "
-        f"{photos}, {answer.effective_samples:.1f} effective samples, expected error "
-        f"{answer.predicted_error:.2f}{beyond}; answered by {answer.answered_by}"
     )

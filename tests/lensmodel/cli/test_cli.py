@@ -27,6 +27,7 @@ import rawpy
 import tifffile
 from deadline import Deadline, stretched
 from PIL import ExifTags, Image
+from rich.progress import Task
 from running import SMALL, scene, write_photo
 from scipy import ndimage
 from typer.testing import CliRunner
@@ -34,8 +35,9 @@ from typer.testing import CliRunner
 from lab.kernels import gaussian
 from lensmodel import photo
 from lensmodel.blind import sampling
-from lensmodel.cli import files, outputs
-from lensmodel.cli.console import EVERY_S, Pace, PacedProgress
+from lensmodel.cli import files
+from lensmodel.cli.console import EVERY_S, Bar
+from lensmodel.cli.correct import targets_of
 from lensmodel.cli.main import app
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -58,7 +60,7 @@ Here = Callable[..., subprocess.CompletedProcess[str]]
 def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
     """Run `main` in this process, in that folder: saves two seconds of imports where nothing is lost."""
     # a command that is quick says nothing of its progress, and a busy machine makes none slow
-    monkeypatch.setitem(PacedProgress.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
+    monkeypatch.setitem(Bar.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
     return partial(in_process.lensmodel, cwd=folder)
 
 
@@ -195,14 +197,10 @@ def test_a_name_that_ends_as_a_pictures_is_a_file_and_any_other_a_folder(
     assert photo.inspect(folder / written).kind == ("jpeg" if written.endswith(".JPG") else "tiff")
 
 
-def test_of_several_photos_the_output_is_a_folder_whatever_its_name(made: Path) -> None:
-    targets, twice = outputs.targets_of([made / "a.dng", made / "b.dng"], "out.tif", None)
+def test_of_several_photos_the_output_is_a_folder_whatever_its_name() -> None:
+    targets = targets_of([Path("a.dng"), Path("b.dng")], "out.tif", None)
 
-    assert [str(target) for target in targets.values()] == [
-        "out.tif/a-corrected.tif",
-        "out.tif/b-corrected.tif",
-    ]
-    assert not twice
+    assert list(map(str, targets.values())) == ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]
 
 
 def test_two_photos_that_would_become_one_file_are_named_and_the_rest_is_done(
@@ -217,7 +215,7 @@ def test_two_photos_that_would_become_one_file_are_named_and_the_rest_is_done(
 
     states = {Path(r["photo"]).name: r["state"] for r in json.loads(done.stdout)["results"]}
     assert states == {"a.jpg": "failed", "a.png": "failed", "b.dng": "corrected"}
-    assert (done.returncode, one_sentence(done.stderr).count("a.")) == (1, 2)
+    assert (done.returncode, done.stderr.count("another photo would become")) == (1, 2)
     assert [p.name for p in (folder / "holiday" / "corrected").iterdir()] == ["b-corrected.tif"]
 
 
@@ -235,29 +233,23 @@ SHOTS = {
 
 
 @pytest.mark.parametrize("case", SHOTS)
-@pytest.mark.parametrize("given", ["folder", "[2024] trip/*", "all"])
+@pytest.mark.parametrize("given", ["folder", "files"])
 def test_raw_and_other_files_of_one_shot_are_one_photo(case: str, given: str, tmp_path: Path) -> None:
     names, expected = SHOTS[case]
-    trip = tmp_path / "[2024] trip"
-    trip.mkdir()
     for name in names:
-        (trip / name).touch()
-    words = {
-        "folder": [str(trip)],
-        "[2024] trip/*": [f"{trip}/*"],
-        "all": [str(trip / name) for name in names],
-    }
+        (tmp_path / name).touch()
 
-    found = files.photos(words[given])
+    found = files.photos([tmp_path] if given == "folder" else [tmp_path / name for name in names], print)
 
-    if given == "all" and case == "corrected":  # who names it will be told
+    if given == "files" and case == "corrected":  # who names it will be told
         expected = names
     assert sorted(path.name for path in found) == sorted(expected)
 
 
 def test_a_folder_inside_that_cannot_be_read_stops_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "a.dng").touch()
     for name in ("lost+found", "more"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.dng").touch()
@@ -270,52 +262,18 @@ def test_a_folder_inside_that_cannot_be_read_stops_nothing(
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
 
-    assert files.passed_over([str(tmp_path)]) == f"the photos in {tmp_path / 'more'}: name it too"
+    assert files.photos([tmp_path], print) == [tmp_path / "a.dng"]
+    assert capsys.readouterr().out == f"passed over: the photos in {tmp_path / 'more'}: name it too\n"
 
 
-@pytest.mark.parametrize(
-    "pattern",
-    ["[2024] trip/*.dng", "[2024] trip/[ab].dng", "[2024]*/a.dng", "[[]2024] trip/a.dng", "**/a.dng"],
-)
-def test_patterns_find_their_files_in_folders_whose_names_look_like_patterns(
-    pattern: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "[2024] trip").mkdir()
-    (tmp_path / "[2024] trip" / "a.dng").touch()
-    (tmp_path / "2 x").mkdir()
-    monkeypatch.chdir(tmp_path)
-
-    if pattern == "[2024]*/a.dng":  # a pattern after all: of folders that begin with one of these digits
-        (tmp_path / "2 x" / "a.dng").touch()
-    assert [path.name for path in files.photos([pattern])] == ["a.dng"]
-
-
-@pytest.mark.parametrize("pattern", ["*.dng", "*.DNG", "IMG_?.Dng", "**/*.dng", "IMG_[12].dng"])
-def test_patterns_take_the_endings_of_photos_in_any_letters(pattern: str, tmp_path: Path) -> None:
-    names = ["IMG_1.DNG", "IMG_2.dng"]
-    for name in (*names, "IMG_3.dngx"):
-        (tmp_path / name).touch()
-
-    assert sorted(path.name for path in files.photos([str(tmp_path / pattern)])) == names
-
-
-def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
-    words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
-    here(*words, "-o", "plain", "--strength", "0")
-    here(*words, "-o", "free", "--halo", "inf")
-    done = here(*words, "-o", "bound", "--halo", "0", "--denoise", "1")
+def test_what_a_photographer_allows_reaches_the_correction(folder: Path, here: Here) -> None:
+    words = ("--method", "fast", "--halo", "0", "--texture", "0.5", "--denoise", "1")
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", "bound.tif", *words)
 
     assert done.returncode == 0, done.stderr
-    with tifffile.TiffFile(folder / "bound/one-corrected.tif") as file:
-        assert "method fast, strength 1, halo 0, denoised 1" in file.pages[0].description
-        assert "profile of 1 photo," in file.pages[0].description
-    plain, free, bound = (
-        tifffile.imread(folder / name / "one-corrected.tif").astype(float)
-        for name in ("plain", "free", "bound")
-    )
-    low, high = (f(plain, (5, 5, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    assert np.mean((free < low - 50) | (free > high + 50)) > 0.01
-    assert np.mean((bound < low - 50) | (bound > high + 50)) < 0.001
+    with tifffile.TiffFile(folder / "bound.tif") as file:
+        said = file.pages[0].description
+    assert "profile of 1 photo, method fast, strength 1, halo 0, texture 0.5, denoised 1" in said
 
 
 def test_corrected_dng_opens_as_raw_and_without_a_terminal_standard_error_stays_empty(
@@ -394,8 +352,6 @@ def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
 # --- refusals ----------------------------------------------------------------------------------
 
 REFUSED = {
-    "nowhere to write": (["calibrate", "one.dng"], 2, "^lensmodel: add --profile and the name of"),
-    "nowhere to measure into": (["measure", "edges", "one.dng"], 2, "^lensmodel: add --profile and the name"),
     "half a pair": (
         ["measure", "pair", "one.dng", "-p", "new"],
         2,
@@ -416,21 +372,15 @@ REFUSED = {
     ),
     "no profile": (["correct", "one.dng", "-p", "gone", "-o", "out"], 2, "no lens profile at gone; make it"),
     "bad profile": (["correct", "one.dng", "-p", "bad", "-o", "out"], 1, "bad is no lens profile"),
-    "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile.*--force"),
+    "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile"),
     "profile is a photo": (
         ["calibrate", "one.dng", "-p", "sub/one.dng", "--force"],
         2,
         "one.dng is a photo; name a new file after --profile",
     ),
     "profile is the photo": (["calibrate", "there.npy", "-p", "there.npy", "--force"], 2, "npy is a photo"),
-    "no profile to add to": (
-        ["calibrate", "one.dng", "-p", "there.npy"],
-        1,
-        "no lens profile.*new file after",
-    ),
     "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
     "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
-    "negative halo": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "-1"], 2, "must not be neg"),
     "halo that is none": (
         ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "nan"],
         2,
@@ -440,11 +390,6 @@ REFUSED = {
         ["correct", "one.dng", "-p", PROFILE, "-o", "o.png", "--format", "jpeg"],
         2,
         "o.png is no name for --format jpeg; end it in .jpg",
-    ),
-    "nearly a format": (
-        ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--format", "tiff"],
-        2,
-        "must be tiff16, .* or dng, got 'tiff'; did you mean tiff16",
     ),
     "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
     "unknown estimator": (
@@ -457,34 +402,15 @@ REFUSED = {
         2,
         "known: .*good-regions",
     ),
-    "unknown channel": (["export", PROFILE, "-o", "new.npz", "--channel", "x"], 2, "r, g or b"),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
-    "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 1, "would both"),
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
-    "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),
     "aperture in words": (["psf", PROFILE, "--aperture", "wide"], 2, "such as 2.8 or f/2.8, got 'wide'"),
-    "no such size": (
-        ["reproduce", "--size", "huge"],
-        2,
-        "--size must be quick or default, got 'huge'",
-    ),
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
     "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
     "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
-    "unknown half": (["bench", "blind", "--half", "x"], 2, "--half must be dev, test or all, got 'x'"),
     "report there": (["report", PROFILE, "-o", "reported"], 2, "report.csv is there already; --force"),
-    "export format": (
-        ["export", PROFILE, "-o", "new.bmp", "--format", "bmp"],
-        2,
-        "'bmp'; add .* .fits, .json",
-    ),
     "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .fits, .json"),
-    "export by two formats": (
-        ["export", PROFILE, "-o", "new.fits", "--format", "npz"],
-        2,
-        "fits does, .* npz",
-    ),
     "half a place": (["export", PROFILE, "-o", "new.npz", "--phi", "1"], 2, "--phi needs --r"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
     "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
@@ -521,11 +447,12 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
 
 
 def test_unknown_options_and_settings_are_wrong_usage(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
-    option = here("calibrate", "one.dng", "--profil", "x")
+    wrong = ["--profil", "x"], ["-p", "x", "--model", "papers"], []
+    options = [here("calibrate", "one.dng", *words) for words in wrong]
     monkeypatch.setenv("LENS_PROT", "9000")
     setting = here("serve")
 
-    assert option.returncode == setting.returncode == 2
+    assert [done.returncode for done in (*options, setting)] == [2] * 4
     assert "did you mean LENS_PORT" in one_sentence(setting.stderr)
 
 
@@ -768,7 +695,7 @@ def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
 def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(
     on_a_terminal: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Pace, "left", lambda *_: 83.0)  # the photo is too quick for any to be told
+    monkeypatch.setattr(Task, "time_remaining", 83.0)  # the photo is too quick for any to be told
     said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]

@@ -1,4 +1,4 @@
-"""What commands say: numbers in words, tables, progress without a terminal, completion of the shell."""
+"""What commands say: numbers in words, progress without a terminal, completion of the shell."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from running import SMALL, write_photo
 
 from lab.kernels import gaussian
 from lensmodel.cli import console
-from lensmodel.cli.console import Display, Pace, PacedProgress, aligned, clock, mtf50_words
-from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.cli.console import Bar, Display, clock, mtf50_words
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, StepHook
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 
 @pytest.mark.parametrize(
@@ -31,99 +30,35 @@ def test_an_mtf50_beyond_what_pixels_show_is_a_lower_bound(frequency: float, wor
     assert mtf50_words(frequency) == words
 
 
-def test_columns_are_in_line_and_numbers_to_the_right() -> None:
-    text = aligned(["lens", "photos"], [["a", "7"], ["longer name", "12"]], numbers={1})
-
-    assert text.splitlines() == [
-        "lens         photos",
-        "-----------  ------",
-        "a                 7",
-        "longer name      12",
-    ]
-
-
-def test_a_cell_may_have_several_lines() -> None:
-    text = aligned(["lens", "learned\nfrom"], [["a long\nname", "7"], ["b", "12"]], numbers={1})
-
-    assert text.splitlines() == [
-        "lens    learned",
-        "           from",
-        "------  -------",
-        "a long        7",
-        "name",
-        "b            12",
-    ]
-
-
 def test_without_a_terminal_progress_is_told_in_lines() -> None:
     said: list[str] = []
-    with PacedProgress("learning from a.dng", 4, say=said.append, every_s=0.0, disable=True) as bar:
+    with Bar("learning from a.dng", 4, say=said.append, every_s=0.0, disable=True) as bar:
+        bar.show(completed=1)
+    with Bar("quick work", 1, say=said.append, disable=True) as bar:
         bar.show(completed=1)
 
     assert said == ["[0:00]  25 % learning from a.dng"]
 
 
-def test_time_left_is_told_by_the_pace_of_the_last_kind_of_work_and_no_share_falls(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_time_left_is_told_by_the_pace_of_the_last_kind_of_work_and_no_share_falls() -> None:
     said: list[str] = []
-    clock_s = iter((0.0, 60.0, 120.0, 121.0, 124.0, 127.0))
-    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock_s))
-    bar = PacedProgress("photos", 10, say=said.append, every_s=0.0, disable=True)
-    for done, more in ((1.8, True), (1, True), (2, False), (3, False), (4, False)):  # one passed over
+    now = [0.0]
+    bar = Bar("photos", 10, say=said.append, every_s=0.0, disable=True, get_time=lambda: now[0])
+    for at, done, more in (
+        (60, 1.8, True),
+        (70, 1, True),
+        (130, 3, False),
+        (140, 4, False),
+    ):  # one passed over
+        now[0] = at
         bar.show(completed=done, more=more)
 
     assert said == [
         "[1:00]  18 % photos",
-        "[2:00]  18 % photos",
-        "[2:01]  20 % photos",
-        "[2:04]  30 % photos",
-        "[2:07]  40 % photos, about 0:18 left",
+        "[1:10]  18 % photos",
+        "[2:10]  30 % photos",
+        "[2:20]  40 % photos, about 1:00 left",
     ]
-
-
-PACES = {
-    "even": lambda s: s / 100,
-    "a slow start": lambda s: 0.01 * min(s, 20) / 20 + 0.99 * max(s - 20, 0) / 80,
-    "a slow end": lambda s: 0.6 * min(s, 50) / 50 + 0.4 * max(s - 50, 0) / 50,
-    "whole photos": lambda s: (s // 10) / 10,
-    "two photos": lambda s: (s // 50) / 2,
-}
-
-
-@pytest.mark.parametrize("pace", PACES)
-def test_no_time_left_is_told_before_it_is_right_within_a_factor_of_two(pace: str) -> None:
-    past, told = Pace(), []
-    for tenth in range(900):
-        past.mark(tenth / 10, PACES[pace](tenth / 10), 1.0)
-        left = past.left(tenth / 10)
-        told += [] if left is None else [left / (100 - tenth / 10)]
-
-    assert all(0.5 <= ratio <= 2.0 for ratio in told)
-    assert told or pace == "two photos"
-
-
-def test_time_left_of_a_measurement_is_told_by_the_pace_of_its_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now_s = [0.0]
-
-    def measure(*_: Any, on_step: StepHook, **given: Any) -> list[PsfSample]:
-        for second in (20.0, 40.0, 60.0):
-            now_s[0] = second
-            on_step(0, 1)  # the page is looked for
-        for place in range(1, 11):
-            now_s[0] += 2.0
-            on_step(place, 40)
-        raise NotEnoughEvidenceError("no more of it is needed")
-
-    write_photo(tmp_path / "page.dng", 1, shape=SMALL)
-    monkeypatch.setattr(console.time, "monotonic", lambda: now_s[0])
-    monkeypatch.setattr("lensmodel.measured.samples_of_developed", measure)
-    done = lensmodel("measure", "target", "page.dng", "--profile", "a.lensprofile", cwd=tmp_path)
-
-    assert "[0:20]   0 % page.dng: finding the page" in done.stderr.splitlines()
-    assert "[1:10]  12 % page.dng: measuring, about 1:10 left" in done.stderr.splitlines()
 
 
 def test_a_measurement_and_its_report_count_the_same_places(
@@ -156,29 +91,21 @@ def test_that_loops_are_compiled_is_said_in_words_above_the_bar(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    Display().configure()
+    Display()
     with monkeypatch.context() as redirected:
-        redirected.setattr(sys, "stderr", io.StringIO())  # as `PacedProgress` does
+        redirected.setattr(sys, "stderr", io.StringIO())  # as `Bar` does
         logging.getLogger(console.COMPILING).info("compiling, about %d s", 30)
         assert sys.stderr.getvalue() == "lensmodel: compiling, about 30 s\n"  # type: ignore[attr-defined]
     assert capsys.readouterr().err == ""
 
 
 def test_a_record_that_cannot_be_printed_ends_no_work(capsys: pytest.CaptureFixture[str]) -> None:
-    Display().configure()
+    Display()
     logging.getLogger("other").warning("%d photos", "no number")
     logging.getLogger(console.REMARKS).warning("the next one")
     said = capsys.readouterr().err
     assert "Logging error" in said
     assert said.endswith("lensmodel: the next one\n")
-
-
-def test_quick_work_says_nothing() -> None:
-    said: list[str] = []
-    with PacedProgress("a", 1, say=said.append, disable=True) as bar:
-        bar.show(completed=1)
-
-    assert said == []
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(7.9, "0:07"), (247, "4:07"), (3847, "1:04:07")])

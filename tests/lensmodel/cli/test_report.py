@@ -71,20 +71,13 @@ def test_the_report_speaks_of_sharpness_centring_aperture_and_the_next_photo(fol
         assert words in text
 
 
-def test_the_report_as_json_reads_back(folder: Path) -> None:
-    stored = json.loads(run("report", NAME, "--json", "--aperture", "5.6"))
-
-    report = from_json(LensReport, stored)
-    assert report.tested[0].settings.aperture == 5.6
-    assert report.advice
-
-
 def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, green_alone: None) -> None:
     run("report", NAME, "-o", "out")
 
     names = {p.name for p in (folder / "out").iterdir()}
     assert names == {f"report.{ending}" for ending in ("pdf", "png", "csv", "json")}
     stored = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
+    assert from_json(LensReport, stored).advice
     with (folder / "out" / "report.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
     found = [row for row in rows if row["aperture"] == "2" and row["direction"] == "sagittal"]
@@ -100,12 +93,8 @@ def test_a_name_that_ends_as_a_form_is_that_file_alone(folder: Path, green_alone
     assert (folder / "out" / "mine.pdf").read_bytes().startswith(b"%PDF-")
 
 
-def test_two_copies_are_compared_in_words_and_in_json(folder: Path, green_alone: None) -> None:
-    told = run("report", NAME, "--against", NAME)
-    stored = json.loads(run("report", NAME, "--against", NAME, "--json"))
-
-    assert f"- {stored['comparison']}\n" in told
-    assert "about the same in the centre" in stored["comparison"]
+def test_two_copies_are_compared_in_words(folder: Path, green_alone: None) -> None:
+    assert "about the same in the centre" in run("report", NAME, "--against", NAME)
 
 
 def test_the_page_says_what_it_rests_on_and_names_a_maker_once() -> None:

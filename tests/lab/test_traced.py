@@ -41,11 +41,6 @@ def linear_field(f_number: float = 2.8) -> GridField:
     return GridField(axis, kernels, centers, facts)
 
 
-def test_repository_has_traced_lenses_within_bounds() -> None:
-    assert len(GRIDS) >= 2
-    assert max(path.stat().st_size for path in GRIDS) < 300 * 1024
-
-
 @pytest.mark.parametrize("path", GRIDS, ids=lambda path: path.stem)
 def test_kernels_of_a_grid_are_kernels(path: Path) -> None:
     grid = read_grid(path)
@@ -70,6 +65,7 @@ def test_traced_lenses_differ_between_corners_and_channels(path: Path) -> None:
     assert distance(np.fliplr(corners[1]), corners[0]).rel_l2 > 0.05
     assert distance(corners[0], center["g"]).rel_l2 > 0.15
     assert distance(center["r"], center["b"]).rel_l2 > 0.05
+    assert path.stat().st_size < 300 * 1024
 
 
 def test_node_comes_back_as_it_was_stored_and_up_is_up() -> None:
@@ -87,7 +83,7 @@ def test_grid_between_nodes_is_near_the_truth() -> None:
     assert distance(kernel, wanted).rel_l2 < 0.01
 
 
-def test_grid_survives_its_file(tmp_path: Path) -> None:
+def test_grid_survives_its_file_and_files_of_another_form_are_refused(tmp_path: Path) -> None:
     field = linear_field()
     field.write(tmp_path / "a.npz")
     again = read_grid(tmp_path / "a.npz")
@@ -95,33 +91,27 @@ def test_grid_survives_its_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.kernels, field.kernels)
     assert again.facts == field.facts
 
-
-def test_files_of_another_form_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", format=np.array(99))
     with pytest.raises(InvalidInputError, match="format 99"):
         read_grid(tmp_path / "a.npz")
 
 
-def test_point_light_becomes_the_kernel_of_its_place() -> None:
-    lens, frame = GridLens(linear_field()), Frame(120, 160)
+def points_at(*places: tuple[int, int]) -> np.ndarray:
+    """A frame of points of light behind the lens."""
     scene = np.zeros((3, 134, 174), dtype=np.float32)
-    scene[:, 7 + 30, 7 + 120] = 1.0
+    for row, col in places:
+        scene[:, 7 + row, 7 + col] = 1.0
     options = BlurOptions(size=15, step=0.25)
-    image = blurred(scene, lens, LensSettings(), frame, options)
-    expected = lens.field().kernel_at(frame.position(30, 120), "g", 15)
+    return blurred(scene, GridLens(linear_field()), LensSettings(), Frame(120, 160), options)
+
+
+def test_point_light_becomes_the_kernel_of_its_place_and_red_lies_further_out() -> None:
+    image, frame = points_at((30, 120), (60, 140)), Frame(120, 160)
+    expected = linear_field().kernel_at(frame.position(30, 120), "g", 15)
+    red, green = (centroid(image[c, 53:68, 133:148].astype(np.float64)) for c in (0, 1))
 
     np.testing.assert_allclose(image[1, 23:38, 113:128], expected, atol=2e-3)
-
-
-def test_lateral_colour_moves_red_outwards() -> None:
-    lens, frame = GridLens(linear_field()), Frame(120, 160)
-    scene = np.zeros((3, 134, 174), dtype=np.float32)
-    scene[:, 7 + 60, 7 + 140] = 1.0
-    image = blurred(scene, lens, LensSettings(), frame, BlurOptions(size=15, step=0.25))
-    red, green = (centroid(image[c, 53:68, 133:148].astype(np.float64)) for c in (0, 1))
-    r = frame.position(60, 140).r
-
-    assert red[1] - green[1] == pytest.approx(0.8 * r, abs=0.02)
+    assert red[1] - green[1] == pytest.approx(0.8 * frame.position(60, 140).r, abs=0.02)
     assert red[0] - green[0] == pytest.approx(0.0, abs=0.02)
 
 

@@ -67,13 +67,6 @@ def test_every_update_lowers_the_free_energy() -> None:
         energy = after_noise
 
 
-def test_scaling_scene_against_kernel_changes_no_free_energy() -> None:
-    y, kernel = shot(stroke(), side=72).astype(np.float64), stroke()
-    found = PatchPosterior.of(y, 13, kernel, FLOOR).improved(kernel, 4)
-
-    assert free_energy(found.scaled(2.0), kernel / 2.0) == pytest.approx(free_energy(found, kernel), rel=1e-5)
-
-
 def test_products_with_the_convolution_are_each_others_transposes() -> None:
     rng = np.random.default_rng(0)
     grid = Grid((20, 27), 5)

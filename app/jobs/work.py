@@ -424,6 +424,8 @@ def _remove_place(context: JobContext, photo: PhotoRow, path: Path, wanted: Want
                     digest = hashlib.file_digest(file, "sha256").hexdigest()
                 new = {"key": f"{photo.folder}cleaned-{digest[:16]}", "digest": digest}
                 context.storage.put(new["key"], cleaned)
+            elif said == "removed":  # without a copy that is without it
+                said = "unknown"
     except JobFailedError as error:
         log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
     context.store.photos.record_location(photo, said, **new)

@@ -26,6 +26,7 @@ from app.blobs.storage import Storage
 from app.http import views
 from app.jobs import tasks
 from app.jobs.answers import (
+    CLEANED,
     CORRECTED,
     INSPECTED,
     KERNELS,
@@ -377,11 +378,13 @@ def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(bench: Bench
     assert names == [opened.public_id, closed.public_id]
 
 
-def test_a_lost_file_and_a_pair_whose_closed_photo_is_gone_are_told_of(bench: Bench) -> None:
-    lost, pair = bench.received(), bench.received(kind="pair", reference_id="gone")
+def test_a_lost_file_and_a_pair_whose_closed_photo_is_gone_or_another_owners_are_told_of(
+    bench: Bench,
+) -> None:
+    theirs, lost = Steps(bench.store, "somebody else").receive().public_id, bench.received()
     bench.storage.delete(lost.folder)
 
-    for photo in (lost, pair):
+    for photo in (lost, *(bench.received(kind="pair", reference_id=key) for key in ("gone", theirs))):
         failed = bench.work(photo)
         assert (failed.state, failed.error_code) == ("failed", "unknown_photo")
 
@@ -608,7 +611,8 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
 
     def cancelled_meanwhile(blob: str, path: Path) -> None:
         put(blob, path)
-        bench.store.jobs.cancel(key, ANY_OWNER)
+        if blob.startswith("corrections/"):
+            bench.store.jobs.cancel(key, ANY_OWNER)
 
     monkeypatch.setattr(bench.storage, "put", cancelled_meanwhile)
     bench.correct(key)
@@ -705,8 +709,14 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(benc
     assert bench.sandbox.ran == ["locate"]  # once
 
 
-def test_a_file_that_cannot_be_searched_is_processed_nevertheless(bench: Bench) -> None:
-    bench.let("locate", refused("time_limit"))
+def torn(arguments: dict[str, Any], folder: Path) -> Outcome:
+    (folder / CLEANED).write_bytes(b"of another length")
+    return ok({"location": "removed"})
+
+
+@pytest.mark.parametrize("answer", [refused("time_limit"), torn])
+def test_a_file_that_cannot_be_searched_is_processed_nevertheless(bench: Bench, answer: Answer) -> None:
+    bench.let("locate", answer)
 
     photo = bench.work()
 

@@ -10,10 +10,9 @@ import socket
 import subprocess
 import sys
 import tempfile
-import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -69,32 +68,25 @@ def read_pid(path: Path) -> int:
     return int(until(lambda: path.exists() and path.read_text(), within_s=20))
 
 
-def test_a_task_hands_over_json_and_files(sandbox: Sandbox) -> None:
-    seen: list[tuple[int, int]] = []
-
-    def note(done: int, total: int) -> None:
-        seen.append((done, total))
-
+def test_a_task_hands_over_json_and_files_and_sees_nothing_of_the_services_environment(
+    sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LENS_DATABASE_URL", "postgresql://user:secret@host/db")
+    seen: list[tuple[int, ...]] = []
+    numbers: Any = {"a": [1, 2], "b": [10, 20]}
     with sandbox.folder() as folder:
-        numbers: Any = {"a": [1, 2], "b": [10, 20]}
-        outcome = sandbox.run("add", numbers, folder=folder, limits=LIMITS, on_progress=note)
+        outcome = sandbox.run(
+            "add", numbers, folder=folder, limits=LIMITS, on_progress=lambda *step: seen.append(step)
+        )
 
         assert outcome.ending == "ok"
         assert np.load(folder / "sum.npy", allow_pickle=False).tolist() == [11, 22]
-        assert outcome.value["folder"] == str(folder)
     assert seen[-1] == (2, 2)
     assert not folder.exists()
-
-
-def test_a_task_sees_nothing_of_the_services_environment(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LENS_DATABASE_URL", "postgresql://user:secret@host/db")
-
-    outcome = run("add", arguments={"a": 1, "b": 2})
-
-    seen = outcome.value["environment"]
-    assert "secret" not in str(seen)
-    assert seen["OMP_NUM_THREADS"] == "1"
-    assert seen["TMPDIR"] == seen["HOME"] == outcome.value["folder"]
+    environment = outcome.value["environment"]
+    assert "secret" not in str(environment)
+    assert environment["OMP_NUM_THREADS"] == "1"
+    assert environment["TMPDIR"] == environment["HOME"] == outcome.value["folder"] == str(folder)
 
 
 @pytest.mark.parametrize("niceness", [10, 0])
@@ -164,26 +156,22 @@ def test_cancelling_kills_the_child_and_what_it_started(
     until(lambda: all(map(is_gone, pids)), within_s=5)
 
 
+def clean() -> dict[str, str]:
+    """Return an environment in which any interpreter of this version finds what this one does."""
+    kept = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    folders = [str(OWN), str(HERE.parents[1]), *site.getsitepackages()]
+    return kept | {"PYTHONPATH": os.pathsep.join(folders)}
+
+
+def boxed(data: Path, task: str, program: str = sys.executable, **asked: Any) -> list[str]:
+    """Return the command that runs one task in a service of its own."""
+    return [program, str(OWN / "boxed.py"), json.dumps({"data": str(data), "task": task, **asked})]
+
+
 def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
-    pid_file = tmp_path / "scratch" / "task" / "pid"
-    script = textwrap.dedent(
-        f"""
-        import sys
-        from pathlib import Path
-        sys.path.insert(0, {str(OWN)!r})
-        from app.sandbox.child import TaskLimits
-        from app.sandbox import runner
-        if __name__ == "__main__":
-            folder = Path({str(pid_file.parent)!r})
-            runner.TASKS_MODULE = "hostile_tasks"
-            box = runner.Sandbox(folder.parent, runner.Budget(1, 1024), cache=folder.parents[1])
-            folder.mkdir()
-            box.run("sleep", {{}}, folder=folder, limits=TaskLimits(512, 60))
-        """
-    )
-    (tmp_path / "parent.py").write_text(script)
-    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py")], env=clean())
-    child_pid = read_pid(pid_file)
+    parent = subprocess.Popen(boxed(tmp_path, "sleep"), env=clean())
+    said = until(lambda: list(tmp_path.glob("scratch/w/*/pid")), within_s=60)
+    child_pid = read_pid(said[0])
 
     parent.kill()
     parent.wait()
@@ -193,83 +181,25 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
 
 def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None:
     """In a container whose root is read-only there is nothing but TMPDIR."""
-    script = f"""if True:
-        from multiprocessing import forkserver
-        from pathlib import Path
-        from app.sandbox.runner import Budget, Sandbox
-        if __name__ == "__main__":
-            Sandbox(Path({str(tmp_path / "s")!r}), Budget(1, 64), cache=Path({str(tmp_path)!r}))
-            print(forkserver._forkserver._forkserver_address)
-    """
     with tempfile.TemporaryDirectory() as folder:  # short: the address of a socket must be
-        said = subprocess.check_output(
-            [sys.executable, "-c", script], env=os.environ | {"TMPDIR": folder}, text=True
-        )
+        environment, command = clean() | {"TMPDIR": folder}, boxed(tmp_path, "refuse")
+        *_, address = json.loads(subprocess.check_output(command, env=environment, text=True))
 
-        assert Path(said.strip()).is_relative_to(folder)
-
-
-PROBE = """
-import json, os, sys
-from pathlib import Path
-sys.path.insert(0, {here!r})
-from app.runtime import supervisor
-from app.runtime.settings import Settings
-from app.sandbox import confine
-from app.sandbox.account import find
-from app.sandbox.child import TaskLimits
-from app.sandbox import runner
-if __name__ == "__main__":
-    data = Path({data!r})
-    confine.keep_private()
-    (data / "app.db").write_text("rows of all owners")
-    (data / "blobs").mkdir()
-    (data / "blobs" / "other").write_text("a photo of another owner")
-    account = find({user!r})
-    if account:
-        for folder in [data, data / "scratch"]:
-            account.lets_through(folder)
-    runner.TASKS_MODULE = {module!r}
-    box = runner.Sandbox(data / "scratch" / "w", runner.Budget(1, 1024), cache=data / "cache",
-                         account=account)
-    arguments = {{"parent": os.getpid(), "database": str(data / "app.db"), "cache": str(data / "cache"),
-                  "other": str(data / "blobs" / "other"), "port": {port}, "but": {but!r}}}
-    with box.folder() as folder, box.folder() as copies:
-        (copies / "own").write_text("the photo of this task")
-        arguments["own"] = str(copies / "own")
-        outcome = box.run("probe", arguments, folder=folder, limits=TaskLimits(1024, 300),
-                          reads=[copies / "own"])
-    print(json.dumps([outcome.ending, outcome.detail, outcome.value]))
-"""
+        assert Path(address).is_relative_to(folder)
 
 
-def probed(
-    data: Path,
-    *,
-    program: str = sys.executable,
-    user: str = "none",
-    module: str = "hostile_tasks",
-    but: tuple[str, ...] = (),
-) -> dict[str, str]:
+def probed(data: Path, *, but: Sequence[str] = (), **asked: Any) -> dict[str, str]:
     """Return what a task that a hostile file took over can do, in a service with secrets."""
     secrets = {"LENS_DATABASE_URL": "postgresql://lens:secret@db/lens", "AWS_SECRET_ACCESS_KEY": "secret"}
-    script = data.with_name("service.py")
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        port, names = listener.getsockname()[1], {"here": str(OWN), "data": str(data), "user": user}
-        script.write_text(PROBE.format(**names, port=port, module=module, but=but), encoding="utf-8")
-        command, environment = [program, str(script)], clean() | secrets
+        arguments = {"port": listener.getsockname()[1], "but": but}
+        command, environment = boxed(data, "probe", arguments=arguments, **asked), clean() | secrets
         said = subprocess.check_output(command, env=environment, text=True, timeout=stretched(400))
-    ending, detail, found = json.loads(said)
+    ending, detail, found, _ = json.loads(said)
     assert ending == "ok", detail
     assert (data / "app.db").read_text() == "rows of all owners"
     assert (data / "blobs" / "other").exists()
-    return dict(found)
-
-
-def clean() -> dict[str, str]:
-    """Return an environment in which any interpreter of this version finds what this one does."""
-    kept = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    return kept | {"PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), *site.getsitepackages()])}
+    return found
 
 
 def done(found: dict[str, str]) -> set[str]:
@@ -519,7 +449,6 @@ def test_a_task_loads_compiled_code_and_saves_none(sandbox: Sandbox, run: Run) -
     first = run("compile_one", **options).value
     compiling = "import hostile_tasks; from lensmodel.core.jit import jit; jit(hostile_tasks._twice)(1)"
     environment = clean() | {"NUMBA_CACHE_DIR": str(sandbox.cache)}
-    environment["PYTHONPATH"] += os.pathsep + str(OWN)
     subprocess.run([sys.executable, "-c", compiling], env=environment, check=True)
     again = run("compile_one", **options).value
 

@@ -337,16 +337,20 @@ def test_the_same_correction_is_made_once_and_a_failed_one_again(store: Store, s
     assert third.public_id != first.public_id
 
 
-def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> None:
-    row = steps.correct(steps.counted())
-    run = store.jobs.start(row.public_id, 1)
-    store.jobs.progress(run, 1, 2)
+def test_a_correction_is_finished_by_the_last_who_took_it_up_and_not_once_it_is_cancelled(
+    store: Store, steps: Steps
+) -> None:
+    jobs, row = store.jobs, steps.correct(steps.counted())
+    file = {"key": "k", "etag": "e", "media_type": "image/tiff", "bytes": 1, "name": "n"}
+    lost, run = jobs.start(row.public_id, 1), jobs.start(row.public_id, 1)
+    assert not jobs.finish(lost, {}, **file)
+    jobs.progress(run, 1, 2)
 
-    assert store.jobs.cancel(row.public_id, OWNER)
+    assert jobs.cancel(row.public_id, OWNER)
 
-    assert not store.jobs.finish(run, {}, key="k", etag="e", media_type="image/tiff", bytes=1, name="n")
-    assert not store.jobs.start(row.public_id, 1)
-    assert not store.jobs.is_live(row.public_id, 1)
+    assert not jobs.finish(run, {}, **file)
+    assert not jobs.start(row.public_id, 1)
+    assert not jobs.is_live(row.public_id, 1)
 
 
 def test_a_worker_declared_dead_cannot_beat_again(store: Store) -> None:

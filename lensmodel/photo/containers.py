@@ -102,6 +102,7 @@ _REFUSED: Final[tuple[tuple[int, bytes, str], ...]] = (
     (0, b"II+\0", "BigTIFF"), (0, b"MM\0+", "BigTIFF"),
 )  # fmt: skip
 _READABLE: Final = "give RAW, DNG, TIFF, PNG or JPEG"
+COPY_AGAIN: Final = "copy it again from the camera or card"
 
 
 def sniff(head: bytes) -> FileKind:
@@ -192,9 +193,7 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
             raise NotAnImageError(
                 f"the JPEG has no frame header, or none of 8 bits ({error}); save it anew from the original"
             ) from error
-        raise TruncatedImageError(
-            "the JPEG ends inside its header; copy it again from the camera or card"
-        ) from error
+        raise TruncatedImageError(f"the JPEG ends inside its header; {COPY_AGAIN}") from error
     readers = (TiffReader.open(block, 6) for block in segments.exif)
     whole = buffer.find(_END_OF_IMAGE, segments.tell()) >= 0  # in a scan a zero follows each byte of 0xFF
     return Header(
@@ -231,6 +230,7 @@ _OF_SRGB: Final = {
     b"gAMA": (">I", (45455,), 400),
     b"cHRM": (">8I", (31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), 400),
 }
+_READ: Final = {b"IDAT", b"eXIf", b"iCCP", b"iTXt", b"sRGB", *_OF_SRGB}
 _PNG_END: Final = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
@@ -238,21 +238,21 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     """Read the chunks; image data are skipped, not read."""
     first = bytes(buffer[8:33])
     if len(first) < 25:
-        raise TruncatedImageError("the PNG ends inside its header; copy it again from the camera or card")
+        raise TruncatedImageError(f"the PNG ends inside its header; {COPY_AGAIN}")
     if first[4:8] != b"IHDR" or zlib.crc32(first[4:21]) != struct.unpack(">I", first[21:])[0]:
         raise NotAnImageError("the PNG's header chunk is damaged")
     width, height, bits, colour = struct.unpack(">IIBB", first[8:18])
     channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
     if not (width and height and channels and bits in {1, 2, 4, 8, 16}):
-        raise NotAnImageError(
-            f"the PNG's header is impossible: {width} x {height}, {bits} bits, type {colour}"
-        )
+        said = f"{width} x {height}, {bits} bits, type {colour}"
+        raise NotAnImageError(f"the PNG's header is impossible: {said}")
     check_size(width, height, len(buffer), limits)  # before a bomb's end is missed
     found = dict[bytes, bytes]()
     for name, start, length in png_chunks(buffer):
-        body = b"" if name == b"IDAT" else bytes(buffer[start : start + min(length, MAX_BLOCK_BYTES)])
-        if name != b"iTXt" or body.startswith(b"XML:com.adobe.xmp\0"):
-            found.setdefault(name, body)
+        if name in _READ:
+            body = bytes(buffer[start : start + min(length, MAX_BLOCK_BYTES if name != b"IDAT" else 0)])
+            if name != b"iTXt" or body.startswith(b"XML:com.adobe.xmp\0"):
+                found.setdefault(name, body)
     if b"IDAT" not in found:
         raise TruncatedImageError("the PNG has no image data")
     exif, text = TiffReader.open(found.get(b"eXIf", b"")), found.get(b"iTXt", b"")
@@ -293,14 +293,10 @@ def png_chunks(buffer: Buffer, *, every: bool = False) -> Iterator[tuple[bytes, 
     while count < MAX_CHUNKS:
         head = bytes(buffer[at : at + 8])
         if len(head) < 8:
-            raise TruncatedImageError(
-                "the PNG ends before its end chunk; copy it again from the camera or card"
-            )
+            raise TruncatedImageError(f"the PNG ends before its end chunk; {COPY_AGAIN}")
         length, name = struct.unpack(">I4s", head)
         if at + 12 + length > len(buffer):
-            raise TruncatedImageError(
-                f"the PNG ends inside chunk {name!r}; copy it again from the camera or card"
-            )
+            raise TruncatedImageError(f"the PNG ends inside chunk {name!r}; {COPY_AGAIN}")
         if name == b"IEND":
             return
         again = name == before == b"IDAT"
@@ -354,7 +350,7 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
     reader = TiffReader.open(buffer)
     every = [] if reader is None else list(reader.walk(SUB_DIRECTORIES))
     if reader is None or not every:
-        raise TruncatedImageError("the TIFF has no readable directory; copy it again from the camera or card")
+        raise TruncatedImageError(f"the TIFF has no readable directory; {COPY_AGAIN}")
     first = every[0][1]
     if _DNG_VERSION in first:
         kind = "dng"
@@ -452,7 +448,7 @@ def _check_strips(tags: Tags, file_bytes: int) -> None:
     if not starts or len(starts) != len(lengths) or not inside:
         raise TruncatedImageError(
             f"the TIFF's {len(starts)} strips with {len(lengths)} lengths go beyond the file's end, or are "
-            "damaged; copy it again from the camera or card"
+            f"damaged; {COPY_AGAIN}"
         )
     stored = _pixels(tags) * tags.integer(277, 1) * tags.integer(258, 1) / 8
     if tags.integer(259, 1) == 1 and sum(lengths) < 0.999 * stored:

@@ -1,33 +1,73 @@
-"""From a photo file, or an array, to linear light; and what is known of a file without decoding it."""
+"""From a photo file, or an array, to linear light; and what is known of a file without decoding it.
+
+RAW goes through LibRaw, as linear camera colours with the true saturation level at 1; TIFF, PNG and JPEG are
+decoded to numbers in full precision, and these to light by their transfer curve.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
+import imagecodecs
 import numpy as np
 import rawpy
-from numpy.typing import ArrayLike
+import tifffile
+from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.core.errors import (
     InvalidInputError,
+    LensModelError,
     MetadataMissingError,
     NotAnImageError,
+    RawDecodeError,
     TruncatedImageError,
+    UnreadablePhotoError,
     UnsupportedFormatError,
 )
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
-from lensmodel.photo.containers import check_size, opened_header
+from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel, Planes
+from lensmodel.photo.colour import (
+    CODES,
+    SRGB_TO_XYZ_D65,
+    Matrix,
+    camera_to_srgb,
+    curves_of,
+    decode,
+    is_of_rgb,
+    matrix3,
+    matrix_profile,
+    named_profile,
+)
+from lensmodel.photo.containers import (
+    COPY_AGAIN,
+    Header,
+    JpegSegments,
+    check_size,
+    opened_header,
+    opened_jpeg,
+    png_picture,
+)
+from lensmodel.photo.dng import Opcode, demosaiced, packed_opcodes, read_opcodes
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
-from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.raster import develop_raster, read_pixels
-from lensmodel.photo.raw import develop_raw, exposure_of, opened_raw
-from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PhotoMetadata, remarks_log
+from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
+from lensmodel.photo.values import (
+    Encoding,
+    LensIdentity,
+    Limits,
+    LinearPhoto,
+    PhotoInfo,
+    PhotoMetadata,
+    PlaneNoise,
+    Transfer,
+    remarks_log,
+)
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 
@@ -61,14 +101,12 @@ def _info_of(path: Path, said: Said, raw: rawpy.RawPy | None, limits: Limits) ->
             )
         width, height = raw.sizes.width, raw.sizes.height
         if header.camera is not None:
-            metadata = exposure_of(raw, metadata)
+            metadata = _exposure_of(raw, metadata)
         check_size(width, height, path.stat().st_size, limits)
     if header.kind == "jpeg" and header.channels == 4:
         raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
     if not header.whole:
-        raise TruncatedImageError(
-            f"the {header.kind.upper()} ends before its picture does; copy it again from the camera or card"
-        )
+        raise TruncatedImageError(f"the {header.kind.upper()} ends before its picture does; {COPY_AGAIN}")
     if min(width, height) < MIN_SIDE:
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
@@ -127,9 +165,9 @@ def develop(
             if on_info is not None:
                 on_info(info)
         except MetadataMissingError:  # of a photo that is damaged nobody shall look up what it does not say
-            read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
+            _read_pixels(path, said.header) if raw is None else Mosaic.of(raw)
             raise
-        developed = develop_raster(path, said, info) if raw is None else develop_raw(raw, said, info)
+        developed = _develop_raster(path, said, info) if raw is None else _develop_raw(raw, said, info)
     for remark in developed.remarks:
         remarks_log.warning("%s: %s", path.name, remark)
     return developed
@@ -199,3 +237,311 @@ def photo_from_array(
         info=PhotoInfo("tiff", width, height, metadata),
         encoding=Encoding(bit_depth=32, transfer="linear", metadata=metadata),
     )
+
+
+# --- RAW ---------------------------------------------------------------------------------------
+
+_NOISE_MIX: Final = np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]])
+"""Share of the variance of each colour's pixels (column) in each plane that AHD makes (row): measured on flat
+fields, as the tests do again. The noise of the planes is not white: at low frequencies it has about 3.7 times
+the power of the sensor's in red and blue and 1.9 times in green, at the highest about half."""
+
+_FULL: Final = 65535.0  # 16 bits
+_ORIENTATIONS: Final = {3: 3, 5: 8, 6: 6}  # how LibRaw says that a picture is turned -> EXIF orientation
+
+_LEAST_SHARE: Final = 0.25  # of the strongest that a channel is balanced by: it costs two of 16 bits
+
+# CRW, CR2, MRW: LibRaw reads every camera that wrote them, so that one it does not know is damaged.
+_KNOWN_WHOLE: Final = ((6, b"HEAPCCDR"), (8, b"CR\x02"), (0, b"\0MRM"))
+
+
+@contextlib.contextmanager
+def opened_raw(path: Path) -> Iterator[rawpy.RawPy]:
+    """Open a RAW file with LibRaw's header parser; foreign errors become ours."""
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_file(str(path))
+            yield raw
+    except (LensModelError, MemoryError):
+        raise
+    except (rawpy.LibRawFileUnsupportedError, rawpy.LibRawIOError) as error:
+        with path.open("rb") as file:
+            head = file.read(16)
+        if isinstance(error, rawpy.LibRawIOError) or any(head.startswith(m, at) for at, m in _KNOWN_WHOLE):
+            raise TruncatedImageError(
+                f"the RAW file is damaged, or ends before its data do; {COPY_AGAIN}"
+            ) from error
+        raise UnsupportedFormatError(
+            "this kind of RAW is not supported by LibRaw; convert it to DNG or TIFF"
+        ) from error
+    except Exception as error:
+        raise RawDecodeError(
+            f"LibRaw cannot decode this file ({error}); convert it to DNG or TIFF"
+        ) from error
+
+
+def _exposure_of(raw: rawpy.RawPy, camera: PhotoMetadata) -> PhotoMetadata:
+    """What LibRaw knows of a photo whose header names the camera alone; 0 is its word for unknown."""
+    said = raw.other
+    return replace(
+        camera,
+        lens=LensIdentity(model=raw.lens.model or None),
+        aperture=round(said.aperture, 1) or None,
+        focal_mm=said.focal_length or None,
+        iso=said.iso_speed or None,
+        exposure_s=said.shutter_speed or None,
+        # the camera's clock has no zone; LibRaw takes its seconds for those of this machine
+        taken_at=said.timestamp and said.timestamp.astimezone(UTC).replace(tzinfo=None),
+        orientation=_ORIENTATIONS.get(raw.sizes.flip, 1),
+        artist=said.artist or None,
+    )
+
+
+def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
+    """Develop an open RAW file to linear camera RGB, once its defective pixels are replaced.
+
+    No white balance, no colour matrix, no rotation: 1.0 is the level at which the sensor saturates.
+    """
+    header, mosaic = said.header, Mosaic.of(raw)
+    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
+    kept, lost = [] if header.coarseness else read_opcodes(header.opcodes_2), list[Opcode]()
+    white, clip, defects = int(raw.white_level), (1.0, 1.0, 1.0), 0
+    sensor_noise, cfa, stated = None, None, header.white
+    if mosaic is not None:
+        white, clip = mosaic.saturation()
+        sensor_noise, cfa, stated = mosaic.noise(white), mosaic.bayer_pattern(), ()
+        kept, lost = demosaiced(kept, cfa)
+        defects = mosaic.repair()
+    balance, own_balance = _white_balance(raw)
+    planes = _developed(raw, white, balance, stated)
+    _, height, width = planes.shape
+    noise = _plane_noise(planes, sensor_noise, balance)
+    to_srgb, xyz_to_camera = _colour(raw, balance)
+    many = " of its sensor is" if defects == 1 else "s of its sensor are"
+    return LinearPhoto(
+        planes=planes,
+        frame=Frame(height, width),
+        noise=noise,
+        clip=clip,
+        info=replace(info, width=width, height=height),
+        encoding=Encoding(
+            bit_depth=max(1, white.bit_length()),
+            metadata=info.metadata.without_serials(),
+            white_balance=balance,
+            to_srgb=matrix3(to_srgb),
+            xyz_to_camera=matrix3(xyz_to_camera),
+            baseline_exposure=said.baseline_exposure(),
+            opcodes_2=packed_opcodes(kept),
+            opcodes_3=packed_opcodes(read_opcodes(header.opcodes_3)),
+        ),
+        sensor_noise=sensor_noise,
+        coding_noise=coding_noise(header.coarseness, curves_of("srgb")[1]),
+        cfa=cfa,
+        grain=(1.0, 1.0, 1.0) if sensor_noise is not None else grain_of(planes, noise, clip),
+        remarks=(
+            *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
+            *((f"{defects} defective pixel{many} replaced",) if defects else ()),
+            *(() if own_balance else ("it does not say its white balance, and that of daylight is taken",)),
+        ),
+    )
+
+
+def _developed(
+    raw: rawpy.RawPy, white: int, balance: tuple[float, float, float], stated: tuple[int, ...]
+) -> Planes:
+    """Demosaic with white balance, then take the balance off again.
+
+    Demosaicing fills in the fine detail of red and blue from green as if their contrasts were equal, as they
+    roughly are after white balance only. `stated` is the white that a DNG without a mosaic states: LibRaw
+    takes the black of such files off their values, but not off their white.
+    """
+    share = np.maximum(np.asarray(balance) / max(balance), _LEAST_SHARE)
+    full, colours = share, min(raw.num_colors, 3)
+    # LibRaw applies this after it took the black level off, so it counts from black.
+    saturation = None if white == raw.white_level else white - min(raw.black_level_per_channel)
+    if stated:
+        black = np.array(raw.black_level_per_channel[:colours], dtype=float)
+        spans = np.resize(np.resize(stated, colours) - black, 3)
+        if spans.min() > 0.0:
+            saturation, full = round(spans.max()), share * (spans / spans.max())
+    rgb = np.asarray(
+        raw.postprocess(
+            demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
+            gamma=(1, 1),
+            no_auto_bright=True,
+            output_bps=16,
+            output_color=rawpy.ColorSpace.raw,
+            user_wb=[float(share[0]), float(share[1]), float(share[2]), float(share[1])],
+            user_flip=0,
+            user_sat=saturation,
+            adjust_maximum_thr=0.0,  # else LibRaw makes the brightest pixel of each photo the white
+            highlight_mode=rawpy.HighlightMode.Ignore,  # the strongest channel reaches 65535, none is cut
+            median_filter_passes=0,
+            fbdd_noise_reduction=rawpy.FBDDNoiseReductionMode.Off,
+        )
+    )
+    if rgb.ndim != 3 or rgb.shape[2] not in {1, 3}:
+        raise UnsupportedFormatError("only RAW files of three colours, or none, are read")
+    planes: Planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
+    for k, plane in enumerate(planes):
+        # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
+        scale = np.float32(1 / np.floor(_FULL * full[k]))
+        np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], scale, out=plane)
+        np.minimum(plane, np.float32(1.0), out=plane)
+    if float(planes.max()) <= 0.0:
+        raise RawDecodeError("the developed photo is black everywhere; the file holds no picture")
+    return planes
+
+
+def _plane_noise(
+    planes: Planes, sensor: PlaneNoise | None, balance: tuple[float, float, float]
+) -> PlaneNoise:
+    """Variance of each plane's pixels, from that of the sensor where it is known.
+
+    Demosaicing adds detail of colour s, noise included, to plane c after white balance w::
+
+        read_c = sum_s M_cs read_s (w_s / w_c)^2
+        shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
+    """
+    if sensor is None:
+        r, g, b = (estimate_noise(plane, step=1 / _FULL) for plane in planes)
+        return r, g, b
+    weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
+    shot = (_NOISE_MIX * weight) @ np.array([model.shot for model in sensor])
+    read = (_NOISE_MIX * weight**2) @ np.array([model.read for model in sensor])
+    r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
+    return r, g, b
+
+
+def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
+    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own, not daylight's."""
+    for own, multipliers in ((True, raw.camera_whitebalance), (False, raw.daylight_whitebalance)):
+        r, g, b = multipliers[:3]
+        if min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20:  # others are absurd
+            return (float(r) / float(g), 1.0, float(b) / float(g)), own
+    return (1.0, 1.0, 1.0), False
+
+
+def _colour(
+    raw: rawpy.RawPy, white_balance: tuple[float, float, float]
+) -> tuple[Matrix | None, Matrix | None]:
+    """White-balanced camera to linear sRGB, and CIE XYZ to camera; from the file, else LibRaw's table."""
+    of_file = np.asarray(raw.color_matrix, dtype=np.float64)[:3, :3]
+    of_table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
+    if np.abs(of_table).sum() > 0:
+        return camera_to_srgb(of_table), of_table
+    if abs(np.linalg.det(of_file)) < 1e-6:
+        return None, None
+    balanced = np.linalg.inv(SRGB_TO_XYZ_D65 @ of_file)
+    return of_file, balanced / np.asarray(white_balance)[:, None]
+
+
+# --- TIFF, PNG and JPEG ------------------------------------------------------------------------
+
+Pixels: TypeAlias = NDArray[Any]
+"""Numbers of a file, `(row, col)` or `(row, col, channel)`."""
+
+_TURNED: Final = (
+    "a program has turned its pixels upright, and nothing tells which way: the PSFs of both are averaged, "
+    "and the more these differ, the less is corrected"
+)
+
+
+def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
+    """Decode a picture and turn its numbers into linear light by its transfer curve."""
+    header, (pixels, transparent) = said.header, _read_pixels(path, said.header)
+    height, width = pixels.shape[:2]
+    if (height, width) != (info.height, info.width):
+        raise UnreadablePhotoError(
+            f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
+        )
+    transfer, icc, without = _transfer_of(said, pixels)
+    curves = curves_of(transfer, icc)
+    planes: Planes = np.empty((3, height, width), dtype=np.float32)
+    for k, curve in enumerate(curves):
+        numbers = pixels[:, :, k]
+        planes[k] = numbers if numbers.dtype.kind == "f" and transfer == "linear" else decode(numbers, curve)
+    green, code = curves[1], {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
+    codes = green[::code] if pixels.dtype.itemsize == 1 else None
+    clip = max(1.0, float(planes.max())) if pixels.dtype.kind == "f" else 1.0
+    r, g, b = (estimate_noise(plane, clip, float(green[code] - green[0]), codes) for plane in planes)
+    return LinearPhoto(
+        planes=planes,
+        frame=Frame(height, width),
+        noise=(r, g, b),
+        clip=(clip,) * 3,
+        info=info,
+        encoding=Encoding(
+            bit_depth=8 * pixels.dtype.itemsize,
+            transfer=transfer,
+            icc=icc,
+            metadata=info.metadata.without_serials(),
+        ),
+        grain=grain_of(planes, (r, g, b), (clip,) * 3),
+        coding_noise=coding_noise(header.coarseness, green),
+        chroma_step=header.chroma_step,
+        remarks=(
+            *(("its transparency is dropped",) if transparent else ()),
+            *without,
+            *((_TURNED,) if info.turned else ()),
+        ),
+    )
+
+
+def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tuple[str, ...]]:
+    """Which curve the numbers follow, the profile for the output, and a word on one that is left out."""
+    icc, lost, floating = said.header.icc, said.header.icc_lost, pixels.dtype.kind == "f"
+    if icc is not None and matrix_profile(icc) is not None:
+        return "icc", icc, _without_profile("its other tags say") if lost else ()
+    if icc is not None and not floating and is_of_rgb(icc):
+        return "srgb", icc, ()
+    declared = named_profile("adobergb") if said.adobe_rgb and not floating else None
+    instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
+    without = _without_profile(instead) if lost or icc is not None else ()
+    return ("linear" if floating else "icc" if declared else "srgb"), declared, without
+
+
+def _without_profile(instead: str) -> tuple[str, ...]:
+    return (f"its ICC profile is damaged or not for RGB: its colours are read as {instead}",)
+
+
+def _read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
+    """Decode to numbers `(row, col, 3)`, and say whether alpha was dropped that was not opaque."""
+    name = header.kind.upper()
+    try:
+        if header.kind == "tiff":
+            with tifffile.TiffFile(path) as file:
+                file.filehandle.seek(header.directory)
+                page = tifffile.TiffPage(file, 0)
+                pixels = page.asarray()
+            if pixels.ndim == 3 and page.planarconfig == 2:
+                pixels = np.moveaxis(pixels, 0, -1)
+        elif header.kind == "png":
+            pixels = imagecodecs.png_decode(png_picture(path.read_bytes()))
+        else:
+            with opened_jpeg(JpegSegments(path.read_bytes())) as image:
+                pixels = np.asarray(image.convert("RGB"))
+        alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
+        return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
+    except (MemoryError, LensModelError):
+        raise
+    except Exception as error:  # decoders meet hostile files with exceptions of any kind
+        if "truncated" in str(error):
+            raise TruncatedImageError(f"the {name} ends before its picture does ({error})") from error
+        raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
+
+
+def _three_channels(pixels: Pixels) -> Pixels:
+    if pixels.dtype.kind == "f":
+        pixels = pixels.astype(np.float32)
+        known = pixels[np.isfinite(pixels)]
+        pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
+    elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise UnsupportedFormatError(
+            f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"
+        )
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or pixels.shape[2] > 4:
+        raise UnsupportedFormatError(f"a picture of shape {pixels.shape} is no photo; give RGB on one page")
+    return np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, :3]

@@ -41,7 +41,7 @@ Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float
 _PROCESSED: Final = 16.0  # noise variance of a photo without its mosaic over what its flat places show
 # Coarseness of grain above which more of it counts, and how much more at most; demosaicing has 6 to 9.
 _USUAL_GRAIN, _COARSEST = 14.0, 4.0
-# Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`.
+# Noise power of demosaiced planes at low frequencies over that of the sensor: see `development._NOISE_MIX`.
 _DEMOSAICED: Final = (3.7, 1.9, 3.7)
 _COARSEST_POWER: Final = 64.0  # largest `noise.graininess` believed: cameras reach 60, texture far more
 

@@ -18,9 +18,9 @@ from PIL.TiffImagePlugin import IFDRational
 from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import opened_header
+from lensmodel.photo.development import opened_raw
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.metadata import Said, is_placeholder, read_xmp
-from lensmodel.photo.raw import opened_raw
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
 _LOOKED_UP = {"61182", "Unknown (00 77 48 5C 80 24 24 0E)"}

@@ -1,31 +1,44 @@
-"""Owners and their keys: who is let in, and that nobody sees what is another's."""
+"""Owners and their keys: who is let in, what is another's, what they take away and what is left of them."""
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import inspect
+import io
 import itertools
 import json
 import re
+import time
+import zipfile
 from collections.abc import Iterator
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
+import httpx2
+import numpy as np
 import pytest
 from fastapi.routing import APIRoute
-from sqlalchemy import select, update
+from sqlalchemy import func, select, update
 from starlette.testclient import TestClient
 from states import Steps, finish, services_of
+from typer.testing import CliRunner
+from uploads import receive
 
+from app.blobs.account_data import erase, zipped
+from app.blobs.storage import Storage
+from app.client import Client
 from app.main import create_app
 from app.pages import pictures
 from app.pages import routes as page_routes
 from app.runtime import supervisor
 from app.runtime.settings import Settings
-from app.store import Store, accounts
+from app.store import Store, accounts, tables
 from app.store.owners import ANY_OWNER, now
-from app.store.tables import KeyRow, SessionRow
 from lensmodel.cli.ending import UsageError
+from lensmodel.cli.main import app
+from lensmodel.core.errors import InvalidInputError
 
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")
 OPEN = {"/healthz", "/readyz", "/sign-in", "/v1/session"}
@@ -209,7 +222,7 @@ def test_a_browser_signs_in_with_a_cookie_that_no_script_and_no_other_site_gets(
     told = guarded.get("/v1/account", headers=shown).json()
     assert (told["owner"], told["scopes"], told["signed_in"]) == ("anna", ["admin"], True)
     with store.database.reading() as session:
-        assert token not in {row.token_hash for row in session.scalars(select(SessionRow))}
+        assert token not in {row.token_hash for row in session.scalars(select(tables.SessionRow))}
     assert guarded.delete("/v1/session", headers=shown).status_code == 204
     assert guarded.get("/v1/account", headers=shown).status_code == 401
 
@@ -220,7 +233,7 @@ def test_keys_end_by_revoking_and_expiry_and_are_kept_nowhere(
     monkeypatch.setattr("app.access.FRESH_S", 0.0)  # each request looks
     made = store.accounts.create_key("anna", ["read"], lasts=timedelta(days=1))
     with store.database.reading() as session:
-        row = session.scalars(select(KeyRow)).one()
+        row = session.scalars(select(tables.KeyRow)).one()
     assert made.split("_", 2)[2] not in str(vars(row))  # a secret may hold the sign that parts it off
     assert row.key_hash == hashlib.sha256(made.encode()).hexdigest()
     renewed = store.accounts.create_key("anna", ["read"])
@@ -231,7 +244,7 @@ def test_keys_end_by_revoking_and_expiry_and_are_kept_nowhere(
 
     assert statuses() == [200, 200, 401]
     with store.database.writing() as session:
-        old = update(KeyRow).where(KeyRow.prefix == row.prefix)
+        old = update(tables.KeyRow).where(tables.KeyRow.prefix == row.prefix)
         session.execute(old.values(expires_at=now() - timedelta(seconds=1)))
     assert statuses() == [401, 200, 401]
     assert store.accounts.revoke_key(renewed.split("_")[1])
@@ -331,3 +344,238 @@ def test_nobody_asks_for_the_rows_of_all_by_leaving_the_owner_out(store: Store) 
 
     assert len(owners) > 10
     assert all(owner.default is inspect.Parameter.empty for owner in owners)
+
+
+# --- the command `lensmodel keys`, and the client that sends one ------------------------------------
+
+
+RUNNER = CliRunner()
+
+
+def run(folder: Path, *words: str) -> tuple[str, str]:
+    done = RUNNER.invoke(app, ["keys", *words, "--data", str(folder)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout, done.stderr
+
+
+def test_a_key_is_made_listed_and_ended(tmp_path: Path) -> None:
+    text, hint = run(tmp_path, "create", "--owner", "anna", "--scope", "read", "--label", "notebook")
+    assert text.startswith("lpk_")
+    assert text.count("\n") == 1  # it can be passed on as it is
+    assert "Shown once" in hint
+
+    [key] = json.loads(run(tmp_path, "list", "--json")[0])
+    assert (key["owner"], key["scope"], key["label"], key["state"]) == ("anna", "read", "notebook", "valid")
+    assert text.strip().split("_", 2)[2] not in str(key)
+    run(tmp_path, "revoke", text.strip())
+    run(tmp_path, "create", "--owner", "ben")
+
+    states = [key["state"] for key in json.loads(run(tmp_path, "list", "--owner", "anna", "--json")[0])]
+    assert states == ["revoked"]
+    assert "owner anna" in run(tmp_path, "list")[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "said"),
+    [
+        ("create --expires 3months", UsageError, "such as 90d; got '3months'"),
+        ("create --owner |", UsageError, "owner's name"),
+        ("revoke abcd2345", InvalidInputError, "no key begins with abcd2345"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(
+    tmp_path: Path, words: str, error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        run(tmp_path, *words.split())
+
+
+def test_the_client_sends_its_key_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    def sent(**options: Any) -> str | None:
+        with Client(**options) as client:
+            return client._http.headers.get("Authorization")
+
+    monkeypatch.delenv("LENS_API_KEY", raising=False)
+    assert (sent(), sent(key="lpk_a")) == (None, "Bearer lpk_a")
+    monkeypatch.setenv("LENS_API_KEY", "lpk_b")
+    assert (sent(), sent(key=""), sent(http=httpx2.Client())) == ("Bearer lpk_b", None, None)
+
+
+# --- what is kept of an owner -----------------------------------------------------------------------
+
+JPEG = b"\xff\xd8\xff" + bytes(200)
+
+
+def counts(store: Store, *tables: type[Any]) -> list[int]:
+    with store.database.reading() as session:
+        return [session.scalar(select(func.count()).select_from(table)) or 0 for table in tables]
+
+
+def send(client: TestClient) -> Any:
+    return client.post("/v1/photos?filename=a.jpg", content=JPEG)
+
+
+def test_a_request_that_is_sent_again_makes_nothing_twice(
+    client: TestClient, store: Store, steps: Steps, storage: Storage
+) -> None:
+    wish = {"photo_id": steps.counted().public_id, "method": "fast"}
+
+    photos = [send(client) for _ in range(2)]
+    made = [client.post("/v1/corrections", json=wish) for _ in range(2)]
+
+    assert [answer.status_code for answer in (*photos, *made)] == [202, 200, 202, 202]
+    assert made[0].json()["id"] == made[1].json()["id"]
+    assert counts(store, tables.PhotoRow, tables.CorrectionRow) == [2, 1]
+    kept = [path.parent.name for path in storage.folder.glob("photos/*/original")]
+    assert kept == [photos[0].json()["id"]] == [photos[1].json()["id"]]
+
+
+def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
+    client: TestClient, steps: Steps, storage: Storage
+) -> None:
+    photo, gone = steps.counted(), steps.receive()
+    storage.put(photo.blob_key, b"mine")
+    steps.owner = "other"
+    foreign = steps.counted()
+
+    answer = client.get("/v1/account/export")
+
+    assert answer.headers["Content-Type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        files = {name: archive.read(name).decode() for name in archive.namelist()}
+    assert files[f"originals/{photo.public_id}/{photo.filename}"] == "mine"
+    assert files["missing.txt"] == f"originals/{gone.public_id}/{gone.filename}\n"
+    rows = {
+        name: [json.loads(line) for line in text.splitlines()]
+        for name, text in files.items()
+        if "jsonl" in name
+    }
+    assert [row["public_id"] for row in rows["photos.jsonl"]] == [photo.public_id, gone.public_id]
+    assert [row["serial"] for row in rows["lenses.jsonl"]] == ["123"]
+    assert [row["kind"] for row in rows["calibrations.jsonl"]] == ["photo_added"]
+    assert (len(rows["patches.jsonl"]), len(rows["samples.jsonl"])) == (2, 6)
+    sample = rows["samples.jsonl"][0]
+    kernel = np.frombuffer(base64.b64decode(sample["psf"]), dtype="<f4")
+    assert kernel.size == sample["entry"]["size"] ** 2
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+    assert foreign.public_id not in str(files)
+
+
+def test_an_archive_of_many_files_takes_time_in_proportion_to_them() -> None:
+    def seconds(number: int) -> float:
+        began = time.process_time()
+        for _ in zipped((zipfile.ZipInfo(f"originals/{k:032x}/p{k}.dng"), [b"any"]) for k in range(number)):
+            pass
+        return time.process_time() - began
+
+    assert seconds(25_000) < 12 * seconds(5_000)  # five times as many
+
+
+def test_an_erased_account_leaves_no_row_and_no_file(
+    client: TestClient, store: Store, steps: Steps, storage: Storage
+) -> None:
+    steps.owner = "other"
+    foreign = steps.counted()
+    kept = (
+        tables.OwnerRow,
+        tables.PhotoRow,
+        tables.LensRow,
+        tables.EventRow,
+        tables.PatchRow,
+        tables.SampleRow,
+    )
+    before = counts(store, *kept)
+    steps.owner = "local"
+    photo, gone = steps.counted(), steps.counted()
+    storage.put(photo.blob_key, b"mine")
+    store.photos.delete(gone.public_id, "local")
+    client.post("/v1/corrections", json={"photo_id": photo.public_id, "method": "fast"})
+
+    assert client.delete("/v1/account").status_code == 204
+    assert counts(store, *kept) == before
+    assert counts(store, tables.CorrectionRow, tables.KeyRow) == [0, 0]
+    assert store.photos.get(foreign.public_id, "other") is not None
+    assert not (storage.folder / photo.blob_key).exists()
+    assert client.get("/v1/photos").json()["items"] == []
+
+
+def test_an_erasure_that_was_killed_is_carried_through_by_a_worker(
+    store: Store, steps: Steps, storage: Storage
+) -> None:
+    photo = steps.counted()
+    store.accounts.create_key("local", ["write"])
+    key = store.accounts.begin_erasing("local")
+    assert key is not None
+    prefixes = store.accounts.erase_some(key)  # and then the API is killed
+
+    assert not store.accounts.has_valid_key()
+    assert store.photos.get(photo.public_id, "local") is None
+    assert store.accounts.to_erase() == [key]
+    assert prefixes == [photo.folder]
+    with store.database.reading() as session:  # it is deleted once more later
+        assert photo.folder in set(session.scalars(select(tables.GarbageRow.prefix)))
+    erase(store.accounts, storage, key)
+    assert store.accounts.to_erase() == []
+    assert (
+        counts(store, tables.OwnerRow, tables.PhotoRow, tables.LensRow, tables.SampleRow, tables.KeyRow)
+        == [0] * 5
+    )
+
+
+def test_an_upload_that_outlasts_its_owner_makes_no_new_one(store: Store) -> None:
+    with pytest.raises(Exception, match="erased"):
+        receive(store, "a1", owner="anna", may_be_new=False)
+    assert counts(store, tables.OwnerRow) == [0]
+
+
+def ended(store: Store, photo: tables.PhotoRow, ago: timedelta) -> None:
+    with store.database.writing() as session:
+        mine = update(tables.PhotoRow).where(tables.PhotoRow.id == photo.id)
+        session.execute(mine.values(finished_at=now() - ago))
+
+
+def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Steps) -> None:
+    counted, running, corrected, stored = steps.counted(), steps.receive(), steps.counted(), steps.receive()
+    steps.inspect(running)
+    store.photos.set_state(stored.public_id, ("received",), "stored")
+    row = steps.correct(corrected, method="fast")
+    for photo in (counted, corrected, stored):
+        ended(store, photo, timedelta(hours=2))
+
+    assert store.photos.unneeded() == [counted.public_id]  # the others are to be corrected
+    store.jobs.cancel(row.public_id, "local")
+    ended(store, stored, timedelta(hours=25))
+    assert set(store.photos.unneeded()) == {counted.public_id, corrected.public_id, stored.public_id}
+
+
+def test_a_file_that_was_given_up_takes_no_room_and_comes_back_with_the_same_bytes(
+    client: TestClient, store: Store, steps: Steps, storage: Storage
+) -> None:
+    sent = send(client).json()["id"]
+    store.photos.set_state(sent, ("received",), "counted", finished_at=now())
+    with store.database.writing() as session:
+        session.execute(update(tables.PhotoRow).values(width=10, height=10))
+    before = store.photos.get(sent, "local")
+    assert before is not None
+    room = [client.get("/v1/account").json()["stored_bytes"]]
+
+    assert store.photos.give_up_file(sent, ("preview.jpg",))
+    assert not store.photos.give_up_file(sent, ("preview.jpg",))
+    garbage, usage = set(store.jobs.garbage()), store.accounts.usage("local")
+    room.append(client.get("/v1/account").json()["stored_bytes"])
+    refused = client.post("/v1/corrections", json={"photo_id": sent})
+    storage.remove(before.blob_key)
+    storage.remove(before.blob_key)  # again, and nothing happens
+    again = send(client)
+    after = steps.fresh(before)
+
+    assert {before.blob_key, f"photos/{sent}/preview.jpg"} <= garbage
+    assert (room, usage.working_photos, usage.photos) == ([len(JPEG), 0], 0, 1)
+    assert refused.status_code == 409
+    assert "send the same file again" in refused.json()["detail"]
+    assert (again.status_code, again.json()["id"]) == (200, sent)
+    assert after.file_gone_at is None
+    assert after.blob_key != before.blob_key  # what deletes the old one cannot delete this
+    assert storage.get(after.blob_key) == JPEG
+    assert counts(store, tables.PhotoRow) == [1]

@@ -16,8 +16,8 @@ from PIL import Image
 
 from lensmodel import photo
 from lensmodel.core.errors import NotAnImageError, TruncatedImageError, UnsupportedFormatError
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import require_known_mosaic
+from lensmodel.photo.tiff import BYTE, laid_out, longs, shorts
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 RNG = np.random.default_rng(5)
@@ -136,19 +136,9 @@ def test_a_quad_bayer_mosaic_is_refused_by_its_pattern_and_nothing_is_printed() 
 def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
     rows: int, columns: int, colours: str, tmp_path: Path
 ) -> None:
-    mosaic = RNG.integers(600, 9000, (48, 64), dtype=np.uint16)
-    write_bayer_dng(tmp_path / "x.dng", mosaic, black=512, white=15000)
-    data = bytearray((tmp_path / "x.dng").read_bytes())
     pattern = bytes("RGBCMYW".index(letter) for letter in colours)
-    for tag, entry in (
-        (33421, struct.pack("<HHIHH", 33421, 3, 2, rows, columns)),
-        (33422, struct.pack("<HHII", 33422, 1, len(pattern), len(data))),
-    ):
-        at = next(i for i in range(10, 600, 12) if data[i : i + 2] == struct.pack("<H", tag))
-        data[at : at + 12] = entry
-    if len(pattern) == 4:
-        data[at + 8 : at + 12] = pattern
-    (tmp_path / "x.dng").write_bytes(bytes(data) + pattern)
+    tags = {256: longs(64), 257: longs(48), 33421: shorts(rows, columns), 33422: (BYTE, pattern)}
+    (tmp_path / "x.dng").write_bytes(laid_out({**tags, 50706: (BYTE, b"\1\4\0\0")}, {}))
 
     with pytest.raises(UnsupportedFormatError, match=f"{rows} x {columns} pixels"):
         photo.inspect(tmp_path / "x.dng")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
@@ -186,36 +185,25 @@ def test_a_saturated_sky_is_no_damage(tmp_path: Path) -> None:
     assert shot(tmp_path, mosaic).planes[1, 5, 5] == 1.0
 
 
-def _even(mosaic: NDArray[np.uint16]) -> None:
-    mosaic[:] = 3000
-
-
-def _dark(mosaic: NDArray[np.uint16]) -> None:
-    mosaic[:] = np.random.default_rng(0).integers(BLACK - 40, BLACK + 1, mosaic.shape)
-
-
-def _cut_off(mosaic: NDArray[np.uint16]) -> None:
-    mosaic[60:] = 0
-
-
-def _random(mosaic: NDArray[np.uint16]) -> None:
-    mosaic[32:] = np.random.default_rng(0).integers(0, WHITE, (64, 96))
+DARK = np.random.default_rng(0).integers(BLACK - 40, BLACK + 1, (96, 96))
+RANDOM = np.random.default_rng(0).integers(0, WHITE, (64, 96))
 
 
 @pytest.mark.parametrize(
-    ("spoil", "error", "text"),
+    ("first", "spoiled", "error", "text"),
     [
-        (_even, RawDecodeError, "3000"),
-        (_dark, RawDecodeError, "black"),
-        (_cut_off, TruncatedImageError, "38% of the rows"),
-        (_random, RawDecodeError, "random"),
+        (0, 3000, RawDecodeError, "3000"),
+        (0, DARK, RawDecodeError, "black"),
+        (60, 0, TruncatedImageError, "38% of the rows"),
+        (32, RANDOM, RawDecodeError, "random"),
     ],
+    ids=["even", "dark", "cut off", "random"],
 )
 def test_raw_data_that_are_no_picture_are_refused(
-    spoil: Callable[[NDArray[np.uint16]], None], error: type[Exception], text: str, tmp_path: Path
+    first: int, spoiled: NDArray[np.integer] | int, error: type[Exception], text: str, tmp_path: Path
 ) -> None:
     mosaic = raw_numbers(textured(96, 96))
-    spoil(mosaic)
+    mosaic[first:] = spoiled
     with pytest.raises(error, match=text):
         shot(tmp_path, mosaic)
 

@@ -124,10 +124,7 @@ def test_the_place_in_a_preview_inside_a_raw_file_goes_too() -> None:
 
 
 def test_a_gps_box_of_canons_cr3_is_emptied() -> None:
-    tags = [(1, 2, 2, b"N\0\0\0"), (2, 5, 3, struct.pack("<I", 8 + 2 + 2 * 12 + 4))]
-    directory = struct.pack("<H", 2) + b"".join(struct.pack("<HHI", *tag[:3]) + tag[3] for tag in tags)
-    values = struct.pack("<6I", 47, 1, 13, 1, 14159, 1000)
-    box = b"CMT4" + b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + values
+    box = b"CMT4" + tiff.laid_out({1: tiff.text("N"), 2: tiff.rationals(*LATITUDE)}, {})
     data = b"\0\0\0\x18ftypcrx " + bytes(40) + box + bytes(40)
     assert SECRET[1] in data
 

@@ -19,9 +19,8 @@ from app.jobs.worker import Worker
 from app.runtime.outage import is_outage
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.jobs import Job
+from app.store.jobs import Job, Kind
 from app.store.owners import ANY_OWNER
-from app.store.tables import PhotoRow
 
 AWAY = exc.OperationalError("SELECT", {}, psycopg.OperationalError("the connection is closed"))
 
@@ -33,36 +32,27 @@ def sqlite_error(code: int) -> exc.OperationalError:
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "is_so"),
     [
-        AWAY,
-        exc.InterfaceError("SELECT", {}, psycopg.InterfaceError("the connection is lost")),
-        exc.TimeoutError("no connection within 30 s"),
-        sqlite_error(sqlite3.SQLITE_BUSY),
-        sqlite_error(sqlite3.SQLITE_FULL),
-        stored.GenericError("error sending request"),
-        stored.PermissionDeniedError("credentials are being changed"),
-        OSError(errno.ENOSPC, "no space"),
-        ConnectionRefusedError(),
-        MemoryError(),
+        (AWAY, True),
+        (exc.InterfaceError("SELECT", {}, psycopg.InterfaceError("the connection is lost")), True),
+        (exc.TimeoutError("no connection within 30 s"), True),
+        (sqlite_error(sqlite3.SQLITE_BUSY), True),
+        (sqlite_error(sqlite3.SQLITE_FULL), True),
+        (stored.GenericError("error sending request"), True),
+        (stored.PermissionDeniedError("credentials are being changed"), True),
+        (OSError(errno.ENOSPC, "no space"), True),
+        (ConnectionRefusedError(), True),
+        (MemoryError(), True),
+        (ValueError("of ours"), False),
+        (FileNotFoundError(errno.ENOENT, "gone"), False),
+        (stored.InvalidPathError("of ours"), False),
+        (exc.IntegrityError("INSERT", {}, Exception("of ours")), False),
+        (sqlite_error(sqlite3.SQLITE_ERROR), False),
     ],
 )
-def test_errors_of_the_machinery_are_known(error: Exception) -> None:
-    assert is_outage(error)
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        ValueError("of ours"),
-        FileNotFoundError(errno.ENOENT, "gone"),
-        stored.InvalidPathError("of ours"),
-        exc.IntegrityError("INSERT", {}, Exception("of ours")),
-        sqlite_error(sqlite3.SQLITE_ERROR),
-    ],
-)
-def test_errors_of_ours_are_no_outage(error: Exception) -> None:
-    assert not is_outage(error)
+def test_errors_of_the_machinery_are_known_from_ours(error: Exception, is_so: bool) -> None:
+    assert is_outage(error) is is_so
 
 
 class Away:
@@ -145,49 +135,38 @@ def test_reading_ahead_pauses_in_an_outage_but_keeps_to_no_photo_for_ever(
 # --- retries ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def failed_photo(steps: Steps) -> PhotoRow:
-    photo = steps.receive()
-    steps.inspect(photo)
-    assert steps.store.photos.fail(photo.public_id, 1, "outage", "for a test")
-    return photo
+def failed(steps: Steps, kind: Kind) -> str:
+    """Let a photo or a correction fail; return its id."""
+    if kind == "photo":
+        works, row = steps.store.photos, steps.planned()
+    else:
+        params = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
+        works, row = steps.store.jobs, steps.correct(steps.counted(), **params)
+        assert works.start(row.public_id, 1)
+    assert works.fail(row.public_id, 1, "outage", "for a test")
+    return row.public_id
 
 
-@pytest.fixture
-def failed_correction(steps: Steps) -> str:
-    params = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
-    correction = steps.correct(steps.counted(), **params)
-    assert steps.store.jobs.start(correction.public_id, 1)
-    assert steps.store.jobs.fail(correction.public_id, 1, "outage", "for a test")
-    return correction.public_id
-
-
-def test_a_failed_photo_is_retried_by_one_call(
-    client: TestClient, store: Store, failed_photo: PhotoRow
+@pytest.mark.parametrize("kind", ["photo", "correction"])
+def test_a_failed_job_is_retried_as_another_job_of_the_engine(
+    client: TestClient, steps: Steps, kind: Kind
 ) -> None:
-    address = f"/v1/jobs/{failed_photo.public_id}/retry"
-    answer = client.post(address)
+    key = failed(steps, kind)
+
+    answer, again = (client.post(f"/v1/jobs/{key}/retry") for _ in range(2))
 
     assert (answer.status_code, answer.json()["state"], answer.json()["error"]) == (202, "queued", None)
-    assert Job("photo", (failed_photo.public_id, 2), "local") in store.jobs.to_do()
-    again = client.post(address)
     assert (again.status_code, again.json()["code"]) == (409, "conflict")
     assert client.post("/v1/jobs/nothing/retry").status_code == 404
+    assert Job(kind, (key, 2), "local") in steps.store.jobs.to_do()
+    works = steps.store.photos if kind == "photo" else steps.store.jobs
+    assert not works.fail(key, 1, "outage", "said late by the first try")
+    assert works.start(key, epoch=2)
 
 
-def test_a_failed_correction_is_retried_as_another_job_of_the_engine(
-    client: TestClient, store: Store, failed_correction: str
-) -> None:
-    answer = client.post(f"/v1/jobs/{failed_correction}/retry")
-
-    assert (answer.status_code, answer.json()["state"]) == (202, "queued")
-    assert Job("correction", (failed_correction, 2), "local") in store.jobs.to_do()
-    assert not store.jobs.fail(failed_correction, 1, "outage", "said late by the first try")
-    assert store.jobs.start(failed_correction, epoch=2)
-
-
-def test_a_retry_gives_way_to_the_same_wish_made_again(store: Store, failed_correction: str) -> None:
-    row = store.jobs.get(failed_correction, ANY_OWNER)
+def test_a_retry_gives_way_to_the_same_wish_made_again(store: Store, steps: Steps) -> None:
+    key = failed(steps, "correction")
+    row = store.jobs.get(key, ANY_OWNER)
     store.jobs.correct(row.photo, row.lens, row.lens_version, row.params)
 
-    assert not store.jobs.retry(failed_correction, ANY_OWNER)
+    assert not store.jobs.retry(key, ANY_OWNER)

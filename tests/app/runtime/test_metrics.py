@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import socket
-from typing import Any
-
 import httpx2
 import pytest
+from conftest import Steps
 from prometheus_client.parser import text_string_to_metric_families
+from servers import free_port
 from starlette.testclient import TestClient
 
 from app.jobs.queue import durable
@@ -30,7 +29,7 @@ def asked(client: TestClient) -> dict[str, float]:
     return numbers(answer.text)
 
 
-def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, steps: Any) -> None:
+def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, steps: Steps) -> None:
     steps.receive()
     begun = steps.receive()
     steps.inspect(begun)
@@ -45,7 +44,7 @@ def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, 
 
 
 def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
-    client: TestClient, steps: Any
+    client: TestClient, steps: Steps
 ) -> None:
     lens = steps.lens_id(steps.counted())
     before = asked(client)
@@ -77,9 +76,7 @@ def test_a_worker_tells_its_own_where_it_has_an_address(monkeypatch: pytest.Monk
 
     durable("photo", fail, lambda *_: None)("p", 1)
     durable("photo", fail, lambda *_: None)("p", 1)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+    address = f"127.0.0.1:{free_port()}"
 
     metrics.publish(address)
 

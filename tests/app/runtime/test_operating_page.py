@@ -7,12 +7,12 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from servers import free_port
 
 PAGES = [Path(__file__).parents[3] / "docs" / name for name in ("service.md", "topics/operating.md")]
 ELSEWHERE = "/var/lib/postgresql"
@@ -29,10 +29,7 @@ def commands() -> list[str]:
 def test_each_command_of_the_pages_does_what_it_says(tmp_path: Path) -> None:
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("needs bash and curl, as the page does")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    lines = ["set -e"]
+    port, lines = str(free_port()), ["set -e"]
     for line in commands():
         lines.append(line.replace("8000", port))
         if line.endswith("&"):  # a person waits for the address

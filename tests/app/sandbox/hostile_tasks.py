@@ -7,6 +7,7 @@ import ctypes
 import errno
 import importlib
 import io
+import itertools
 import os
 import signal
 import socket
@@ -47,15 +48,6 @@ def refuse(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> N
     )
 
 
-def swell(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
-    return int(np.ones(arguments["mb"] << 17).sum())
-
-
-def spin(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    while True:
-        pass
-
-
 def sleep(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     (folder / "pid").write_text(str(os.getpid()))
     progress(0, 1)
@@ -67,18 +59,6 @@ def spawn(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
     (folder / "own").write_text(str(os.getpid()))
     (folder / "pid").write_text(str(process.pid))
     time.sleep(60)
-
-
-def crash(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    ctypes.string_at(0)
-
-
-def die(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def blunder(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    raise KeyError("nobody thought of this")
 
 
 def write(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
@@ -209,10 +189,6 @@ def sabotage(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
     }
 
 
-def abort(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    ctypes.CDLL(None).abort()
-
-
 def litter(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     for number in range(arguments["files"]):
         (folder / str(number)).write_bytes(bytes(arguments["bytes"]))
@@ -329,3 +305,11 @@ def link(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> Non
 
 
 TASKS = {name: each for name, each in globals().items() if isinstance(each, FunctionType) and name[0] != "_"}
+TASKS |= {
+    "abort": lambda *_: ctypes.CDLL(None).abort(),
+    "blunder": lambda *_: {}["nobody thought of this"],
+    "crash": lambda *_: ctypes.string_at(0),
+    "die": lambda *_: os.kill(os.getpid(), signal.SIGKILL),
+    "spin": lambda *_: all(itertools.repeat(True)),
+    "swell": lambda arguments, *_: int(np.ones(arguments["mb"] << 17).sum()),
+}

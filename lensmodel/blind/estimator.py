@@ -1,4 +1,4 @@
-"""What every blind estimator takes and gives, what it refuses, and the last steps that several share."""
+"""What every blind estimator takes, gives and refuses."""
 
 from __future__ import annotations
 
@@ -41,13 +41,10 @@ class PsfEstimate:
 
 
 class PsfEstimator(Protocol):
-    """A blind estimator: patches of one field position in, one kernel out [1]_.
+    """A blind estimator: patches of one field position in, one kernel out.
 
-    Name and version are stored with each sample.
-
-    References
-    ----------
-    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 5.
+    Name and version are stored with each sample. Source: M. Hirsch, B. Schölkopf, "Self-Calibration of
+    Optical Lenses", ICCV 2015, section 5.
     """
 
     @property
@@ -66,7 +63,7 @@ class PsfEstimator(Protocol):
         size: int = 31,
         green: PsfEstimate | None = None,
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share.
+        """Estimate the kernel that all patches share, of sum 1 and with its centre of mass in the middle.
 
         Parameters
         ----------
@@ -79,17 +76,10 @@ class PsfEstimator(Protocol):
         green : PsfEstimate, optional
             What this method gave for the same windows in green, to start another color from.
 
-        Returns
-        -------
-        PsfEstimate
-            Its kernel is float64 of shape (size, size), with sum 1 and its centre of mass in the middle.
-
         Raises
         ------
         NotEnoughEvidenceError
             If no patch determines a kernel: flat, clipped, or noise only.
-        InvalidInputError
-            For values that no photo has.
         """
 
 
@@ -113,8 +103,7 @@ class PhotoEstimator(Protocol):
         """Return the samples of the windows, three of each in the order of `CHANNELS`."""
 
 
-LARGEST: Final = 55
-"""Side of the largest kernel that is estimated, the paper's: a larger one leaves too little of a patch."""
+LARGEST: Final = 55  # pixels, the side of the paper's kernels: a larger one leaves too little of a patch
 
 
 def require_size(size: int) -> None:
@@ -163,13 +152,9 @@ def _unfit(patch: Plane, model: NoiseModel) -> str | None:
     return None
 
 
-_HALF_CONFIDENT = 0.4
-"""Relative error at which a kernel's weight is a half: that of a usual blind one (chosen)."""
-
-
 def confidence_of(error: float) -> float:
-    """Confidence of an estimate with an expected relative L2 error; 1/2 at 0.4."""
-    return 1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2)
+    """Confidence of an estimate with an expected relative L2 error; 1/2 at a usual one, 0.4 (chosen)."""
+    return 1.0 / (1.0 + (error / 0.4) ** 2)
 
 
 def finished(kernel: Kernel, *, size: int, error: float) -> PsfEstimate:

@@ -1,9 +1,9 @@
-"""The default: patches of a whole photo, encoded beside each other by a network that knows many lenses.
+"""The default: patches of a whole photo, encoded beside each other by the network of `lensmodel.neural`.
 
 photo -> windows all over it -> statistics -> tokens, by attention within the photo -> a kernel of each
 
-Kernels of single patches are the samples of the paper: to be looked at, exported, and averaged by its
-regression. The model attends to the tokens themselves (`lensmodel.model.learned_field`).
+Kernels of single patches are to be looked at, exported, and averaged by the paper's regression. The model
+attends to the tokens themselves (`lensmodel.model.learned_field`).
 """
 
 from __future__ import annotations
@@ -33,13 +33,11 @@ from lensmodel.patches.spread import spread_evenly
 from lensmodel.patches.windows import Patch, Selection
 from lensmodel.photo.values import LinearPhoto
 
-_DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)
-"""Of planes that a converter or a camera made: what the network was trained with."""
-
+_DEVELOPED_NOISE: Final = NoiseModel(shot=0.0, read=1e-6)  # of developed planes in the training
 _HELD: Final = 0.999  # share of its light that the array of a sample's kernel holds (chosen)
 _LEAST_SIDE: Final = 15  # pixels: of a sample's kernel (chosen)
-_ANYWHERE: Final = FieldPosition(0.5, 0.6)
-"""Place of patches of which nobody says where they lie (chosen: between centre and corner)."""
+_ANYWHERE: Final = FieldPosition(0.5, 0.6)  # of patches of which nobody says where they lie (chosen)
+_MOSAIC: Final = ((0, 1), (1, 2))  # by which developed planes are sampled
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +66,9 @@ class LearnedEstimator:
         on_step: StepHook = ignore_step,
     ) -> list[PsfSample]:
         """Encode patches of a photo beside each other."""
-        network, kind = FieldNetwork.load(), _kind_of(developed)
+        network = FieldNetwork.load()
+        # only a Bayer mosaic holds the samples of the sensor
+        kind: PatchKind = "jpeg" if developed.info.kind == "jpeg" else "raw" if developed.cfa else "tiff"
         conditions = Conditions.of(settings, developed.info.metadata.pixel_pitch_um, kind)
         xy = np.array([patch.position.xy for patch in patches])
         rows = []
@@ -112,12 +112,11 @@ class LearnedEstimator:
     ) -> PsfEstimate:
         """Estimate the kernel that patches of one plane share, as if all colors of a mosaic were that plane.
 
-        The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image. See
-        `PsfEstimator.estimate`.
+        The middle 128 pixels of a patch are used; a smaller one is continued by its mirror image.
         """
         kept = usable(patches, noise, size)
         network, conditions = FieldNetwork.load(), Conditions()
-        colours = _colours(((0, 1), (1, 2)), 0, 0)
+        colours = _colours(_MOSAIC, 0, 0)
         xy = np.tile(_ANYWHERE.xy, (len(kept), 1))
         rows = [
             patch_statistics(_middle(plane), colours, math.sqrt(model.read), model.shot)
@@ -129,18 +128,11 @@ class LearnedEstimator:
         return finished(answer.kernels[1], size=size, error=float(answer.error[1]))
 
 
-def _kind_of(developed: LinearPhoto) -> PatchKind:
-    """How the network is to take the pixels: only a Bayer mosaic holds the samples of the sensor."""
-    if developed.info.kind == "jpeg":
-        return "jpeg"
-    return "raw" if developed.cfa is not None else "tiff"
-
-
 def _statistics(developed: LinearPhoto, patch: Patch) -> NDArray[np.float32]:
     """Statistics of the samples of a mosaic in a window: the sensor's, or else planes sampled by one."""
     rows, cols = slice(patch.row, patch.row + WINDOW), slice(patch.col, patch.col + WINDOW)
     planes = developed.planes[:, rows, cols]
-    colours = _colours(developed.cfa or ((0, 1), (1, 2)), patch.row, patch.col)
+    colours = _colours(developed.cfa or _MOSAIC, patch.row, patch.col)
     mosaic = np.take_along_axis(planes, colours[None].astype(np.intp), axis=0)[0]
     noise = developed.sensor_noise[1] if developed.cfa and developed.sensor_noise else _DEVELOPED_NOISE
     return patch_statistics(np.ascontiguousarray(mosaic), colours, math.sqrt(noise.read), noise.shot)

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import scipy
@@ -34,12 +34,8 @@ from lensmodel.core.psf import as_kernel, delta, otf, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 
 _BORDER = 3  # pixels left out along the rim: fewer patches overlap there (chosen)
-_ERROR: Final = 0.61
-"""Expected relative L2 error, of every patch alike: its mean on 24 patches of `lensmodel bench blind`."""
-
-ALPHA = 4.0 / 3.0
-"""Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
-
+_ERROR: Final = 0.61  # expected relative L2: the mean on 24 patches of `lensmodel bench blind`
+ALPHA = 4.0 / 3.0  # between levels: smaller and copies are hardly sharper, larger and patches do not recur
 SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
 _COMPONENTS = 10  # by which neighbours are found: they hold nearly all of a patch's power (chosen)
 _NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
@@ -205,9 +201,8 @@ class _Scaled:
 class PatchRecurrence:
     """Kernel for which undoing the blur makes patches recur across scales.
 
-    min over x, k of |y - k * x|² + lambda1 rho(x, x^a) + lambda2 |k|²: alternating the match of
-    patches, a Wiener-like image step and a least-squares kernel step, coarse to fine. All patches
-    of a set share k: their normal equations are summed with weights 1/noise².
+    min over x, k of |y - k * x|² + lambda1 rho(x, x^a) + lambda2 |k|²: alternating the match of patches, a
+    Wiener-like image step and a least-squares kernel step, coarse to fine. Patches share k.
     """
 
     levels: int = 6  # levels of the pyramid, each 4/3 smaller
@@ -227,10 +222,7 @@ class PatchRecurrence:
         size: int = 31,
         green: PsfEstimate | None = None,
     ) -> PsfEstimate:
-        """Estimate the kernel that patches share: after green, the finest level alone, from its kernel on.
-
-        See `PsfEstimator`.
-        """
+        """Estimate the kernel that patches share: after green, the finest level alone, from its kernel on."""
         levels = self.levels if green is None else 1
         kept = usable(patches, noise, size)
         scaled = [_Scaled.of(patch, model) for patch, model in kept]
@@ -249,33 +241,26 @@ class PatchRecurrence:
 
     def _step(self, views: Sequence[_Scaled], latent: list[Image], kernel: Kernel, side: int) -> Kernel:
         """Match and sharpen each latent image, in place, and solve for the kernel that they share."""
-        parts = []
+        a, b, taken = np.zeros((side**2, side**2)), np.zeros(side**2), 0.0
         for i, view in enumerate(views):
             z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise))
             latent[i], response = blend(view.y, kernel, z, self.beta)
-            parts.append(normal_equations(latent[i], view.y, side, view.noise, response))
-        return self._solved(parts, views, np.asarray(resized(kernel, side)))
-
-    def _solved(self, parts: Sequence[Part], views: Sequence[_Scaled], begin: NDArray[np.float64]) -> Kernel:
-        """Kernel of the normal equations of all patches together."""
-        weights = [1.0 / max(view.noise**2, 1e-6) for view in views]
-        a = np.asarray(sum(weight * part[0] for weight, part in zip(weights, parts, strict=True)))
-        b = np.asarray(sum(weight * part[1] for weight, part in zip(weights, parts, strict=True)))
+            own_a, own_b, own_taken = normal_equations(latent[i], view.y, side, view.noise, response)
+            weight = 1.0 / max(view.noise**2, 1e-6)
+            a, b, taken = a + weight * own_a, b + weight * own_b, taken + weight * own_taken
         ridge = self.ridge * np.trace(a) / a.shape[0]
         a[np.diag_indices_from(a)] += ridge
-        taken = sum(weight * part[2] for weight, part in zip(weights, parts, strict=True))
-        solved = nonnegative_least_squares(a, b, begin.ravel(), smallest=ridge - taken)
+        begin = np.asarray(resized(kernel, side)).ravel()
+        solved = nonnegative_least_squares(a, b, begin, smallest=ridge - taken)
         solved[solved < 0.01 * solved.max()] = 0.0
         if not solved.max() > 0:
             raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
-        return as_kernel(solved.reshape(begin.shape))
+        return as_kernel(solved.reshape(side, side))
 
 
-Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], float]
-"""Normal equations of one patch: A, b, and the most by which an eigenvalue of A can be below zero."""
-
-
-def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]) -> Part:
+def normal_equations(
+    x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Normal equations of y = k * x over the interior, the noise that x took from y taken off.
 
     With h the filter by which y entered x (origin at [0, 0]), s the noise of y and N interior pixels::

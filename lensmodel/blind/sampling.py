@@ -1,9 +1,6 @@
-"""Step 1: from a photo to samples of its lens's PSF.
+"""Step 1: from a photo to samples of its lens's PSF, with the parts that a `Config` names.
 
-inspect -> develop -> choose patches -> estimate each cell of them -> samples
-
-Each step is a plain function on values, so that a script, the command and the workers of the service run the
-same code. `PRESETS` say which parts are taken where nobody asks for others.
+develop -> choose patches -> estimate each cell of them -> samples
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ import logging
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -44,12 +41,9 @@ from lensmodel.photo import LinearPhoto, PhotoMetadata
 
 log = logging.getLogger(__name__)
 
-DEFAULT_KERNEL_SIZE: Final = 31
-"""Pixels: holds the blur of usual lenses, and the cost grows with its square (chosen)."""
+DEFAULT_KERNEL_SIZE: Final = 31  # pixels: holds usual blur, and the cost grows with its square (chosen)
 _PATCH_SIZE: Final = 192  # pixels: room for a kernel, few enough for one blur (chosen)
-_SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
-KERNEL_PATCHES: Final = 24
-"""Patches that an estimator of kernels looks at: each costs a second (chosen)."""
+KERNEL_PATCHES: Final = 24  # that an estimator of kernels looks at: each costs a second (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +66,7 @@ PRESETS: Final[Mapping[str, Config]] = MappingProxyType(
     }
 )
 """`default` encodes patches of whole photos and attends to them. `paper` is that of M. Hirsch and
-B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4 to 7, to be compared with: kernels
-by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and Richardson-Lucy deconvolution, without
-what guards photos from errors of any of them."""
+B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4 to 7, to be compared with."""
 
 
 def configured(
@@ -159,7 +151,7 @@ def find_patches(
         require_spread(selection.patches, count=count)
         return selection
     third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
-    size = min(_PATCH_SIZE, max(third, _SMALLEST_PATCH))
+    size = min(_PATCH_SIZE, max(third, patches.SMALLEST_PATCH))
     selection = patches.select(
         developed.planes[1],
         developed.noise[1],
@@ -202,10 +194,9 @@ def estimate_cell(
 ) -> list[PsfSample]:
     """Estimate the PSF of one field cell in each channel, green first, of a photo or the folder of one.
 
-    The patches of a cell share one kernel: their normal equations are summed, which is worth
-    more than averaging finished kernels. Each patch becomes one sample at its own place, and
-    the weights of a cell's samples add up to the confidence of its estimate. An estimator of whole
-    photos has all patches of one in one cell, and gives each its own kernels.
+    The patches of a cell share one kernel: their normal equations are summed, which is worth more than
+    averaging finished kernels. Each becomes a sample at its place; their weights add up to the confidence.
+    An estimator of whole photos has all patches of one in one cell, and gives each its own kernels.
     """
     developed = load_developed(developed) if isinstance(developed, Path) else developed
     method = estimators.resolve(estimator)
@@ -306,7 +297,7 @@ def samples_of_photo(
     groups = patches_by_cell(selection)
     total, done = len(selection.patches), 0
     on_event(CalibrationEvent(path, "estimating", done, total))
-    by_cell: dict[int, list[PsfSample]] = {}
+    samples: list[PsfSample] = []
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         alone = len(groups) == 1
         if not alone:
@@ -320,20 +311,18 @@ def samples_of_photo(
             size=config.kernel_size,
         )
         with ThreadPoolExecutor(1) if alone else processes.pool(executor, workers, method) as pool:
-            jobs = {pool.submit(estimate, group): index for index, group in enumerate(groups)}
+            jobs = [pool.submit(estimate, group) for group in groups]
             try:
-                for job in as_completed(jobs):
-                    index = jobs[job]
+                for group, job in zip(groups, jobs, strict=True):
                     try:
-                        by_cell[index] = job.result()
+                        samples += job.result()
                     except NotEnoughEvidenceError as error:
                         log.info("a cell of %s was dropped: %s", path.name, error)
-                    done += len(groups[index])
+                    done += len(group)
                     on_event(CalibrationEvent(path, "estimating", done, total))
             finally:
                 for job in jobs:
                     job.cancel()  # those not begun, after an error: leaving `with` waits only for what runs
-    samples = [sample for index in sorted(by_cell) for sample in by_cell[index]]
     if not samples:
         raise NoUsablePatchesError(
             f"none of the {total} patches of {path.name} determines a PSF; "

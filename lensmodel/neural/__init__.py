@@ -1,13 +1,7 @@
-"""The learned part of the model: what a patch tells of the blur, and a regression with learned kernels.
+"""The network: `statistics` turns a patch into numbers, `network` encodes the patches of a photo and answers.
 
-Attention over a set of samples is Nadaraya-Watson regression [1]_ whose kernel, the weight of each sample in
-the answer, is learned, as is what each sample says. `statistics` turns a patch into numbers, `network`
-encodes the patches of a photo and answers at a place; `features` makes both the same in all eight octants of
-the field.
-
-References
-----------
-.. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6, eq. 3 to 7.
+`features` makes both the same in all eight octants of the field. `lensmodel.blind.learned` takes the patches
+from photos, and `lensmodel.model.learned_field` asks of those of all photos; `lab.population` trains it.
 """
 
 from lensmodel.neural.features import Conditions

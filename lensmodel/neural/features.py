@@ -19,8 +19,7 @@ from lensmodel.core.psf import KINDS, PatchKind
 from lensmodel.core.types import LensSettings
 
 OCTANTS: Final = 8
-DIRECTIONS: Final = 16
-"""Directions of statistics over the full circle, pi/8 apart, counter-clockwise from the right."""
+DIRECTIONS: Final = 16  # of statistics over the full circle, counter-clockwise from the right
 
 
 def octant_of(xy: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -78,12 +77,9 @@ _PRODUCTS: Final = _MATRICES[:, None] @ _MATRICES.mT[None]
 _RELATIVE: Final = (_PRODUCTS[:, :, None] == _MATRICES).all(axis=(-1, -2)).argmax(axis=-1)
 
 
-FAR_M: Final = 50.0
-"""Metres: focus farther away is as good as infinite: a lens of 300 mm moves less than 2 mm for it."""
-
+FAR_M: Final = 50.0  # focus farther away is as good as infinite: a lens of 300 mm moves less than 2 mm for it
 _GREEN_UM: Final = 0.54
-SETTINGS: Final = 5
-"""Columns of settings: logarithms of f-number, diffraction width (px), focal length, focus; the kind."""
+SETTINGS: Final = 5  # columns: logarithms of f-number, diffraction width (px), focal length, focus; the kind
 
 
 @dataclass(frozen=True, slots=True)

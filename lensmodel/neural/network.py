@@ -6,14 +6,10 @@ place and settings, starts from what is usual there and takes up the samples by 
 
     a = softmax_j( q k_j / sqrt(d) + (q P) phi_j - g |distances_j| ),    out = sum_j a_j (v_j + phi_j R)
 
-which is eq. (4) of the paper [1]_ with learned weights and values; phi_j tells how sample j lies to the
-query. One more logit, of nothing, lets few or far samples count little. The answer are logits of a kernel at
-two scales, a softmax of which is non-negative with sum 1, and the expected error. Here in NumPy; trained by
-`lab.population`.
-
-References
-----------
-.. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6, eq. 3 to 7.
+which is Nadaraya-Watson regression (M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015,
+eq. 4) with learned weights and values; phi_j tells how sample j lies to the query. One more logit, of
+nothing, lets few or far samples count little. The answer are logits of a kernel at two scales, a softmax of
+which is non-negative with sum 1, and the expected error.
 """
 
 from __future__ import annotations
@@ -48,10 +44,8 @@ Array = NDArray[np.float32]
 FINE: Final = 33  # pixels: side of the part of a kernel that is told pixel by pixel
 COARSE: Final = 25
 BLOCK: Final = 3
-SIDE: Final = COARSE * BLOCK
-"""Pixels: side of a kernel. Beyond the fine part it is told in cells of BLOCK x BLOCK pixels."""
-RINGS: Final = 8
-"""Rings of frequency, 1/16 cycles/pixel wide, for which the error of the transfer function is told."""
+SIDE: Final = COARSE * BLOCK  # of a kernel, told in cells of BLOCK x BLOCK pixels beyond the fine part
+RINGS: Final = 8  # of frequency, 1/16 cycles/pixel wide, for which an error of the transfer function is told
 
 WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"  # the weights of the package
 _CLAMP: Final = 6.0  # standard deviations that a statistic may lie off the population's mean
@@ -80,13 +74,10 @@ class Memory:
 class FieldAnswer:
     """The PSF at a place and settings."""
 
-    # (3, SIDE, SIDE), of red, green and blue; non-negative, of sum 1, centre of mass in the middle
-    kernels: NDArray[np.float64]
+    kernels: NDArray[np.float64]  # (3, SIDE, SIDE), of red, green and blue; of sum 1, centred
     error: NDArray[np.float64]  # (3,), expected relative L2 distance to the true kernels
-    # (3, RINGS), expected r.m.s. error of the transfer function in each ring of frequency.
-    ring_error: NDArray[np.float64]
-    # (n,), how much each sample counted, of sum 1: the mean over the attention of all blocks and heads
-    weights: NDArray[np.float64]
+    ring_error: NDArray[np.float64]  # (3, RINGS), expected r.m.s. error of the transfer function
+    weights: NDArray[np.float64]  # (n,), of the samples, of sum 1: the mean over all attention
 
 
 def _gelu(x: Array) -> Array:

@@ -1,7 +1,6 @@
 """What one patch of a photo tells about the blur, as numbers that the network reads.
 
-Scenes have power spectra that fall as a power law, and edges that are steps; a lens bends both. The numbers
-are, for the samples of each colour in the mosaic, the logarithm of the noise-corrected power spectrum in
+They are, for the samples of each colour in the mosaic, the logarithm of the noise-corrected power spectrum in
 rings and directions, and for interpolated green how the gradient across edges correlates with itself along
 eight directions. The correlation of its third and seventh power with itself belongs to the strongest edges,
 is signed (a halo is negative) and differs between the two sides of an edge where the PSF is one-sided
@@ -20,14 +19,9 @@ from lensmodel.core.jit import jit
 from lensmodel.core.types import Plane
 from lensmodel.neural.features import DIRECTIONS, direction_order, octant_of
 
-WINDOW: Final = 128
-"""Pixels: side of a patch; holds several times the widest kernel, and little of the field (chosen)."""
-
-_RINGS: Final = (
-    0.022, 0.04, 0.056, 0.075, 0.1, 0.128, 0.158, 0.19, 0.225, 0.265, 0.31, 0.36, 0.43,
-)  # fmt: skip
-"""Edges of rings, cycles/pixel: from three periods in a window to where green of a Bayer mosaic still
-tells."""
+WINDOW: Final = 128  # pixels: holds several times the widest kernel, and little of the field (chosen)
+# edges, cycles/pixel: from three periods in a window to where green of a Bayer mosaic still tells
+_RINGS: Final = (0.022, 0.04, 0.056, 0.075, 0.1, 0.128, 0.158, 0.19, 0.225, 0.265, 0.31, 0.36, 0.43)
 _GREEN_RINGS, _COLOUR_RINGS, _LOW_RINGS = 12, 9, 2
 _SHIFTS: Final = (1, 2, 3, 4, 6, 9, 13)  # pixels between correlated gradients
 _POWERS: Final = 3  # first (of magnitudes), third and seventh (signed)

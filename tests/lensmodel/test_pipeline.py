@@ -12,12 +12,12 @@ from lensmodel import api, correction, photo
 from lensmodel.blind import sampling
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
+from lensmodel.core.psf import PsfSample, delta
+from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
+from lensmodel.photo.development import photo_from_array
 from lensmodel.simulate import (
     BlurOptions,
     SimulatedCamera,
@@ -166,16 +166,9 @@ def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:
 
 
 def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
-    developed = LinearPhoto(
-        planes=np.zeros((3, 4, 4), dtype=np.float32),
-        frame=Frame(4, 4),
-        noise=(NoiseModel.white(0.01),) * 3,
-        clip=(1.0, 1.0, 1.0),
-        info=photo.PhotoInfo("dng", 4, 4, photo.PhotoMetadata(aperture=2.8, focal_mm=35.0)),
-        encoding=photo.Encoding(),
-    )
+    said = photo.PhotoMetadata(aperture=2.8, focal_mm=35.0)
 
-    chosen = developed.info.metadata.settings(LensSettings(aperture=4.0, focus_m=2.0))
+    chosen = said.settings(LensSettings(aperture=4.0, focus_m=2.0))
 
     assert (chosen.aperture, chosen.focal_mm, chosen.focus_m) == (2.8, 35.0, 2.0)
 
@@ -194,17 +187,8 @@ def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.
 
     monkeypatch.setattr(api.correction, "correct_planes", record)
     monkeypatch.setattr(api, "resample", lambda planes, *_: planes + 1)
-    developed = LinearPhoto(
-        planes=np.zeros((3, 4, 4), dtype=np.float32),
-        frame=Frame(4, 4),
-        noise=(NoiseModel.white(0.01),) * 3,
-        clip=(1.0, 1.0, 1.0),
-        info=photo.PhotoInfo("dng", 4, 4),
-        encoding=photo.Encoding(),
-    )
-    kernel = np.zeros((5, 5))
-    kernel[2, 2] = 1.0
-    model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
+    developed = photo_from_array(np.zeros((3, 4, 4)))
+    model = LensModel.fit([PsfSample(delta(5), FieldPosition(0.1, 0.0))])
 
     for method, warped in (("paper", True), ("standard", False)):
         api.correct_photo(developed, model, LensSettings(), method=method, lateral="shift")  # type: ignore[arg-type]

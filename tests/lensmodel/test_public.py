@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 
 import lensmodel
 from lab.kernels import gaussian
+from lensmodel.api import say
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.geometry import field_grid
@@ -287,3 +289,29 @@ def test_a_lens_comes_back_from_its_file(tmp_path: Path) -> None:
 
     asked = {"aperture": 2.0, "size": 15}
     assert back.psf(0.7, 0.2, **asked).kernel == pytest.approx(lens.psf(0.7, 0.2, **asked).kernel, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "notebook", "said"),
+    [
+        (True, False, "\r\x1b[Ka.dng: 50%\r\x1b[Ka.dng: done\n"),
+        (False, True, "a.dng: done\n"),
+        (False, False, ""),
+    ],
+)
+def test_a_terminal_shows_each_step_and_a_notebook_whole_lines(
+    terminal: bool,
+    notebook: bool,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+    if notebook:
+        monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+
+    say("a.dng: 50%")
+    say("a.dng: done", stays=True)
+
+    assert capsys.readouterr().err == said

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from lab import kernels
 from lensmodel.core import errors, psf
 from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
+from lensmodel.core.types import FieldPosition, LensSettings
 
 angles = st.floats(-10, 10)
 
@@ -69,12 +71,6 @@ def test_one_stop_is_a_factor_of_root_two() -> None:
     assert wide is not None
     assert stopped is not None
     assert stopped - wide == pytest.approx(1.0)
-
-
-def test_noise_variance_grows_with_level() -> None:
-    noise = NoiseModel(shot=1e-3, read=1e-6)
-
-    assert np.allclose(noise.variance(np.array([0.0, 1.0])), [1e-6, 1.001e-3])
 
 
 def test_registry_names_what_it_knows() -> None:
@@ -144,3 +140,52 @@ def test_sample_keeps_its_own_read_only_kernel() -> None:
     assert sample.kernel.sum() == pytest.approx(1.0)
     with pytest.raises(ValueError, match="read-only"):
         sample.kernel[0, 0] = 1.0
+
+
+# ---- names of cameras and lenses
+
+
+@pytest.mark.parametrize(
+    ("maker", "model", "name"),
+    [
+        ("Acme", "Acme 42mm", "Acme 42mm"),
+        ("ACME", "Acme 42mm", "Acme 42mm"),
+        ("Canon", "EF24mm f/1.4L", "Canon EF24mm f/1.4L"),
+        (None, "42mm", "42mm"),
+        ("Acme", None, "Acme"),
+        (None, None, ""),
+    ],
+)
+def test_a_maker_is_named_once(maker: str | None, model: str | None, name: str) -> None:
+    assert full_name(maker, model) == name
+
+
+@pytest.mark.parametrize(
+    ("maker", "model", "name"),
+    [
+        ("EASTMAN KODAK COMPANY", "KODAK Z612 ZOOM DIGITAL CAMERA", "Kodak Z612"),
+        ("Eastman Kodak Company", "Kodak Digital Science DC50 Zoom Camera", "Kodak Digital Science DC50"),
+        ("NIKON CORPORATION", "NIKON D1", "Nikon D1"),
+        ("OLYMPUS IMAGING CORP.", "E-P3", "Olympus E-P3"),
+        ("Hewlett-Packard", "HP Photosmart", "Hewlett-Packard HP Photosmart"),
+        ("DJI", "FC300S", "DJI FC300S"),
+        (None, "CAMERA", "CAMERA"),
+    ],
+)
+def test_a_camera_is_named_without_company_and_kind(maker: str | None, model: str, name: str) -> None:
+    assert camera_name(maker, model) == name
+
+
+# ---- least squares
+
+
+def test_least_squares_respects_the_sign_constraint() -> None:
+    a = np.diag([2.0, 4.0, 1.0])
+
+    k = nonnegative_least_squares(a, np.array([2.0, -3.0, 0.5]), np.ones(3))
+
+    assert np.allclose(k, [1.0, 0.0, 0.5], atol=1e-6)
+
+
+def test_where_nothing_is_known_the_start_comes_back() -> None:
+    assert nonnegative_least_squares(np.zeros((2, 2)), np.zeros(2), np.ones(2)).tolist() == [1.0, 1.0]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lab.kernels import distance, gaussian
-from lab.model_benchmark import PaperModel, pixel_to_local
+from lab.model_benchmark import pixel_to_local, run_model_benchmark
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, UnknownMethodError
 from lensmodel.core.psf import PsfSample, centroid, delta, second_moments
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings
@@ -64,9 +64,8 @@ def photo(
             kernel = np.fft.ifft2(np.fft.fft2(kernel) * np.fft.fft2(np.fft.ifftshift(shake))).real
         kernel = np.maximum(kernel, 0.0)
         # noise that leaves the empty surroundings empty: clipped there, it would be a bias, not noise
-        kernel = np.maximum(
-            kernel + rng.normal(0.0, noise, kernel.shape) * np.sqrt(kernel * kernel.max()), 0.0
-        )
+        grain = rng.normal(0.0, noise, kernel.shape) * np.sqrt(kernel * kernel.max())
+        kernel = np.maximum(kernel + grain, 0.0)
         found.append(PsfSample(kernel, where, GREEN, photo=name))
     return tuple(found)
 
@@ -239,14 +238,6 @@ def test_answer_is_within_eight_hundredths_of_the_exact_sum() -> None:
         assert np.abs(fast - exact).max() <= 0.08 * exact.max()
 
 
-def test_bandwidth_of_the_paper_taken_literally_widens_the_psf() -> None:
-    where = FieldPosition(0.5, 0.4)
-    literal = PaperModel.fit(photos(3, samples=16)).kernel_at_settings(where, GREEN, SIZE)
-    ours = kernel_at(LensModel.fit(photos(3, samples=16)), where.r, where.phi)
-
-    assert distance(literal, truth(where)).rel_l2 > 3 * distance(ours, truth(where)).rel_l2
-
-
 def test_bandwidths_are_those_of_green_in_whatever_order_channels_come() -> None:
     green = photos(3, noise=0.01)
     blue = [replace(s, settings=s.settings.with_channel("b")) for s in photos(3, noise=0.5)]
@@ -334,12 +325,6 @@ def test_older_model_is_untouched_by_samples_added_later() -> None:
     assert kernel_at(left, 0.5, 0.5).max() > kernel_at(right, 0.5, 0.5).max()
 
 
-def test_a_sample_takes_25_bytes_a_pixel() -> None:
-    samples = photos(20)
-
-    assert LensModel.fit(samples).nbytes < 25 * SIZE * SIZE * len(samples) + 8 * 800 * SIZE * SIZE
-
-
 # ---- bad photos, and what it says of itself
 
 
@@ -417,10 +402,8 @@ def test_a_question_far_from_every_sample_says_in_what(
 
 
 def test_unknown_aperture_takes_no_part_in_distances() -> None:
-    model, where = (
-        LensModel.fit([replace(s, settings=LensSettings()) for s in photos(2)]),
-        FieldPosition(0.5, 1),
-    )
+    model = LensModel.fit([replace(s, settings=LensSettings()) for s in photos(2)])
+    where = FieldPosition(0.5, 1.0)
     at_two, at_eight = (model.query(where, LensSettings(aperture=n), SIZE) for n in (2.0, 8.0))
 
     assert np.array_equal(at_two.kernel, at_eight.kernel)
@@ -451,3 +434,19 @@ def test_even_sizes_are_refused(size: int) -> None:
 def test_impossible_expectations_are_refused(bad: float) -> None:
     with pytest.raises(InvalidInputError, match="expected error"):
         replace(photo("a", 0)[0], error=bad)
+
+
+# ---- true kernels of lenses that were not looked at while it was made
+
+
+@pytest.mark.slow
+def test_true_kernels_are_predicted_between_and_beyond_the_patches() -> None:
+    rows = run_model_benchmark(seeds=range(2000, 2016), photos=(1, 2, 5), methods=["mode-default"])
+    errors = {row["photos"]: row["errors"] for row in rows}
+
+    assert errors[1]["corner"] <= 0.25
+    assert errors[1]["center"] <= 0.15
+    assert errors[5]["corner"] <= 0.175
+    assert errors[5]["center"] <= 0.06
+    for zone in ("center", "mid", "corner"):
+        assert errors[1][zone] > errors[2][zone] > errors[5][zone]

@@ -212,10 +212,10 @@ def reproduce(
     assert_bars: Annotated[bool, typer.Option("--assert-bars", help="Fail where a bar is missed.")] = False,
     force: Force = False,
 ) -> None:
-    """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
+    """Make the paper's figures and its Table 1 on simulated lenses.
 
-    Finished results are kept: a run that was stopped goes on, and a change of code or settings computes anew.
-    A finished page is replaced only with --force.
+    Nothing was tuned on them. Finished results are kept: a run that was stopped goes on, and a change of code
+    or settings computes anew. A finished page is replaced only with --force.
 
     Examples:
 

@@ -28,12 +28,13 @@ from app.schemas import CorrectionOut, JobOut, PhotoOut
 from lab.images import Picture, ZoneSharpness, as_shown, by_zone, fidelity, measure_edges, side_by_side
 from lab.kernels import distance
 from lab.scenes import photograph_of
-from lensmodel.cli.console import Display, mtf50_words
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone
 from lensmodel.photo import develop
+from lensmodel.report.lens_report import SensorGeometry
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo
 
 # what a demo leaves in its folder
@@ -206,8 +207,9 @@ def _cells(values: Mapping[Zone, float]) -> str:
 
 
 def _edge_rows(before: Mapping[Zone, ZoneSharpness], after: Mapping[Zone, ZoneSharpness]) -> str:
+    words = SensorGeometry().words
     return "\n".join(
-        f"| {ZONE_WORDS[zone]} | {mtf50_words(before[zone].mtf50)} | {mtf50_words(made.mtf50)} "
+        f"| {ZONE_WORDS[zone]} | {words(before[zone].mtf50)} | {words(made.mtf50)} "
         f"| {made.mtf_max:.2f} | {made.overshoot:.1f} % |"
         for zone, made in after.items()
         if zone in before

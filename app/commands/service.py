@@ -96,7 +96,7 @@ def worker(data: Data = None) -> None:
 
 
 def config(data: Data = None) -> None:
-    """Print the effective settings as environment variables; secrets are masked.
+    """Print the settings as environment variables.
 
     The last lines tell which measures of this machine's kernel confine the processes that decode photos.
 

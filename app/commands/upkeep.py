@@ -21,7 +21,9 @@ def doctor(
     json_output: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Check an installation, running or not: tables, blobs, and whether a worker is running.
+    """Check an installation, running or not.
+
+    Checked are tables, blobs, and whether a worker is running.
 
     Examples:
 
@@ -53,7 +55,7 @@ def backup(
     data: Data = None,
     quiet: Quiet = False,
 ) -> None:
-    """Copy all rows and blobs of an installation into a folder, even while it runs.
+    """Copy an installation into a folder, even while it runs.
 
     The folder is a complete backup at every moment: the last step replaces the old one by the new one.
     Only blobs that are not there yet are copied. It is a data folder itself: `lensmodel serve --data FOLDER`

@@ -61,12 +61,12 @@ def calibrate(
     quiet: options.Quiet = False,
     verbose: options.Verbose = 0,
 ) -> None:
-    """Learn the blur of one lens from photos and write it to a profile.
+    """Learn the blur of a lens from photos.
 
-    An existing profile is added to. Photos that it was learned from are skipped, and it is
-    saved after each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
-    beside a RAW file of the same name are passed over, and so are corrected photos. --scheduler lets
-    a Dask cluster do the work; give its address, such as tcp://10.0.0.1:8786.
+    It is written to a profile; an existing one is added to. Photos that it was learned from are skipped,
+    and it is saved after each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and
+    PNG files beside a RAW file of the same name are passed over, and so are corrected photos. --scheduler
+    lets a Dask cluster do the work; give its address, such as tcp://10.0.0.1:8786.
 
     Examples:
 

@@ -122,17 +122,16 @@ class Bar(Progress):
         self.add_task(text, total=total, left="")
         (self._task,) = self.tasks
 
-    def show(self, *, more: bool = False, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
+    def show(self, **changes: Any) -> None:  # noqa: ANN401 - as `Progress.update` takes them
         """Change what is shown as `Progress.update` does; tell it if it is time.
 
-        What was done of a photo that is then passed over stays done. While there is `more` work of another
-        kind ahead, whose pace nobody knows, no time left is told.
+        What was done of a photo that is then passed over stays done.
         """
         task = self._task
         if "completed" in changes:
             changes["completed"] = max(changes["completed"], task.completed)
         self.update(task.id, **changes)
-        left = "" if more or task.time_remaining is None else clock(task.time_remaining)
+        left = "" if task.time_remaining is None else clock(task.time_remaining)
         task.fields["left"] = left and f"ETA {left}"
         if self._say is not None and self.get_time() - self._last >= self._every_s:
             self._last = self.get_time()
@@ -150,14 +149,6 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-NYQUIST: Final = 0.5  # Cycles/pixel: the Nyquist frequency, the finest detail that a grid of pixels can hold
-
-
-def mtf50_words(frequency: float) -> str:
-    """Write an MTF50 in cycles/pixel: a lower bound where contrast has not halved at the pixels' limit."""
-    return f"at least {NYQUIST:g}" if frequency >= NYQUIST else f"{frequency:.3f}"
 
 
 def gain_words(gain: float | None) -> str:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -21,7 +20,7 @@ from lensmodel.api import FORMATS, SEEN_DB
 from lensmodel.blind.sampling import CalibrationEvent, configured
 from lensmodel.calibration import Calibration
 from lensmodel.cli import files, options
-from lensmodel.cli.console import Bar, Display, gain_words
+from lensmodel.cli.console import Display, gain_words
 from lensmodel.cli.ending import UsageError, reason
 from lensmodel.cli.groups import PhotoGroup, Shot, groups
 from lensmodel.core.errors import (
@@ -203,9 +202,7 @@ def correct(
         document = correct_groups(correction, profiles or base / PROFILES, learn_from)
     else:
         known = Lens(files.profile_at(profile))
-        with shown.progress(total=len(targets)) as bar:
-            results = correction.photos(list(targets), known, bar)
-        document = {"profile": str(profile), "results": results}
+        document = {"profile": str(profile), "results": correction.photos(list(targets), known)}
     shown.document(document)
     if any(result["state"] == "failed" for result in document["results"]):
         raise typer.Exit(1)
@@ -252,36 +249,39 @@ class Correction:
     display: Display
     refused: dict[Path, LensModelError | OSError] = field(default_factory=dict)  # photos that taught nothing
 
-    def photos(
-        self, paths: Sequence[Path], lens: Lens | None, bar: Bar, *, begin: int = 0, more: bool = False
-    ) -> list[dict[str, Any]]:
+    def photos(self, paths: Sequence[Path], lens: Lens | None) -> list[dict[str, Any]]:
         """Correct the photos of a lens, one after the other; return what became of each, and tell it."""
         results: list[dict[str, Any]] = []
-        tell = self.display.detail if self.sorted else self.display.note
         left: Counter[str] = Counter()
-        for number, path in enumerate(paths, start=begin):
-            bar.show(description=f"correcting {path.name}", more=more)
-            target = self.targets[path]
-            result = self._photo(path, target, lens, partial(bar.part, number, more=more))
-            match result["state"]:
-                case "failed":
-                    self.display.error(f"{path}: {result['reason']}")
-                case "left":
-                    left[result["reason"]] += 1
-                    few = left[result["reason"]] <= _SAID
-                    (self.display.note if few else tell)(f"{path}: left as it is: {result['reason']}")
-                case "kept":
-                    tell(f"{target} is there already and was left alone; --force replaces it")
-                case _:
-                    if self.sorted:
-                        tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
-                    else:
-                        self.display.result(str(target))
-                    for remark in _remarks(result):
-                        tell(f"{path.name}, {remark}")
-            results.append({"photo": str(path), "output": str(target), **result})
-            bar.show(completed=number + 1, more=more)
+        with self.display.progress(total=len(paths)) as bar:
+            for number, path in enumerate(paths):
+                bar.show(description=f"correcting {path.name}")
+                target = self.targets[path]
+                result = self._photo(path, target, lens, partial(bar.part, number))
+                left[result.get("reason", "")] += 1
+                self._tell(path, target, result, known=left[result.get("reason", "")] > _SAID)
+                results.append({"photo": str(path), "output": str(target), **result})
+                bar.show(completed=number + 1)
         return results
+
+    def _tell(self, path: Path, target: Path, result: Mapping[str, Any], *, known: bool) -> None:
+        """Tell what became of a photo, with -v even why it is left where that is `known` of others."""
+        display = self.display
+        tell = display.detail if self.sorted else display.note
+        match result["state"]:
+            case "failed":
+                display.error(f"{path}: {result['reason']}")
+            case "left":
+                (tell if known else display.note)(f"{path}: left as it is: {result['reason']}")
+            case "kept":
+                tell(f"{target} is there already and was left alone; --force replaces it")
+            case _:
+                if self.sorted:
+                    tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
+                else:
+                    display.result(str(target))
+                for remark in _remarks(result):
+                    tell(f"{path.name}, {remark}")
 
     def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
         """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
@@ -389,22 +389,13 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         except (LensModelError, OSError) as error:
             results.append({"photo": str(path), "output": None, **files.failed(error)})
             display.error(f"{path}: {reason(error)}")
-    lens_groups, unread = groups(shots), len(results)
-    counts = [min(most, group.scenes) for group in lens_groups]
-    with display.progress("learning", sum(counts) + len(shots)) as bar:
-        begins = accumulate(counts, initial=0)
-        learned = [
-            _learn(group, profiles, count, correction, bar, begin)
-            for group, count, begin in zip(lens_groups, counts, begins, strict=False)
-        ]
-        for group, count in zip(lens_groups, learned, strict=True):
-            target = group.profile_in(profiles)
-            lens = Lens(files.profile_at(target)) if target.exists() else None
-            begin = sum(counts) + len(results) - unread
-            more = group is not lens_groups[-1]  # photos of another kind, which may be left or take longer
-            done = correction.photos(group.paths, lens, bar, begin=begin, more=more)
-            results += done
-            rows.append(_row(group, None if lens is None else target, count, done))
+    for group in groups(shots):
+        target = group.profile_in(profiles)
+        count = _learn(group, target, min(most, group.scenes), correction)
+        lens = Lens(files.profile_at(target)) if target.exists() else None
+        done = correction.photos(group.paths, lens)
+        results += done
+        rows.append(_row(group, None if lens is None else target, count, done))
     if rows:
         display.result(table_of(rows))
     for row in rows:
@@ -419,27 +410,27 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
     return {"groups": rows, "results": results}
 
 
-def _learn(group: PhotoGroup, profiles: Path, most: int, correction: Correction, bar: Bar, begin: int) -> int:
+def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) -> int:
     """Learn the lens of a group; return from how many photos, now or in an earlier run."""
     display, counted = correction.display, 0
-
-    def on_event(event: CalibrationEvent) -> None:
-        text = f"learning from {event.photo.name}: {event.stage}"
-        bar.part(begin + counted, event.done, event.total, description=text, more=True)
-
-    store = files.ProfileFile(group.profile_in(profiles))
+    store = files.ProfileFile(profile)
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)
     paths = [shot.path for shot in group.to_learn_from()]
-    for event in calibration.learn(paths, on_event=on_event):
-        if event.error is None:
-            counted += 1
-        else:
-            correction.refused[event.photo] = event.error
-            display.detail(f"{event.photo}: {event.error}")
-        if counted == most:
-            break
-    bar.show(completed=begin + most, more=True)
+    with display.progress("learning", total=most) as bar:
+
+        def on_event(event: CalibrationEvent) -> None:
+            text = f"learning from {event.photo.name}: {event.stage}"
+            bar.part(counted, event.done, event.total, description=text)
+
+        for event in calibration.learn(paths, on_event=on_event):
+            if event.error is None:
+                counted += 1
+            else:
+                correction.refused[event.photo] = event.error
+                display.detail(f"{event.photo}: {event.error}")
+            if counted == most:
+                break
     refused = [correction.refused.get(path) for path in paths]
     if not counted and all(isinstance(error, NotEnoughEvidenceError) for error in refused):
         reasons = set(map(str, refused))

@@ -76,13 +76,5 @@ def remedy(missing: ModuleNotFoundError) -> str | None:
     if top in {"app", "lab"}:
         where = " or in the container image" if top == "app" else ""
         return f"this command is no part of the package: it runs in the source tree{where}"
-    if top == "matplotlib":
-        what, extra = "drawing", "report"
-    elif "app" in sys.modules:
-        what, extra = "the service", "service"
-    else:
-        return None
-    return (
-        f"this command needs {what}, which is not installed ({top} is missing): "
-        f"pip install 'lensmodel[{extra}]'"
-    )
+    extra = "report" if top == "matplotlib" else "service" if "app" in sys.modules else None
+    return extra and f"{top} is not installed: pip install 'lensmodel[{extra}]'"

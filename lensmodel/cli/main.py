@@ -27,52 +27,25 @@ ending.workers_ignore_it()
 COMMANDS: Final[Mapping[str | None, Mapping[str, tuple[str, str]]]] = {
     None: {
         "correct": ("lensmodel.cli.correct", "Remove the blur of the lens from photos."),
-        "calibrate": (
-            "lensmodel.cli.calibrate",
-            "Learn the blur of one lens from photos and write it to a profile.",
-        ),
-        "report": (
-            "lensmodel.cli.report",
-            "Say how sharp a lens is, whether it is centred, and which photo would help most.",
-        ),
+        "calibrate": ("lensmodel.cli.calibrate", "Learn the blur of a lens from photos."),
+        "report": ("lensmodel.cli.report", "Say how sharp a lens is, and whether it is centred."),
         "measure": ("lensmodel.cli.measure", "Measure the blur of a lens from photos made for the purpose."),
         "serve": ("app.commands.service", "Run the whole service: the API and a worker."),
     },
     "Research": {
-        "target": (
-            "lensmodel.cli.measure",
-            "Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.",
-        ),
-        "psf": (
-            "lensmodel.cli.report",
-            "Show what the lens makes of a point of light at one place in the picture.",
-        ),
-        "export": (
-            "lensmodel.cli.report",
-            "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
-        ),
+        "target": ("lensmodel.cli.measure", "Write the page to print for `lensmodel measure`."),
+        "psf": ("lensmodel.cli.report", "Show the image of a point of light at one place in the picture."),
+        "export": ("lensmodel.cli.report", "Write PSFs for other programs."),
         "demo": ("lab.demo", "Run the whole process on a simulated lens whose true blur is known."),
-        "reproduce": (
-            "lab.commands",
-            "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
-        ),
+        "reproduce": ("lab.commands", "Make the paper's figures and its Table 1 on simulated lenses."),
         "bench": ("lab.commands", "Measure quality and speed."),
     },
     "Administration": {
         "api": ("app.commands.service", "Run only the API process, for installations on many machines."),
         "worker": ("app.commands.service", "Run only a worker process, for installations on many machines."),
-        "config": (
-            "app.commands.service",
-            "Print the effective settings as environment variables; secrets are masked.",
-        ),
-        "doctor": (
-            "app.commands.upkeep",
-            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
-        ),
-        "backup": (
-            "app.commands.upkeep",
-            "Copy all rows and blobs of an installation into a folder, even while it runs.",
-        ),
+        "config": ("app.commands.service", "Print the settings as environment variables."),
+        "doctor": ("app.commands.upkeep", "Check an installation, running or not."),
+        "backup": ("app.commands.upkeep", "Copy an installation into a folder, even while it runs."),
         "keys": ("app.commands.keys", "Make, list and revoke the keys of a service that others can reach."),
     },
 }

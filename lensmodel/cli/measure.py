@@ -79,7 +79,7 @@ def measure(
     results: list[dict[str, Any]] = []
     with shown.progress(total=len(groups)) as bar:
         for number, group in enumerate(groups):
-            bar.show(description=f"{group[0].name}: measuring", more=True)
+            bar.show(description=f"{group[0].name}: measuring")
             sampler = partial(
                 measuring.samples_of_developed,
                 kind,
@@ -149,9 +149,10 @@ def target(
     ] = USUAL_DETAIL,
     force: options.Force = False,
 ) -> None:
-    """Write the page to print for `lensmodel measure target`, or with --edges for `measure edges`.
+    """Write the page to print for `lensmodel measure`.
 
-    Print it at full size on matte paper, in grey, without sharpening; fix it flat.
+    It is for `measure target`, or with --edges for `measure edges`. Print it at full size on matte paper, in
+    grey, without sharpening; fix it flat.
 
     Examples:
 

@@ -12,7 +12,7 @@ import typer
 from lensmodel import quality
 from lensmodel.api import lateral_of
 from lensmodel.cli import files, options
-from lensmodel.cli.console import Display, mtf50_words
+from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
@@ -32,6 +32,7 @@ from lensmodel.report import (
     widest,
 )
 from lensmodel.report import export as write_psfs
+from lensmodel.report.lens_report import SensorGeometry
 from lensmodel.report.tables import to_csv
 
 Aperture = Annotated[float | None, options.aperture("f-number; default: the widest that a photo had.")]
@@ -65,7 +66,9 @@ def report(
     ] = None,
     force: options.Force = False,
 ) -> None:
-    """Say how sharp a lens is, whether it is centred, and which photo would help most.
+    """Say how sharp a lens is, and whether it is centred.
+
+    It also says which photo would help most.
 
     Examples:
 
@@ -169,7 +172,9 @@ def export(
     size: options.Size = 31,
     force: options.Force = False,
 ) -> None:
-    """Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.
+    """Write PSFs for other programs.
+
+    They are a grid over the picture, or a single place with --r and --phi.
 
     Examples:
 
@@ -212,7 +217,7 @@ def psf(
     size: options.Size = 55,
     json_output: options.Json = False,
 ) -> None:
-    """Show what the lens makes of a point of light at one place in the picture.
+    """Show the image of a point of light at one place in the picture.
 
     Examples:
 
@@ -231,9 +236,10 @@ def psf(
     with shown.progress("computing the PSF"):
         answer = files.profile_at(profile).model.query(place, settings, size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
+    words = SensorGeometry().words
     shown.result(
         f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
-        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; "
+        f"MTF50 tangential {words(tangential)}, sagittal {words(sagittal)} cycles/px; "
         f"photos: {answer.photos}, {answer.effective_samples:.1f} effective samples, expected error "
         f"{answer.predicted_error:.2f}{' (beyond what the photos cover)' if answer.extrapolated else ''}; "
         f"answered by {answer.answered_by}"

@@ -25,6 +25,10 @@ from scipy import ndimage
 from app.main import create_app
 from app.runtime import supervisor
 from app.runtime.settings import Settings
+from lab.kernels import gaussian
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.simulate import demo_scene
@@ -191,6 +195,17 @@ def write_photo(
     light = ndimage.gaussian_filter(scene(seed % 2, *shape), sigma)
     light[:, shape[1] - blank :] = 0.4
     return write_light(path, light, seed, serial=serial, aperture=aperture)
+
+
+def lens_of_one_blur() -> LensProfile:
+    """The profile of the lens of `write_photo`, which blurs alike everywhere, learned from another photo."""
+    samples = [
+        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    names = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
+    return LensProfile(LensModel.fit(samples), names, {"0123456789abcdef": "x.dng"})
 
 
 def write_light(

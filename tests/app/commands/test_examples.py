@@ -23,7 +23,7 @@ import pytest
 import typer
 from deadline import stretched
 from PIL import Image
-from running import PROGRAM, scene, write_light, write_photo
+from running import PROGRAM, lens_of_one_blur, scene, write_light, write_photo
 from scipy import ndimage
 from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
@@ -39,10 +39,8 @@ from lab.kernels import gaussian
 from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.measured.page import TargetPage
-from lensmodel.model import LensModel, LensProfile, save_profile
+from lensmodel.model import save_profile
 
 HERE = Path(__file__).parents[3]
 PATIENCE_S = 240.0
@@ -164,15 +162,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savez(
         folder / "stars.npz", psf=np.stack([gaussian(15, np.eye(2) * (1.0 + x)) for x in r]), r=r, phi=phi
     )
-    samples = [
-        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
-        for r in (0.1, 0.5, 0.9)
-        for phi in (-2.0, 0.5, 2.5)
-    ]
-    lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
-    known = LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"})
+    known = lens_of_one_blur()
     save_profile(folder / "my-24mm.lensprofile", known)
-    save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**lens, "serial": "L-43"}))
+    save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**known.lens, "serial": "L-43"}))
     settings = Settings(data_dir=folder / "lensmodel-data")
     with contextlib.closing(Store(settings)) as store:
         upgrade(store.database)

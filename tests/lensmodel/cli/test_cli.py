@@ -28,7 +28,7 @@ import tifffile
 from deadline import Deadline, stretched
 from PIL import ExifTags, Image
 from rich.progress import Task
-from running import SMALL, scene, write_photo
+from running import SMALL, lens_of_one_blur, scene, write_photo
 from scipy import ndimage
 from typer.testing import CliRunner
 
@@ -41,7 +41,7 @@ from lensmodel.cli.correct import targets_of
 from lensmodel.cli.main import app
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import load_profile, save_profile
 
 HERE = Path(__file__).parents[1]
 PROFILE = "my-24mm.lensprofile"
@@ -100,13 +100,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_photo(folder / "a.dng", 1, shape=SMALL)
     write_photo(folder / "b.dng", 2, shape=SMALL)
     write_photo(folder / "other.dng", 3, serial="L-43", shape=SMALL)
-    samples = [
-        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
-        for r in (0.1, 0.5, 0.9)
-        for phi in (-2.0, 0.5, 2.5)
-    ]
-    lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
-    save_profile(folder / PROFILE, LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"}))
+    save_profile(folder / PROFILE, lens_of_one_blur())
     return folder
 
 
@@ -177,46 +171,26 @@ def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: He
 
 
 @pytest.mark.parametrize(
-    ("output", "written"),
+    ("photos", "output", "written"),
     [
-        ("sharp.tif", "sharp.tif"),
-        ("new/sharp.JPG", "new/sharp.JPG"),
-        ("sharp.v2", "sharp.v2/one-corrected.tif"),
-        ("sharp.tif/", "sharp.tif/one-corrected.tif"),
-        ("there.png", "there.png/one-corrected.tif"),
+        (["a.dng"], "sharp.tif", ["sharp.tif"]),
+        (["a.dng"], "new/sharp.JPG", ["new/sharp.JPG"]),
+        (["a.dng"], "sharp.v2", ["sharp.v2/a-corrected.tif"]),
+        (["a.dng"], "sharp.tif/", ["sharp.tif/a-corrected.tif"]),
+        (["a.dng"], "there.png", ["there.png/a-corrected.tif"]),
+        (["a.dng", "b.dng"], "out.tif", ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]),
+        (["in/a.dng"], None, ["in/corrected/a-corrected.tif"]),
     ],
 )
-def test_a_name_that_ends_as_a_pictures_is_a_file_and_any_other_a_folder(
-    output: str, written: str, folder: Path, here: Here
+def test_a_name_that_ends_as_a_pictures_is_a_file_for_one_photo_and_any_other_a_folder(
+    photos: list[str], output: str | None, written: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder / "there.png").mkdir()
+    monkeypatch.chdir(tmp_path)
+    Path("there.png").mkdir()
 
-    done = here("correct", "one.dng", "-p", PROFILE, "-o", output, "--method", "fast", "-q")
-
-    assert done.returncode == 0, done.stderr
-    assert photo.inspect(folder / written).kind == ("jpeg" if written.endswith(".JPG") else "tiff")
-
-
-def test_of_several_photos_the_output_is_a_folder_whatever_its_name() -> None:
-    targets = targets_of([Path("a.dng"), Path("b.dng")], "out.tif", None)
-
-    assert list(map(str, targets.values())) == ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]
-
-
-def test_two_photos_that_would_become_one_file_are_named_and_the_rest_is_done(
-    folder: Path, here: Here
-) -> None:
-    (folder / "holiday").mkdir()
-    shutil.copy(folder / "one.dng", folder / "holiday" / "b.dng")
-    for name in ("a.jpg", "a.png"):
-        Image.fromarray(_picture()).save(folder / "holiday" / name)
-
-    done = here("correct", "holiday", "-p", PROFILE, "--method", "fast", "--json")
-
-    states = {Path(r["photo"]).name: r["state"] for r in json.loads(done.stdout)["results"]}
-    assert states == {"a.jpg": "failed", "a.png": "failed", "b.dng": "corrected"}
-    assert (done.returncode, done.stderr.count("another photo would become")) == (1, 2)
-    assert [p.name for p in (folder / "holiday" / "corrected").iterdir()] == ["b-corrected.tif"]
+    assert targets_of([*map(Path, photos)], output, None) == dict(
+        zip(map(Path, photos), map(Path, written), strict=True)
+    )
 
 
 SHOTS = {
@@ -268,10 +242,10 @@ def test_a_folder_inside_that_cannot_be_read_stops_nothing(
 
 def test_what_a_photographer_allows_reaches_the_correction(folder: Path, here: Here) -> None:
     words = ("--method", "fast", "--halo", "0", "--texture", "0.5", "--denoise", "1")
-    done = here("correct", "one.dng", "-p", PROFILE, "-o", "bound.tif", *words)
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", "new/bound.tif", *words)
 
     assert done.returncode == 0, done.stderr
-    with tifffile.TiffFile(folder / "bound.tif") as file:
+    with tifffile.TiffFile(folder / "new" / "bound.tif") as file:
         said = file.pages[0].description
     assert "profile of 1 photo, method fast, strength 1, halo 0, texture 0.5, denoised 1" in said
 
@@ -287,19 +261,21 @@ def test_corrected_dng_opens_as_raw_and_without_a_terminal_standard_error_stays_
         assert (raw.sizes.height, raw.sizes.width) == SMALL
 
 
-def test_folders_pass_over_what_was_made_of_a_raw_file_and_one_bad_photo_does_not_stop_the_others(
+def test_folders_pass_over_what_was_made_of_a_raw_file_and_bad_photos_do_not_stop_the_others(
     folder: Path, here: Here
 ) -> None:
-    for name in ("one.jpg", "one.tif", "one-corrected.tif"):
+    for name in ("one.jpg", "one.tif", "one-corrected.tif", "two.jpg", "two.png"):
         Image.fromarray(_picture()).save(folder / name)
     (folder / "a-note.dng").write_text("this is text")
     done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
 
     assert done.returncode == 1
-    results = json.loads(done.stdout)["results"]
-    assert [result["photo"] for result in results] == ["a-note.dng", "one.dng"]
-    assert [result["state"] for result in results] == ["failed", "corrected"]
-    assert "give RAW, DNG, TIFF, PNG or JPEG" in one_sentence(done.stderr)
+    states = {result["photo"]: result["state"] for result in json.loads(done.stdout)["results"]}
+    bad = dict.fromkeys(("a-note.dng", "two.jpg", "two.png"), "failed")
+    assert states == {**bad, "one.dng": "corrected"}
+    assert "give RAW, DNG, TIFF, PNG or JPEG" in done.stderr
+    assert done.stderr.count("another photo would become") == 2
+    assert [path.name for path in (folder / "out").iterdir()] == ["one-corrected.tif"]
 
 
 def test_psf_says_what_made_the_answer(folder: Path) -> None:
@@ -487,44 +463,32 @@ def test_the_api_alone_logs_as_much_as_its_setting_says(here: Here, monkeypatch:
 # --- what is there already ---------------------------------------------------------------------
 
 
-@pytest.fixture
-def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Put a demo in place of the real one that writes two files at once, and counts its runs."""
-    runs: list[int] = []
+def test_demo_renews_what_an_earlier_demo_left_and_no_folder_of_others_unless_forced(
+    folder: Path, here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs: list[Path] = []
 
     def run(output: Path, say: Callable[[str], None]) -> bool:
-        runs.append(len(runs))
+        runs.append(output)
         say("working")
-        say("done")
         output.mkdir(parents=True, exist_ok=True)
         (output / "report.md").write_text(f"run {len(runs)}", encoding="utf-8")
         return True
 
     monkeypatch.setattr("lab.demo.run", run)
-    return runs
 
-
-def test_demo_renews_what_an_earlier_demo_left(folder: Path, here: Here, shown_off: list[int]) -> None:
     first, second = here("demo", "-o", "out"), here("demo", "-o", "out")
-
     assert first.returncode == second.returncode == 0
     assert second.stdout.strip() == "run 2"
-    assert first.stderr.splitlines() == ["[ 0:00] working", "[ 0:00] done"]
-    assert len(shown_off) == 2
+    assert first.stderr.splitlines() == ["[ 0:00] working"]
 
-
-def test_demo_uses_no_folder_of_others_unless_forced(folder: Path, here: Here, shown_off: list[int]) -> None:
-    (folder / "out").mkdir()
     (folder / "out" / "mine.txt").write_text("my notes", encoding="utf-8")
-
     refused = here("demo", "-o", "out")
-    runs = len(shown_off)
-    forced = here("demo", "-o", "out", "--force")
-
     assert refused.returncode == 2
     assert re.search("mine.txt is not of a demo; .*--force", one_sentence(refused.stderr))
-    assert runs == 0
-    assert forced.returncode == 0
+    assert len(runs) == 2
+
+    assert here("demo", "-o", "out", "--force").returncode == 0
     assert (folder / "out" / "mine.txt").read_text(encoding="utf-8") == "my notes"
 
 

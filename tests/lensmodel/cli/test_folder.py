@@ -18,16 +18,13 @@ from in_process import lensmodel
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
-from running import SMALL, write_photo
+from running import SMALL, lens_of_one_blur, write_photo
 
-from lab.kernels import gaussian
 from lensmodel.blind.sampling import photo_id
 from lensmodel.cli.console import Bar
 from lensmodel.cli.correct import table_of
 from lensmodel.cli.groups import Shot, groups
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import load_profile, save_profile
 from lensmodel.model.profile import Camera
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 
@@ -48,18 +45,12 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (photos / "phone.HEIC").write_bytes(b"another kind")
     (photos / "day 2").mkdir()
     shutil.copy(photos / "a.dng", photos / "day 2")
-    samples = [
-        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
-        for r in (0.1, 0.5, 0.9)
-        for phi in (-2.0, 0.5, 2.5)
-    ]
-    names = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
     known = {photo_id(photos / name): name for name in ("a.dng", "b.dng")}
     camera = Camera("Test", "T-1", None)
     lenses = here / "lenses"
     lenses.mkdir()
     group = groups([Shot.of(photos / "a.dng")])[0]
-    profile = LensProfile(LensModel.fit(samples), names, known, (camera,))
+    profile = replace(lens_of_one_blur(), photos=known, cameras=(camera,))
     save_profile(lenses / f"{group.name}.lensprofile", profile)
     return here
 

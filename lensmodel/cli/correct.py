@@ -23,12 +23,7 @@ from lensmodel.cli import files, options
 from lensmodel.cli.console import Display, gain_words
 from lensmodel.cli.ending import UsageError, reason
 from lensmodel.cli.groups import PhotoGroup, Shot, groups
-from lensmodel.core.errors import (
-    InvalidInputError,
-    LensModelError,
-    NotEnoughEvidenceError,
-    UnreadablePhotoError,
-)
+from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.correction.audit import HELD
@@ -285,11 +280,10 @@ class Correction:
 
     def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
         """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
-        refused = self.refused.get(path)
-        little = refused is None or isinstance(refused, NotEnoughEvidenceError)
-        if isinstance(refused, UnreadablePhotoError) or (lens is None and refused is not None and not little):
-            return files.failed(refused)
         if lens is None:
+            refused = self.refused.get(path)
+            if refused is not None and not isinstance(refused, NotEnoughEvidenceError):
+                return files.failed(refused)
             return {"state": "left", "reason": "no photo of its lens shows enough to learn the blur from"}
         try:
             if path.stem.endswith(CORRECTED):

@@ -26,16 +26,6 @@ def picture(height: int = 60, width: int = 48) -> Image:
     return signal.convolve(rng.normal(size=(height + 8, width + 8)), gaussian(9, 2.0 * np.eye(2)), "valid")
 
 
-def test_a_constant_and_a_ramp_survive_resampling() -> None:
-    ramp = np.broadcast_to(np.arange(60.0) + 0.5, (40, 60))
-
-    small = resample(ramp, (20, 30))
-
-    inner = small[4:-4, 4:-4]
-    assert np.allclose(inner, 2.0 * np.arange(30)[4:-4] + 1.0)
-    assert np.allclose(resample(np.full((40, 60), 3.0), (29, 43)), 3.0)
-
-
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_resampling_commutes_with_turns(turns: int) -> None:
     y = picture()
@@ -78,15 +68,6 @@ def test_rescaled_kernels_keep_their_centre_and_scale_their_moments() -> None:
     assert np.allclose(second_moments(double, 0.0) / 2.0, second_moments(kernel, 0.0), atol=0.3)
 
 
-def test_levels_go_down_to_the_coarsest_side_or_the_smallest_image() -> None:
-    sides = kernel_sides(31, 256)
-
-    assert sides[0] == 31
-    assert sides == tuple(odd(31 * RATIO**i) for i in range(len(sides)))
-    assert sides[-1] >= 5 > odd(31 * RATIO ** len(sides))
-    assert len(kernel_sides(31, 64)) < len(sides)
-
-
 def test_every_level_gets_shapes_that_fit_together() -> None:
     levels: list[Level] = []
 
@@ -98,6 +79,9 @@ def test_every_level_gets_shapes_that_fit_together() -> None:
 
     found = coarse_to_fine(View(picture(96, 80), 0.01), look, 15, start=gaussian(15, np.eye(2)))
 
-    assert [level.number for level in levels] == list(reversed(range(len(levels))))
+    sides = kernel_sides(15, 80)
+    assert sides == tuple(odd(15 * RATIO**i) for i in range(len(sides)))
+    assert sides[-1] >= 5 > odd(15 * RATIO ** len(sides))
+    assert [level.side for level in levels] == [*reversed(sides)]
     assert found.shape == (15, 15)
     assert all(level.view.noise <= 0.01 for level in levels)

@@ -50,18 +50,9 @@ OWNERS = ("one", "two")
 Spell: TypeAlias = Callable[[], contextlib.AbstractContextManager[None]]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How hard it gets."""
-
-    photos: int = 8
-    workers: int = 3
-    kills: int = 20
-    outages: int = 3
-    full_disks: int = 3
-    pauses: int = 2
-    late: int = 4
-    patience_s: float = 300.0
+WORKERS, PAUSES, FULL_DISKS = 3, 2, 3
+LATE = 4  # photos whose uploads take too long at first
+PATIENCE_S = 300.0
 
 
 class Victims(Crew):
@@ -155,9 +146,8 @@ def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
 class Torture:
     """One installation, and what is done to it."""
 
-    def __init__(self, given: Installation, log: Path, chance: random.Random, plan: Plan) -> None:
-        self.given, self.chance, self.plan = given, chance, plan
-        self.settings = given.settings
+    def __init__(self, given: Installation, log: Path, chance: random.Random) -> None:
+        self.given, self.chance, self.settings = given, chance, given.settings
         self.settings.data_dir.mkdir(parents=True)
         self.store, self.storage = Store(self.settings), Storage(self.settings.storage)
         upgrade(self.store.database)
@@ -202,7 +192,7 @@ class Torture:
 
     def settle(self, is_all_sent: Callable[[], bool]) -> None:
         """Wait until all photos are counted."""
-        end = time.monotonic() + stretched(self.plan.patience_s)
+        end = time.monotonic() + stretched(PATIENCE_S)
         while not is_all_sent() or set(states(self.store)) != {"counted"}:
             self.crew.replace_the_dead()
             now = set(states(self.store))
@@ -211,7 +201,7 @@ class Torture:
             assert time.monotonic() < end, shown
             time.sleep(0.2)
 
-    def check(self) -> None:
+    def check(self, expected: int) -> None:
         findings = examine(self.settings, self.store, self.storage, deep=False)
         assert not [finding for finding in findings if finding.check != "work"], findings
         with self.store.database.reading() as session:
@@ -222,13 +212,15 @@ class Torture:
                 .join(LensRow, LensRow.owner_id == OwnerRow.id)
                 .order_by(OwnerRow.name)
             ).all()
-        each = self.plan.photos // len(OWNERS)
-        assert (photos, samples) == (self.plan.photos, self.plan.photos * CELLS * CHANNELS), lenses
+        each = expected // len(OWNERS)
+        assert (photos, samples) == (expected, expected * CELLS * CHANNELS), lenses
         found = [tuple(lens) for lens in lenses]
         assert found == [(owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS], found
 
 
-def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None) -> str:
+def torture(
+    folder: Path, seed: int, *, servers: bool, photos: int = 8, kills: int = 20, outages: int = 3
+) -> str:
     """Do it once; return what happened in one line.
 
     Raises
@@ -236,29 +228,29 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
     AssertionError
         If anything was lost, counted twice, or seen by another owner.
     """
-    plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
+    chance, began = random.Random(seed), time.monotonic()
     with contextlib.ExitStack() as stack:
         given = stack.enter_context(installation(folder, servers=servers))
         late_thread = stack.enter_context(ThreadPoolExecutor(1))
-        work = stack.enter_context(contextlib.closing(Torture(given, folder / "workers.log", chance, plan)))
-        on_time, full_disks = plan.photos - plan.late, plan.full_disks if given.full_disks else 0
-        for number in range(on_time):
+        work = stack.enter_context(contextlib.closing(Torture(given, folder / "workers.log", chance)))
+        for number in range(photos - LATE):
             work.send(number)
-        late = late_thread.submit(work.send_late, range(on_time, plan.photos), random.Random(chance.random()))
-        for _ in range(plan.workers):
+        late_ones = range(photos - LATE, photos)
+        late = late_thread.submit(work.send_late, late_ones, random.Random(chance.random()))
+        for _ in range(WORKERS):
             work.crew.hire()
-        deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
-        deeds += ["pause"] * plan.pauses
+        full_disks = FULL_DISKS if given.full_disks else 0
+        deeds = ["kill"] * kills + ["outage"] * outages + ["full disk"] * full_disks + ["pause"] * PAUSES
         chance.shuffle(deeds)
         for deed in deeds:
             work.do(deed, [] if servers else databases(given.settings))
         work.settle(late.done)
         late.result()  # what it did not foresee
-        work.check()
+        work.check(photos)
     return (
-        f"seed {seed}: {plan.photos} of {plan.photos} photos counted once, "
-        f"{plan.photos * CELLS * CHANNELS} samples, {plan.kills} kills, {plan.outages} outages, "
-        f"{plan.pauses} pauses, {full_disks} full disks, {time.monotonic() - began:.0f} s"
+        f"seed {seed}: {photos} of {photos} photos counted once, {photos * CELLS * CHANNELS} samples, "
+        f"{kills} kills, {outages} outages, {PAUSES} pauses, {full_disks} full disks, "
+        f"{time.monotonic() - began:.0f} s"
     )
 
 

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -24,27 +24,14 @@ from sqlalchemy import update
 
 from app.blobs.storage import Storage
 from app.http import views
-from app.jobs import tasks
-from app.jobs.answers import (
-    CLEANED,
-    CORRECTED,
-    INSPECTED,
-    KERNELS,
-    SAMPLES,
-    SELECTED,
-    SHOWN,
-    SIDES,
-    THUMBNAIL,
-    JobFailedError,
-    NotWantedError,
-    checked,
-)
+from app.jobs import answers, tasks
+from app.jobs.answers import JobFailedError, NotWantedError, checked
 from app.jobs.context import JobContext
 from app.jobs.queue import durable, end_job
 from app.jobs.sample_files import write_samples
 from app.jobs.work import correct, measure, read_ahead, remove_location, work_on
 from app.runtime.settings import Settings
-from app.sandbox.child import MAX_RESULT, Outcome, ProgressHook, TaskLimits
+from app.sandbox.child import MAX_RESULT, Outcome, TaskLimits
 from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import CorrectionRow, PhotoRow
@@ -94,18 +81,15 @@ SLOW = Outcome("time_limit", code="time_limit", detail="slow")
 
 def develop(arguments: dict[str, Any], folder: Path) -> Outcome:
     np.save(folder / "planes.npy", np.zeros((3, 4, 4), np.float32))
-    (folder / SHOWN).write_bytes(b"a small picture")
+    (folder / answers.SHOWN).write_bytes(b"a small picture")
     return ok({})
 
 
 def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
     numbers = [number for number in arguments["numbers"] for _ in CHANNELS]
-    samples = [
-        PsfSample(KERNEL, ELSEWHERE, LensSettings(channel=channel), 0.5, estimator="default/1", error=0.1)
-        for _ in arguments["numbers"]
-        for channel in CHANNELS
-    ]
-    write_samples(folder, samples)
+    channels = [LensSettings(channel=channel) for channel in CHANNELS] * len(arguments["numbers"])
+    about: Any = {"weight": 0.5, "estimator": "default/1", "error": 0.1}
+    write_samples(folder, [PsfSample(KERNEL, ELSEWHERE, channel, **about) for channel in channels])
     return ok(numbers)
 
 
@@ -121,7 +105,7 @@ def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
     (folder / "result.jpg").write_bytes(b"a picture")
-    (folder / SIDES["before"]).write_bytes(b"tiles")
+    (folder / answers.SIDES["before"]).write_bytes(b"tiles")
     return ok({"file": "result.jpg", "report": {"zones": {"center": {"expected_gain_db": 3.0}}}})
 
 
@@ -146,26 +130,16 @@ class Scripted(TasksHere):
             "correct": [write_result],
         }
 
-    def run(
-        self,
-        task: str,
-        arguments: Mapping[str, Any],
-        *,
-        folder: Path,
-        limits: TaskLimits,
-        reads: Sequence[Path],
-        wanted: Callable[[], bool],
-        on_progress: ProgressHook = ignore_step,
-    ) -> Outcome:
+    def run(self, task: str, arguments: Any, *, folder: Path, **around: Any) -> Outcome:
         self.ran.append(task)
-        self.limits.append(limits)
+        self.limits.append(around["limits"])
         self.seen[task] = dict(arguments)
         self.files = {path.name for path in folder.iterdir()}
-        if not wanted():
+        if not around["wanted"]():
             return Outcome("cancelled")
-        answers = self.answers[task]
         with self._choosing:
-            answer = answers.pop(0) if len(answers) > 1 else answers[0]
+            left = self.answers[task]
+            answer = left.pop(0) if len(left) > 1 else left[0]
         return answer(dict(arguments), folder) if callable(answer) else answer
 
 
@@ -176,9 +150,9 @@ class Bench:
         self.context, self.sandbox, self.steps = context, sandbox, steps
         self.store, self.storage = context.store, context.storage
 
-    def let(self, task: str, *answers: Answer) -> None:
+    def let(self, task: str, *replies: Answer) -> None:
         """Let a task answer so, the last answer for ever."""
-        self.sandbox.answers[task] = list(answers)
+        self.sandbox.answers[task] = list(replies)
 
     def received(self, **options: Any) -> PhotoRow:
         photo = self.steps.receive(**options)
@@ -230,7 +204,7 @@ def test_a_photo_goes_all_the_way(bench: Bench) -> None:
 
     assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
     assert (done.lens.version, done.lens.sample_count, done.lens.serial) == (1, 6, "123")
-    assert bench.storage.get(f"photos/{done.public_id}/{SHOWN}") == b"a small picture"
+    assert bench.storage.get(f"photos/{done.public_id}/{answers.SHOWN}") == b"a small picture"
     _, samples = bench.steps.learned(done)
     assert {(round(s.position.r, 9), s.position.phi) for s in samples} == {(0.1, 0.5), (0.3, 0.5)}
     assert {s.settings.focus_m for s in samples} == {math.inf}  # as the file says by a negative number
@@ -321,14 +295,14 @@ def test_no_picture_is_kept_that_is_larger_than_may_be_read_at_once(
     bench: Bench, more: int, kept: bool
 ) -> None:
     def inspect(arguments: dict[str, Any], folder: Path) -> Outcome:
-        with (folder / THUMBNAIL).open("wb") as file:
+        with (folder / answers.THUMBNAIL).open("wb") as file:
             file.truncate(MAX_RESULT + more)
         return ok(INFO)
 
     bench.let("inspect", inspect)
     photo = bench.work()
 
-    assert (bench.storage.folder / f"{photo.folder}{THUMBNAIL}").is_file() is kept
+    assert (bench.storage.folder / f"{photo.folder}{answers.THUMBNAIL}").is_file() is kept
 
 
 def nobody_elses_patch(arguments: dict[str, Any], folder: Path) -> Outcome:
@@ -576,10 +550,10 @@ def test_a_correction_ends_with_a_file(bench: Bench) -> None:
     row = bench.correct(bench.ask(bench.counted()))
 
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
-    assert row.result_shown_bytes == len(bench.storage.get(f"{row.run_folder}{SIDES['before']}")) == 5
+    assert row.result_shown_bytes == len(bench.storage.get(f"{row.run_folder}{answers.SIDES['before']}")) == 5
     assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
     assert bench.storage.get(row.result_key) == b"a picture"
-    assert bench.sandbox.files >= {KERNELS, SAMPLES}
+    assert bench.sandbox.files >= {answers.KERNELS, answers.SAMPLES}
 
 
 @pytest.mark.parametrize(
@@ -710,7 +684,7 @@ def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(benc
 
 
 def torn(arguments: dict[str, Any], folder: Path) -> Outcome:
-    (folder / CLEANED).write_bytes(b"of another length")
+    (folder / answers.CLEANED).write_bytes(b"of another length")
     return ok({"location": "removed"})
 
 
@@ -743,20 +717,20 @@ CORRECTION = {"file": "a.jpg", "report": {"zones": {"mid": {}}, "audit": {"zones
 @pytest.mark.parametrize(
     ("kind", "answer"),
     [
-        (INSPECTED, []),
-        (INSPECTED, spoilt(INFO, "width", 2**40)),
-        (INSPECTED, spoilt(INFO, "width", "600")),
-        (INSPECTED, spoilt(INFO, "metadata.aperture", 1e300)),
-        (INSPECTED, spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
-        (SELECTED, spoilt(SELECTION, "patches", [patch(0)] * 2001)),
-        (SELECTED, spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
-        (SELECTED, spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
-        (SELECTED, spoilt(SELECTION, "patches.0.row", 2**70)),
-        (SELECTED, spoilt(SELECTION, "lateral", {"red": [1.0]})),
-        (CORRECTED, spoilt(CORRECTION, "report.zones", {"elsewhere": {}})),
-        (CORRECTED, spoilt(CORRECTION, "report.zones.mid", {"reasons": ["x"] * 100})),
-        (CORRECTED, spoilt(CORRECTION, "report.audit.tiles", [{"row": 1}])),
-        (CORRECTED, spoilt(CORRECTION, "report.audit.zones", {"mid": {"tiles": "many"}})),
+        (answers.INSPECTED, []),
+        (answers.INSPECTED, spoilt(INFO, "width", 2**40)),
+        (answers.INSPECTED, spoilt(INFO, "width", "600")),
+        (answers.INSPECTED, spoilt(INFO, "metadata.aperture", 1e300)),
+        (answers.INSPECTED, spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
+        (answers.SELECTED, spoilt(SELECTION, "patches", [patch(0)] * 2001)),
+        (answers.SELECTED, spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
+        (answers.SELECTED, spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
+        (answers.SELECTED, spoilt(SELECTION, "patches.0.row", 2**70)),
+        (answers.SELECTED, spoilt(SELECTION, "lateral", {"red": [1.0]})),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.zones", {"elsewhere": {}})),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.zones.mid", {"reasons": ["x"] * 100})),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.audit.tiles", [{"row": 1}])),
+        (answers.CORRECTED, spoilt(CORRECTION, "report.audit.zones", {"mid": {"tiles": "many"}})),
     ],
 )
 def test_what_no_task_gives_is_no_answer(kind: Any, answer: Any) -> None:
@@ -772,7 +746,11 @@ def test_what_tasks_give_are_answers() -> None:
     report = codec.to_json({"zones": zones, "nothing_to_correct": False})
     corrected = {"file": "result.png", "report": report}
 
-    for kind, answer in ((SELECTED, SELECTION), (CORRECTED, CORRECTION), (CORRECTED, corrected)):
+    for kind, answer in (
+        (answers.SELECTED, SELECTION),
+        (answers.CORRECTED, CORRECTION),
+        (answers.CORRECTED, corrected),
+    ):
         assert checked(kind, answer) == answer
 
 

@@ -10,7 +10,7 @@ from unittest import mock
 import pytest
 from conftest import Steps
 from servers import moto, postgres
-from torture import Plan, torture
+from torture import torture
 
 from app.blobs.storage import Storage
 from app.runtime import metrics
@@ -47,6 +47,6 @@ def test_an_installation_works_on_servers(settings: Settings) -> None:
 def test_deaths_and_outages_lose_nothing_and_count_nothing_twice(
     servers_too: bool, kills: int, tmp_path: Path
 ) -> None:
-    said = torture(tmp_path, 5, servers=servers_too, plan=Plan(photos=4, kills=kills, outages=2))
+    said = torture(tmp_path, 5, servers=servers_too, photos=4, kills=kills, outages=2)
 
     assert "4 of 4 photos counted once" in said

@@ -32,12 +32,8 @@ from lensmodel.model.identity import Identity, difference
 from lensmodel.photo import PhotoMetadata
 from lensmodel.photo.values import CORRECTED
 
-AHEAD: Final = 32
-"""Photos that are sent to an executor at once (chosen): a gigabyte of them, work for some dozen processes."""
-
-SAME_STOPS: Final = 1.0 / 3.0
-"""Apertures nearer than this are one setting: cameras set thirds of a stop."""
-
+AHEAD: Final = 32  # photos that are sent to an executor at once (chosen): a gigabyte, work for dozens
+_SAME_STOPS: Final = 1.0 / 3.0  # apertures nearer than this are one setting: cameras set thirds of a stop
 _ONE_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
 
 
@@ -149,24 +145,14 @@ class Calibration:
         return len(samples)
 
     def _sampled(
-        self,
-        path: Path,
-        job: Future[list[PsfSample]] | None,
-        on_event: EventHook,
-        key: str,
-        admit: Admit,
+        self, path: Path, job: Future[list[PsfSample]] | None, on_event: EventHook, key: str, admit: Admit
     ) -> list[PsfSample]:
         """Estimate the samples of a photo, or wait for those that are estimated elsewhere."""
         if job is not None:
             admit(photo.inspect(path).metadata)
             return job.result()
         return samples_of_photo(
-            path,
-            self._config,
-            key=key,
-            admit=admit,
-            executor=self._pool,
-            on_event=on_event,
+            path, self._config, key=key, admit=admit, executor=self._pool, on_event=on_event
         )
 
     def _sent(self, path: Path) -> tuple[Any, ...] | None:
@@ -210,7 +196,7 @@ def joined(model: LensModel, samples: Sequence[PsfSample], *, replace: bool = Fa
 def _alike(old: PsfSample, new: PsfSample) -> bool:
     """Whether two samples are of one setting of the lens."""
     a, b = old.settings.stops, new.settings.stops
-    if a is not None and b is not None and abs(a - b) >= SAME_STOPS:
+    if a is not None and b is not None and abs(a - b) >= _SAME_STOPS:
         return False
     f, g = old.settings.focal_mm, new.settings.focal_mm
     return f is None or g is None or abs(f - g) < _ONE_FOCAL * g

@@ -16,8 +16,7 @@ from typing import Any, Final, TypeVar
 A = TypeVar("A")
 T = TypeVar("T")
 
-_ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""The work is parallel over processes; threads of linear algebra in each only get in one another's way."""
+_ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # the work is parallel over processes
 
 
 def portable(part: object) -> bool:

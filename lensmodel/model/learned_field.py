@@ -26,18 +26,11 @@ from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, Memory
 
 NEAREST: Final = 256  # samples that a question attends to (chosen: the patches of three photos)
 
-_CANDIDATES: Final = 4 * NEAREST
-"""Nearest samples among which the photos share (chosen: a dozen photos at one place)."""
-
+_CANDIDATES: Final = 4 * NEAREST  # among which the photos share (chosen: a dozen photos at one place)
+# steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen)
 _CELL: Final = np.array([0.25, 0.25, 1.0 / 3.0, 0.25, 0.5]) / va.UNITS
-"""Steps of x, y, stops, octaves and dioptres within which questions share a neighbourhood (chosen)."""
-
-_MEMORIES: Final = 64
-"""Neighbourhoods whose keys are kept (chosen: those of a whole picture; each takes a megabyte)."""
-
-_ANSWERS: Final = 64
-"""Answers that are kept: one holds all three channels, which are asked for one after the other (chosen)."""
-
+_MEMORIES: Final = 64  # neighbourhoods whose keys are kept (chosen: a whole picture's, a megabyte each)
+_ANSWERS: Final = 64  # that are kept: of all channels, which are asked for one after the other (chosen)
 _ROW_BYTES: Final = 200  # of a patch besides its token: place, settings, its part of the tree
 _KEY_BYTES: Final = 4608  # of a patch: keys and values of three attentions, 192 floats each
 

@@ -21,16 +21,10 @@ from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
 from lensmodel.model.variables import VARIABLES
 
-_LEAST_ERROR: Final = 0.01
-"""Relative L2 below which no part of an answer is believed (chosen): it would silence the others."""
-
+_LEAST_ERROR: Final = 0.01  # relative L2 below which no part of an answer is believed (chosen)
 _LISTED: Final = 1e-3  # share of the weight from which on a photo is counted: less shows in no digit (chosen)
 
-_ZONE_RADII: Final[dict[Zone, tuple[float, ...]]] = {
-    "center": (0.1, 0.25),
-    "mid": (0.4, 0.6),
-    "corner": (0.8, 0.95),
-}
+_ZONE_RADII: Final = ((0.1, 0.25), (0.4, 0.6), (0.8, 0.95))  # in the order of `ZONES`
 _ZONE_ANGLES: Final = np.arange(4) * np.pi / 2.0 + 0.6  # towards the corners of most pictures
 
 
@@ -59,6 +53,7 @@ class LensModel:
         self._regression = before if before is not None and before.samples == kernels else None
         if kernels and self._regression is None:
             self._regression = Regression(kernels, settings)
+        self._answering = [part for part in (self._attention, self._regression) if part is not None]
 
     @classmethod
     def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:
@@ -107,10 +102,6 @@ class LensModel:
             weights=self.weights,
             ring_error=parts[0].ring_error,
         )
-
-    @property
-    def _answering(self) -> list[LearnedField | Regression]:
-        return [part for part in (self._attention, self._regression) if part is not None]
 
     def kernels(
         self,
@@ -182,7 +173,8 @@ class LensModel:
             places = [FieldPosition(r, float(phi)) for phi in _ZONE_ANGLES]
             return [self.query(place, settings, 15).predicted_error for place in places]
 
-        return {zone: float(np.mean([expected(r) for r in radii])) for zone, radii in _ZONE_RADII.items()}
+        pairs = zip(ZONES, _ZONE_RADII, strict=True)
+        return {zone: float(np.mean([expected(r) for r in radii])) for zone, radii in pairs}
 
     @property
     def nbytes(self) -> int:

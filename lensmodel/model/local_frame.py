@@ -43,8 +43,7 @@ from lensmodel.model import variables as va
 
 # Of 1, r, r^2, then the rest: weak, only against too few samples (chosen)
 _PLACE_RIDGE = np.array([1e-6, 1e-3, 1e-2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
-_SETTING_RIDGE = 0.05
-"""Of the terms of the settings: with none, two apertures would scale kernels at will (chosen)."""
+_SETTING_RIDGE = 0.05  # of the settings: with none, two apertures would scale kernels at will (chosen)
 _RANGE = (0.45, 2.5)  # factors by which a kernel is scaled at most: beyond, its shape is another one (chosen)
 _HUBER = 0.15  # of a logarithm of the width: the scatter of estimates (chosen)
 _MIN_SAMPLES = 6  # below, widths are carried nowhere: the fit over the field has more terms (chosen)
@@ -131,10 +130,8 @@ _RIM = 3  # coefficients around the grid, zeros: so far out a spline is not zero
 _LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
 _REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
-_STEPS = 6
-"""Of centring at most: each lowers what is left many times over, and it ends when little is (chosen)."""
-_ROOM = 1.35
-"""Side over that of an answer, for kernels that are scaled down to it: few are scaled by more (chosen)."""
+_STEPS = 6  # of centring at most: each lowers what is left many times over (chosen)
+_ROOM = 1.35  # side over that of an answer, for kernels scaled down to it: few are by more (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,9 +154,8 @@ class LocalKernels:
 
     side: int  # odd side of the stored kernels
     splines: NDArray[np.float32]  # (n, (finer (side - 1) + 1 + 2 rims)^2), coefficients
-    # (n,), phi of the places in radians; radius of the light in steps of the grid
-    angles: NDArray[np.float64]
-    radii: NDArray[np.float64]
+    angles: NDArray[np.float64]  # (n,), phi of the places in radians
+    radii: NDArray[np.float64]  # (n,), of the light in steps of the grid
     widths: NDArray[np.float64]  # (n, 2), scales (s_u, s_v) of the places
     finer: int = FINER  # coefficients for each pixel along an axis
 

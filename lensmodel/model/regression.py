@@ -33,17 +33,14 @@ from lensmodel.model.bandwidths import bandwidths, cross_validate
 from lensmodel.model.local_frame import Answers, LocalKernels, WidthField
 
 _REACH: Final = 5.0  # bandwidths: a Gaussian has fallen to 4e-6 there
-_DROPPED: Final = 3e-5
-"""Samples that together weigh less are left out (chosen: below what a kernel in single precision holds)."""
+_DROPPED: Final = 3e-5  # samples that together weigh less are left out (chosen: below single precision)
 _FEW: Final = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
 
-_DRIFT: Final = 0.15
-"""Relative L2 error for each unit of `Support` beyond the first to the nearest sample (chosen)."""
+_DRIFT: Final = 0.15  # relative L2 for each unit of `Support` beyond the first to the nearest sample (chosen)
+# the same for each unit beyond the outermost sample (chosen: the median of drawn lenses wide open changes by
+# .53 to .62 over a unit outwards; no command repeats it)
 _OUTWARD: Final = 0.5
-"""The same for each unit of place beyond the outermost sample, where none lies on the other side (chosen: of
-drawn lenses wide open the median changes by .53 to .62 over a unit outwards; no command repeats it)."""
-_WIDEST: Final = 255
-"""Pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory."""
+_WIDEST: Final = 255  # pixels: side of the widest kernel that is made for coarser pixels: memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,10 +32,10 @@ from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 COLUMNS: Final = ("r", "phi", "phi", "aperture_stops", "wavelength_nm", "focal_octaves", "focus_dioptres")
 """The variable that each column of a point belongs to; phi takes two, cosine and sine."""
 
+# in which a question can lie beyond the samples
 VARIABLES: Final = ("place", "aperture_stops", "focal_octaves", "focus_dioptres")
-"""In which a question can lie beyond the samples."""
+# of x, y, stops, octaves and dioptres (chosen: kernels of usual lenses differ by 0.1 to 0.2 over each)
 UNITS: Final = np.array([0.2, 0.2, 1.0, 0.5, 0.5])
-"""Of x, y, stops, octaves and dioptres (chosen: kernels of usual lenses differ by 0.1 to 0.2 over each)."""
 FAR: Final = 2.5  # units: a Gaussian has fallen to 0.04 there (chosen)
 _CENTER_R = 0.25  # half-diagonals: inside, directions fade, since at the centre there is none (chosen)
 

@@ -1,9 +1,8 @@
 """Spread windows over the field.
 
 `spread_windows` keeps of scored windows the best ones that lie apart: non-maximum suppression, quotas, cells
-of the field. `spread_evenly`, for the learned estimator, cuts the frame into equal cells and moves one window
-within each to where detail is richest; flat and clipped ones alone are left out, for the network weighs its
-patches.
+of the field. `spread_evenly`, for the learned estimator, moves one window in each of equal cells to where
+detail is richest; flat and clipped ones alone are left out, for the network weighs its patches.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import func, select, update
 from starlette.testclient import TestClient
-from states import Steps, finish, services_of
+from states import Steps, failed, finish, services_of
 from typer.testing import CliRunner
 from uploads import receive
 
@@ -139,10 +139,11 @@ def test_a_second_owner_finds_nothing_of_the_first_on_any_route(
     assert missing <= {f"/ui/photos/{ids['photo_id']}/tiles/before/whole.jpg"}
 
 
-def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too(
+def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too_and_nothing_happens(
     guarded: TestClient, store: Store, steps: Steps
 ) -> None:
-    theirs, mine = furnish(guarded, steps, "anna"), furnish(guarded, steps, "ben")
+    mine, theirs = furnish(guarded, steps, "ben"), furnish(guarded, steps, "anna")
+    begun, ended = steps.receive(), failed(steps, "outage")
     ben = key_of(store, "ben")
     foreign_lens = {"photo_id": mine["photo_id"], "lens_id": theirs["lens_id"]}
 
@@ -153,10 +154,19 @@ def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too(
         ("GET", f"/v1/corrections?photo_id={theirs['photo_id']}", None),
         ("GET", f"/batch?ids={mine['correction_id']},{theirs['correction_id']}", None),
         ("GET", f"/ui/parts?page=photo&id={theirs['photo_id']}", None),
+        ("PATCH", "/v1/photos", {"photo_ids": [mine["photo_id"], begun.public_id], "aperture": 2.8}),
+        ("PATCH", f"/v1/photos/{begun.public_id}", {"aperture": 2.8}),
+        ("POST", f"/v1/jobs/{begun.public_id}/cancel", None),
+        ("POST", f"/v1/jobs/{ended.public_id}/retry", None),
+        ("DELETE", f"/v1/photos/{begun.public_id}", None),
     ):
         assert guarded.request(method, path, headers=ben, json=body).status_code == 404, (path, body)
     listed = guarded.get(f"/v1/photos?lens_id={theirs['lens_id']}", headers=ben).json()
     assert listed["items"] == []
+    assert [(row.state, row.given) for row in map(steps.fresh, (begun, ended))] == [
+        ("received", {}),
+        ("failed", {}),
+    ]
 
 
 def test_the_same_bytes_of_two_owners_are_two_photos_and_one_goes_without_the_other(
@@ -296,6 +306,7 @@ def test_a_stream_of_events_ends_with_the_key(
         if asked:
             store.accounts.revoke_key(made.split("_")[1])
         asked.append(really(who))
+        assert len(asked) < 5, "the stream goes on"
         return asked[-1]
 
     monkeypatch.setattr(gate, "is_still", revoked_meanwhile)

@@ -383,9 +383,10 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
         except (LensModelError, OSError) as error:
             results.append({"photo": str(path), "output": None, **files.failed(error)})
             display.error(f"{path}: {reason(error)}")
-    for group in groups(shots):
+    lens_groups = groups(shots)  # those of a zoom have one profile: all are learned before any is corrected
+    learned = [_learn(group, group.profile_in(profiles), most, correction) for group in lens_groups]
+    for group, count in zip(lens_groups, learned, strict=True):
         target = group.profile_in(profiles)
-        count = _learn(group, target, min(most, group.scenes), correction)
         lens = Lens(files.profile_at(target)) if target.exists() else None
         done = correction.photos(group.paths, lens)
         results += done
@@ -406,7 +407,7 @@ def correct_groups(correction: Correction, profiles: Path, most: int) -> dict[st
 
 def _learn(group: PhotoGroup, profile: Path, most: int, correction: Correction) -> int:
     """Learn the lens of a group; return from how many photos, now or in an earlier run."""
-    display, counted = correction.display, 0
+    display, counted, most = correction.display, 0, min(most, group.scenes)
     store = files.ProfileFile(profile)
     config = configured(store.model, LensSettings(aperture=correction.options["aperture"]))
     calibration = Calibration(store, config, any_lens=correction.any_lens)

@@ -137,17 +137,13 @@ def _targets(output: Path | None) -> tuple[Path, ...]:
 
 def _written(found: LensReport, form: str) -> bytes:
     """A report in one of `FORMS`."""
+    if form == ".csv":
+        return to_csv(found).encode()
+    if form == ".json":
+        return json.dumps(to_json(found), indent=1).encode()
     from lensmodel.report.plots import pages, to_pdf, to_png  # noqa: PLC0415 - matplotlib, an extra
 
-    match form:
-        case ".pdf":
-            return to_pdf(pages(found))
-        case ".png":
-            return to_png(pages(found)[0])
-        case ".csv":
-            return to_csv(found).encode()
-        case _:
-            return json.dumps(to_json(found), indent=1).encode()
+    return to_pdf(pages(found)) if form == ".pdf" else to_png(pages(found)[0])
 
 
 def export(

@@ -23,8 +23,6 @@ from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
 
 STAND_INS = Path(__file__).parent / "stand_ins"
 CHANNELS = 3
-
-
 WORKER = [sys.executable, str(STAND_INS / "stand_in_worker.py")]
 
 
@@ -44,12 +42,7 @@ class Crew:
 
     def hire(self) -> subprocess.Popen[bytes]:
         with self.log.open("a") as log:
-            process = subprocess.Popen(
-                WORKER,
-                env=self._environment,
-                stderr=log,
-                start_new_session=True,
-            )
+            process = subprocess.Popen(WORKER, env=self._environment, stderr=log, start_new_session=True)
         self.processes.append(process)
         return process
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import struct
@@ -47,8 +48,11 @@ def test_a_returned_sample_is_that_of_the_task(tmp_path: Path) -> None:
     assert [sample.error for sample in read_samples(tmp_path)] == [0.2, None]
 
 
-def array(name: str, values: np.ndarray) -> Damage:
-    return lambda folder: np.save(folder / name, values)
+def put(name: str, content: bytes | np.ndarray) -> Damage:
+    """Write something else instead of a file."""
+    if isinstance(content, bytes):
+        return lambda folder: (folder / name).write_bytes(content)
+    return lambda folder: np.save(folder / name, content)
 
 
 def changed(**values: object) -> Damage:
@@ -59,41 +63,34 @@ def changed(**values: object) -> Damage:
     return damage
 
 
-def text(written: str) -> Damage:
-    return lambda folder: (folder / SAMPLES).write_text(written)
+def archived() -> bytes:
+    written = io.BytesIO()
+    np.savez(written, np.ones((1, 5, 5), dtype=np.float32))
+    return written.getvalue()
 
 
-def raw(content: bytes) -> Damage:
-    return lambda folder: (folder / KERNELS).write_bytes(content)
-
-
-def archive(folder: Path) -> None:
-    with (folder / KERNELS).open("wb") as file:
-        np.savez(file, np.ones((1, 5, 5), dtype=np.float32))
-
-
-def boundless(folder: Path) -> None:
-    with (folder / KERNELS).open("wb") as file:
-        head = {"descr": "<f4", "fortran_order": False, "shape": (1, 10**9, 10**9)}
-        np.lib.format.write_array_header_1_0(file, head)
+def boundless() -> bytes:
+    written, head = io.BytesIO(), {"descr": "<f4", "fortran_order": False, "shape": (1, 10**9, 10**9)}
+    np.lib.format.write_array_header_1_0(written, head)
+    return written.getvalue()
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        raw(b""),
-        raw(b"PK\x03\x04" + bytes(40)),
-        raw(pickle.dumps(np.ones((1, 5, 5)))),
-        archive,
-        boundless,
-        array(KERNELS, np.ones((1, 5, 5))),
-        array(KERNELS, np.ones((2, 5, 5), dtype=np.float32)),
-        array(KERNELS, np.ones((5, 5), dtype=np.float32)),
-        array(KERNELS, np.full((1, 5, 5), np.nan, dtype=np.float32)),
-        array(KERNELS, np.ones((1, MAX_SIDE + 2, MAX_SIDE + 2), dtype=np.float32)),
-        array(ENCODED, np.ones((1, 3), dtype=np.uint8)),
-        array(ENCODED, np.ones((1, 403), dtype=np.float32)),
-        array(ENCODED, np.full((1, 403), 255, dtype=np.uint8)),
+        put(KERNELS, b""),
+        put(KERNELS, b"PK\x03\x04" + bytes(40)),
+        put(KERNELS, pickle.dumps(np.ones((1, 5, 5)))),
+        put(KERNELS, archived()),
+        put(KERNELS, boundless()),
+        put(KERNELS, np.ones((1, 5, 5))),
+        put(KERNELS, np.ones((2, 5, 5), dtype=np.float32)),
+        put(KERNELS, np.ones((5, 5), dtype=np.float32)),
+        put(KERNELS, np.full((1, 5, 5), np.nan, dtype=np.float32)),
+        put(KERNELS, np.ones((1, MAX_SIDE + 2, MAX_SIDE + 2), dtype=np.float32)),
+        put(ENCODED, np.ones((1, 3), dtype=np.uint8)),
+        put(ENCODED, np.ones((1, 403), dtype=np.float32)),
+        put(ENCODED, np.full((1, 403), 255, dtype=np.uint8)),
         changed(encoded=1),
         changed(encoded="0"),
         changed(size=float("inf")),
@@ -103,13 +100,8 @@ def boundless(folder: Path) -> None:
         changed(r=10**400),
         changed(settings={"channel": "x"}),
         changed(settings={"zoom": 2}),
-        text("{}"),
-        text("5"),
-        text("[5]"),
-        text('["size"]'),
-        text("[" * 10**5),
-        lambda folder: (folder / SAMPLES).unlink(),
-        lambda folder: (folder / KERNELS).unlink(),
+        *(put(SAMPLES, text) for text in (b"{}", b"5", b"[5]", b'["size"]', b"[" * 10**5)),
+        *(lambda folder, name=name: (folder / name).unlink() for name in (SAMPLES, KERNELS)),
     ],
 )
 def test_whatever_a_child_wrote_instead_is_refused(tmp_path: Path, damage: Damage) -> None:

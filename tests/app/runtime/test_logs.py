@@ -96,27 +96,21 @@ def test_lines_for_people_name_them_too_and_no_text_forges_one() -> None:
     assert written == [f"at work {ids}\n    | INFO forged\\x1b[2J\\x0d\\x2028y"]
 
 
-def test_the_line_of_a_request_says_what_was_asked_and_answered(client: TestClient, said: Said) -> None:
-    client.get("/v1/photos/PHOTO", headers={"X-Request-ID": "asked-1"})
-
-    (record,) = said("app.access")
-
-    about = {"request_id": "asked-1", "method": "GET", "path": "/v1/photos/PHOTO", "status": 404}
-    assert record.items() >= {**about, "photo_id": "PHOTO"}.items()
-    assert record["ms"] >= 0
-
-
-def test_a_line_from_within_a_request_has_its_id(
+def test_the_line_of_a_request_says_what_was_asked_and_answered_and_those_from_within_have_its_id(
     client: TestClient, said: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("app.store.lenses.Lenses.page", broken)
-    answer = client.get("/v1/lenses", headers={"X-Request-ID": "asked-2"})
+    monkeypatch.setattr("app.store.photos.Photos.get", broken)
+    client.get("/v1/photos/PHOTO", headers={"X-Request-ID": "asked-1"})
 
-    assert answer.status_code == 500
-    assert [record["request_id"] for record in said("app.http.errors")] == ["asked-2"]
+    (record,), (within,) = said("app.access"), said("app.http.errors")
+
+    about = {"request_id": "asked-1", "method": "GET", "path": "/v1/photos/PHOTO", "status": 500}
+    assert record.items() >= {**about, "photo_id": "PHOTO"}.items()
+    assert record["ms"] >= 0
+    assert within["request_id"] == "asked-1"
 
 
 def test_a_connection_that_is_kept_gives_nothing_of_one_request_to_the_next(

@@ -269,14 +269,14 @@ def test_links_that_a_task_leaves_lead_nowhere(sandbox: Sandbox, tmp_path: Path)
 
 
 def test_a_task_keeps_neither_its_worker_nor_others_waiting(run: Run, sandbox: Sandbox) -> None:
-    server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    server = forkserver._forkserver._forkserver_pid
     start = time.monotonic()
 
     assert run("stutter", limits=replace(LIMITS, wall_s=1.0)).ending == "time_limit"
 
     assert time.monotonic() - start < stretched(10)
     assert run("add", arguments={"a": 1, "b": 2}).ending == "ok"
-    assert forkserver._forkserver._forkserver_pid == server  # type: ignore[attr-defined]
+    assert forkserver._forkserver._forkserver_pid == server
 
 
 @pytest.mark.parametrize("how", ["link", "pipe", "nest", "list", "void", "folder"])
@@ -441,7 +441,7 @@ def test_what_a_task_prints_is_logged_and_looks_like_no_record_of_ours(
 
 def test_a_task_loads_compiled_code_and_saves_none(sandbox: Sandbox, run: Run) -> None:
     in_force("files")
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # of another test, which has another cache
+    forkserver._forkserver._stop()  # of another test, which has another cache
     sandbox._serve()
     limits = TaskLimits(memory_mb=2048, wall_s=stretched(60))
     options: Any = {"limits": limits, "arguments": {"cache": str(sandbox.cache)}}

@@ -47,7 +47,6 @@ class Header:
     width: int = 0  # size as stored; 0 where only LibRaw can tell
     height: int = 0
     channels: int = 0  # samples of a pixel; 0 unknown
-    bits: int = 0  # bits of a sample; 0 unknown
     compression: int = 1  # TIFF tag 259; 1 is none
     directory: int = 0  # offset of the directory of a TIFF's picture; 0 where it is not said which
     tiff: tuple[TiffReader, ...] = ()  # TIFF structures with EXIF in them
@@ -200,7 +199,6 @@ def _read_jpeg(buffer: Buffer, _: Limits) -> Header:
         "jpeg",
         *image.size,
         channels=image.layers,
-        bits=image.bits,
         tiff=tuple(reader for reader in readers if reader is not None),
         xmp=image.info.get("xmp"),
         icc=segments.profile(),
@@ -265,7 +263,6 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
         width,
         height,
         channels,
-        bits,
         tiff=() if exif is None else (exif,),
         xmp=_inflated(xmp) if text[18:19] == b"\1" else xmp,
         icc=icc,
@@ -362,7 +359,6 @@ def _read_tiff(buffer: Buffer, limits: Limits, kind: FileKind = "tiff") -> Heade
         width=photo.integer(256),
         height=photo.integer(257),
         channels=photo.integer(277, 1),
-        bits=photo.integer(258, 1),
         compression=photo.integer(259, 1),
         tiff=(reader,),
         xmp=_block(first, 700),

@@ -490,19 +490,16 @@ def _develop_raster(path: Path, said: Said, info: PhotoInfo) -> LinearPhoto:
 
 def _transfer_of(said: Said, pixels: Pixels) -> tuple[Transfer, bytes | None, tuple[str, ...]]:
     """Which curve the numbers follow, the profile for the output, and a word on one that is left out."""
-    icc, lost, floating = said.header.icc, said.header.icc_lost, pixels.dtype.kind == "f"
+    icc, floating = said.header.icc, pixels.dtype.kind == "f"
     if icc is not None and matrix_profile(icc) is not None:
-        return "icc", icc, _without_profile("its other tags say") if lost else ()
+        return "icc", icc, ()
     if icc is not None and not floating and is_of_rgb(icc):
         return "srgb", icc, ()
     declared = named_profile("adobergb") if said.adobe_rgb and not floating else None
     instead = "its other tags say" if declared else "linear light" if floating else "sRGB"
-    without = _without_profile(instead) if lost or icc is not None else ()
-    return ("linear" if floating else "icc" if declared else "srgb"), declared, without
-
-
-def _without_profile(instead: str) -> tuple[str, ...]:
-    return (f"its ICC profile is damaged or not for RGB: its colours are read as {instead}",)
+    without = f"its ICC profile is damaged or not for RGB: its colours are read as {instead}"
+    transfer: Transfer = "linear" if floating else "icc" if declared else "srgb"
+    return transfer, declared, (without,) if said.header.icc_lost or icc is not None else ()
 
 
 def _read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:

@@ -103,8 +103,6 @@ def write_image(
                 b"eXIf": laid_out(main, below),
                 b"iTXt": b"XML:com.adobe.xmp\0\0\0\0\0" + xmp,
             }
-            if description:
-                chunks[b"tEXt"] = b"Description\0" + description.encode("latin-1", "replace")
             _write_png(file, upright(pixels, encoding.metadata.orientation), chunks)
         else:
             sample_format = 1 if format == "tiff16" else 3  # whole numbers, or floating-point

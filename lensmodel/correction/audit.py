@@ -111,7 +111,7 @@ def kept_shares(
     clip = np.array([min(s.clip, 1e9) for s in sensors], dtype=np.float32)
     keep = np.ones(shape, dtype=np.float32)
     part = (*inner[0].indices(shape[0])[:2], *inner[1].indices(shape[1])[:2])
-    spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, _FOOT, keep)
+    spikes = _spikes(y, x, noise, clip, _point_gains(blurs), part, keep)
     checks = {ISOLATED: spikes / keep[inner].size}
     _powers(y, x, noise, clip, powers)
     wide = _around(powers)
@@ -200,14 +200,13 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
     clip: Real,
     gains: Real,
     part: tuple[int, int, int, int],
-    foot: Real,
     keep: Real,
 ) -> float:
     """Lower `keep` around pixels that stand out of a colour; return the sum of what such in `part` lose."""
     rows, cols = keep.shape
     zero, one, limit, most = np.float32(0.0), np.float32(1.0), np.float32(_STANDS_OUT), np.float32(_SPIKE)
     shown, out = np.empty((rows, cols), np.float32), np.zeros(cols, np.float32)
-    least, wide = (most * limit) ** 2, foot.size // 2
+    least, wide = (most * limit) ** 2, _FOOT.size // 2
     held = 0.0
     for c in range(3):
         shot, read = noise[c, 0], noise[c, 1]
@@ -238,7 +237,7 @@ def _spikes(  # noqa: C901 - one pass over the tile, row by row
                     held += share
                 for k in range(max(i - wide, 0), min(i + wide + 1, rows) if share > zero else 0):
                     for l in range(max(j - wide, 0), min(j + wide + 1, cols)):
-                        left = one - share * foot[k - i + wide] * foot[l - j + wide]
+                        left = one - share * _FOOT[k - i + wide] * _FOOT[l - j + wide]
                         keep[k, l] = min(keep[k, l], left)
     return held
 
@@ -345,43 +344,21 @@ class HeldTile:
 
 @dataclass(frozen=True, slots=True)
 class ZoneAudit:
-    """What was held back in one zone.
+    """What was held back in one zone."""
 
-    Parameters
-    ----------
-    tiles : int
-        How many were audited.
-    tiles_held : int
-        Those of which more than a tenth was held back.
-    held_back : float
-        Mean share of the correction that was held back, 0 to 1.
-    checks : Mapping[str, float]
-        The same by check, each as if alone; those that held nothing back are left out.
-    """
-
-    tiles: int
-    tiles_held: int
-    held_back: float
-    checks: Mapping[str, float]
+    tiles: int  # how many were audited
+    tiles_held: int  # those of which more than a tenth was held back
+    held_back: float  # mean share of the correction that was held back, 0 to 1
+    checks: Mapping[str, float]  # the same by check, each as if alone; only those that held something back
 
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What the audit of a photo held back, why, and where.
+    """What the audit of a photo held back, why, and where."""
 
-    Parameters
-    ----------
-    zones : Mapping[Zone, ZoneAudit]
-        Zones without a tile are left out.
-    tiles : tuple of HeldTile
-        The map: those of which at least a hundredth was held back.
-    tile_side : int
-        Side of the square in pixels that a tile stands for; 0 where it is not known.
-    """
-
-    zones: Mapping[Zone, ZoneAudit]
-    tiles: tuple[HeldTile, ...] = ()
-    tile_side: int = 0
+    zones: Mapping[Zone, ZoneAudit]  # zones without a tile are left out
+    tiles: tuple[HeldTile, ...] = ()  # the map: those of which at least a hundredth was held back
+    tile_side: int = 0  # side of the square in pixels that a tile stands for; 0 where it is not known
 
     @property
     def held_back(self) -> float:

@@ -23,18 +23,12 @@ class Drift:
 
     A point at q of the sharp plane is spread by h(. ; q), so that k_down and k_across act on the
     latent plane times its distance from the origin.
-
-    Parameters
-    ----------
-    down, across : tuple of (UniformBlur, UniformBlur, float)
-        Two blurs before and after, and the pixels between the places they were taken at.
-    origin : tuple of float
-        Pixel `(row, col)` of the tile where the kernel is k.
     """
 
+    # two blurs before and after, and the pixels between the places they were taken at
     down: tuple[UniformBlur, UniformBlur, float]
     across: tuple[UniformBlur, UniformBlur, float]
-    origin: tuple[float, float]
+    origin: tuple[float, float]  # pixel of the tile where the kernel is k
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +44,7 @@ class UniformBlur:
     offset : tuple of float
         Shift `(row, col)` in pixels of the image of a point, on top of the kernel: lateral colour.
     drift : Drift or None
-        How the kernel changes around its place. The operator itself is uniform; a method may use the drift
-        to model what a uniform operator leaves out.
+        How the kernel changes around its place: the operator is uniform, a method may model the rest.
     """
 
     kernel: Kernel

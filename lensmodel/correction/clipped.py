@@ -35,7 +35,6 @@ pixel of 700; with less, chance would dim the lights; with more, their glow woul
 _ABSURD: Final = np.float32(2.0)
 """Times that bound beyond which the glow is no answer (chosen: steps that converge leave less)."""
 
-
 _DARKEST: Final = 0.9
 """Least share of the darkest light nearby that remains, times what a kernel spreads (chosen: 1 would allow no
 dark detail in a glow at all, much less the dark ring that it is there to prevent)."""
@@ -49,32 +48,17 @@ of a pixel is subtracted than is left), and share of that below which it is roun
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lights:
-    """What shines beyond saturation in a tile.
+    """What shines beyond saturation in a tile."""
 
-    Parameters
-    ----------
-    rest : Planes
-        The tile without the glow; clipped pixels hold what the light below saturation makes of them.
-    beyond : Planes
-        Sharp light above the clipping level.
-    glow : Planes
-        The same as the lens spreads it.
-    spread : ndarray, shape (channels,)
-        Share of a point's light that falls beyond its neighbours.
-    """
-
+    # the tile without the glow; clipped pixels hold what the light below saturation makes of them
     rest: Planes
-    beyond: Planes
-    glow: Planes
-    spread: Real
+    beyond: Planes  # sharp light above the clipping level
+    glow: Planes  # the same as the lens spreads it
+    spread: Real  # (channels,), share of a point's light that falls beyond its neighbours
 
     @classmethod
     def of(
-        cls,
-        tile: Planes,
-        blurs: Sequence[UniformBlur],
-        sensors: Sequence[Sensor],
-        steps: int,
+        cls, tile: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], steps: int
     ) -> Lights | None:
         """Find the light above the clipping level of each colour; None where nothing is clipped.
 
@@ -123,10 +107,7 @@ class Lights:
 def regions(lights: Mask, reach: int) -> list[tuple[Window, Mask]]:
     """Windows of a tile in which lights are estimated together.
 
-    Returns
-    -------
-    list of (window, own)
-        The data to use, and the light that only this window estimates, `reach` wider on each side than it.
+    Each is the data to use, and the light that only this window estimates, `reach` wider on each side.
     """
     if not lights.any():
         return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import delta
-from lensmodel.core.types import ZONES, Plane, Planes, Zone
+from lensmodel.core.types import ZONES, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
@@ -89,31 +89,16 @@ class CellForecast:
 
 @dataclass(frozen=True, slots=True)
 class ZoneReport:
-    """What the correction is expected to have done in one zone.
+    """What the correction is expected to have done in one zone."""
 
-    Parameters
-    ----------
-    cells : int
-        Cells of the zone that were corrected.
-    expected_gain_db : float or None
-        Expected gain in PSNR of linear light against the sharp scene, decibels; may be negative. None where
-        the PSFs are too uncertain.
-    psf_error : float
-        Mean expected relative error of the PSFs.
-    left : int
-        Cells left as they were, because there was nothing to gain.
-    held_back : float
-        Mean share of the correction that the audit held back, 0 to 1.
-    reasons : tuple of str
-        The checks that held something back, the strictest first.
-    """
-
-    cells: int
+    cells: int  # cells of the zone that were corrected
+    # Expected gain in PSNR of linear light against the sharp scene, decibels; may be negative. None where the
+    # PSFs are too uncertain.
     expected_gain_db: float | None
-    psf_error: float
-    left: int = 0
-    held_back: float = 0.0
-    reasons: tuple[str, ...] = field(default=())
+    psf_error: float  # mean expected relative error of the PSFs
+    left: int = 0  # cells left as they were, because there was nothing to gain
+    held_back: float = 0.0  # mean share of the correction that the audit held back, 0 to 1
+    reasons: tuple[str, ...] = ()  # the checks that held something back, the strictest first
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,37 +111,6 @@ class Plan:
     shares: tuple[float, ...]
     forecast: CellForecast
     softness: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """One colour of a cell: transfer functions of its kernel and of a point, noise, and the scene's power."""
-
-    K: Complex
-    point: Complex
-    D: Real
-    noise: float
-    level: float
-    slope: float
-
-    @classmethod
-    def of(
-        cls,
-        channel: int,
-        plane: Plane,
-        rings: NDArray[np.float64],
-        posterior: PsfPosterior,
-        offset: tuple[float, float],
-        sensor: Sensor,
-    ) -> _Scene:
-        """Fit the law of the scene to the power of a plane in each ring."""
-        point = UniformBlur(delta(1), offset).spectrum(GRID)
-        known = posterior.kernel.shape[0] <= WIDEST
-        K = UniformBlur(posterior.kernel, offset).spectrum(GRID) if known else point
-        noise = float(sensor.variance(plane[::_EVERY, ::_EVERY].mean()))
-        seen = noise_power(noise, channel, mosaic=sensor.measured is not None)
-        law = scene_law(rings, K.real**2 + K.imag**2 + posterior.variance, seen)
-        return cls(K, point, posterior.variance, noise, *law)
 
 
 def plan(
@@ -187,23 +141,28 @@ def plan(
     `offsets` are the lateral shifts of the channels, `(row, col)` in pixels; `returned` is t.
     """
     rings = ring_power(tile).mean(axis=1)
-    scenes = [
-        _Scene.of(c, tile[c], rings[c], posteriors[c], offsets[c], sensors[c]) for c in range(len(tile))
-    ]
-    soft = softness(float(np.median([scene.slope for scene in scenes])))
-    z = np.float32(_SHARPER * soft)
+    scenes = []
+    for c, (posterior, sensor) in enumerate(zip(posteriors, sensors, strict=True)):
+        point = UniformBlur(delta(1), offsets[c]).spectrum(GRID)
+        known = posterior.kernel.shape[0] <= WIDEST
+        K = UniformBlur(posterior.kernel, offsets[c]).spectrum(GRID) if known else point
+        noise = float(sensor.variance(tile[c, ::_EVERY, ::_EVERY].mean()))
+        seen = noise_power(noise, c, mosaic=sensor.measured is not None)
+        law = scene_law(rings[c], K.real**2 + K.imag**2 + posterior.variance, seen)
+        scenes.append((K, point, posterior.variance, noise, *law))
+    soft = softness(float(np.median([slope for *_, slope in scenes])))
+    z = _SHARPER * soft
     before = after = 0.0
     shares: list[float] = []
-    for scene in scenes:
+    for K, point, D, noise, level, slope in scenes:
         left, harm = np.empty((2, _SHARES.size))
-        S, t = scene_power(scene.level, scene.slope), np.float32(returned)
-        given = (scene.K, scene.point, S, scene.D, frequency_counts(GRID), np.float32(scene.noise))
-        unchanged = _remaining(*given, _SHARES, t, np.float32(soft), z, left, harm)
+        spectra = (K, point, scene_power(level, slope), D, frequency_counts(GRID))
+        t, n = np.float32(returned), np.float32(noise)
+        before += _remaining(*spectra, n, _SHARES, t, np.float32(soft), np.float32(z), left, harm)
         harmless = harm <= 0.0
         harmless[-1] = not harmless[:-1].any()  # by a point only noise is taken
         best = int(np.argmin(np.where(harmless, left, np.inf)))
         shares.append(float(_SHARES[best]))
-        before += unchanged
         after += float(left[best])
     error = float(np.mean([posterior.error for posterior in posteriors]))
     forecast = CellForecast(zone_of(cell.position.r), before, after, error)

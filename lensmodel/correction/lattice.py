@@ -51,29 +51,16 @@ class Roi:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
-    """One cell: its part of the frame, and its weight there.
-
-    Parameters
-    ----------
-    top, left : int
-        First pixel of that part.
-    rise, run : ndarray
-        Weights along rows and columns; those of all cells sum to one.
-    position : FieldPosition
-        Centre of the cell: where its PSF is taken.
-    middle : tuple of float
-        The same as a pixel `(row, col)`.
-    beside : tuple of (FieldPosition, FieldPosition, float)
-        Centres of the cells above and below, and left and right, with the pixels between them; at the
-        border the cell itself stands in for the missing one.
-    """
+    """One cell: its part of the frame, and its weight there."""
 
     top: int
     left: int
-    rise: NDArray[np.float32]
-    run: NDArray[np.float32]
-    position: FieldPosition
-    middle: tuple[float, float]
+    rise: NDArray[np.float32]  # weights along the rows; those of all cells sum to one
+    run: NDArray[np.float32]  # and along the columns
+    position: FieldPosition  # centre of the cell: where its PSF is taken
+    middle: tuple[float, float]  # the same as a pixel (row, col)
+    # Centres of the cells above and below, and left and right, with the pixels between them; at the border
+    # the cell itself stands in for the missing one.
     beside: tuple[_Beside, _Beside]
 
     @property

@@ -17,7 +17,7 @@ from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import LEAST_CLIPPED, compact
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.transforms import Number, Real
+from lensmodel.correction.transforms import ONE, ZERO, Number, Real
 
 Mask = NDArray[np.bool_]
 
@@ -219,19 +219,21 @@ def _mean3(plane: Real, out: Real) -> None:
 
 
 @jit
-def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above: Real) -> None:
+def _levels(light: Real, reach: int) -> Real:
     """Levels around every second pixel of every second row, as seen, and how much of an edge each makes.
 
-    `bottom` and `top` are the least and most light within `reach` pixels; `below` and `above` are 1 where a
-    quarter of that window lies at this level, 0 where it is a line.
+    The first two are the least and most light within `reach` pixels; the others are 1 where a quarter of that
+    window lies at this level, 0 where it is a line.
     """
-    rows, cols = bottom.shape
+    rows, cols = (light.shape[0] + 1) // 2, (light.shape[1] + 1) // 2
     wide = (reach + 1) // 2
+    levels = np.empty((4, rows, cols), np.float32)
+    bottom, top, below, above = levels[0], levels[1], levels[2], levels[3]
     level, seen = np.empty_like(light), np.empty((rows, cols), np.float32)
     _mean3(light, level)
     for i in range(rows):
         for j in range(cols):
-            seen[i, j] = np.sqrt(max(level[2 * i, 2 * j], np.float32(0.0)))
+            seen[i, j] = np.sqrt(max(level[2 * i, 2 * j], ZERO))
     extremes(seen, seen, wide, bottom, top)
     padded = np.empty((rows + 2 * wide, cols + 2 * wide), np.float32)
     for i in range(rows + 2 * wide):
@@ -254,13 +256,12 @@ def _levels(light: Real, reach: int, bottom: Real, top: Real, below: Real, above
                     value = padded[i + k, j + l]
                     dark[j] += np.int32(value <= low[j])
                     bright[j] += np.int32(value >= high[j])
-        scale, start = (
-            np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it,
-            np.float32(_LINE_SHARE) * all_of_it,
-        )
+        start = np.float32(_LINE_SHARE) * all_of_it
+        scale = np.float32(1.0 / (_EDGE_SHARE - _LINE_SHARE)) / all_of_it
         for j in range(cols):
-            below[i, j] = min(max((np.float32(dark[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
-            above[i, j] = min(max((np.float32(bright[j]) - start) * scale, np.float32(0.0)), np.float32(1.0))
+            below[i, j] = min(max((np.float32(dark[j]) - start) * scale, ZERO), ONE)
+            above[i, j] = min(max((np.float32(bright[j]) - start) * scale, ZERO), ONE)
+    return levels
 
 
 @jit
@@ -272,37 +273,32 @@ def _hold_light(
     `most` receives the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
-    zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
-    tiny = np.float32(_TINY)
+    third, tiny = np.float32(1.0 / 3.0), np.float32(_TINY)
     room, edge = shares
     floor = np.sqrt(darkest)
     light, seen = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
     for i in range(rows):
         for j in range(cols):
             light[i, j] = third * (y[0, i, j] + y[1, i, j] + y[2, i, j])
-            seen[i, j] = np.sqrt(max(light[i, j], zero))
+            seen[i, j] = np.sqrt(max(light[i, j], ZERO))
     least = np.empty((rows, cols), np.float32)
     extremes(seen, seen, _REACH, least, most)
-    blocks = ((rows + 1) // 2, (cols + 1) // 2)
-    bottoms, tops = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
-    belows, aboves = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
-    _levels(light, wide, bottoms, tops, belows, aboves)
-    bottom, top = np.empty(cols, np.float32), np.empty(cols, np.float32)
-    below, above = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    levels, near = _levels(light, wide), np.empty((4, cols), np.float32)
+    bottom, top, below, above = near[0], near[1], near[2], near[3]
     for i in range(rows):
-        for j in range(cols):
-            bottom[j], top[j] = bottoms[i // 2, j // 2], tops[i // 2, j // 2]
-            below[j], above[j] = belows[i // 2, j // 2], aboves[i // 2, j // 2]
+        for k in range(4):
+            for j in range(cols):
+                near[k, j] = levels[k, i // 2, j // 2]
         for j in range(cols):
             low, high = least[i, j], most[i, j]
-            now = np.sqrt(third * (max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero)))
+            now = np.sqrt(third * (max(x[0, i, j], ZERO) + max(x[1, i, j], ZERO) + max(x[2, i, j], ZERO)))
             line, at_edge = room * (high - low), edge * (top[j] - bottom[j])
             up = line + above[j] * (min(at_edge, line) - line)
             down = line + below[j] * (min(at_edge, line) - line)
             bound = min(max(now, low - down, floor * low), high + up)
             share = bound / max(now, tiny)
-            share = np.float32(1.0) if free[i, j] else share * share
-            lost = now < tiny and share > zero and not free[i, j]
+            share = ONE if free[i, j] else share * share
+            lost = now < tiny and share > ZERO and not free[i, j]
             fill = bound * bound / max(light[i, j], np.float32(1e-9))
             x[0, i, j] = y[0, i, j] * fill if lost else x[0, i, j] * share
             x[1, i, j] = y[1, i, j] * fill if lost else x[1, i, j] * share
@@ -313,17 +309,16 @@ def _hold_light(
 def _hold_own(y: Real, x: Real, room: Real, dark: Number) -> None:
     """Hold one colour within its own range within 2 pixels, widened, in place."""
     rows, cols = y.shape
-    zero = np.float32(0.0)
     seen = np.empty((rows, cols), np.float32)
     low, high = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
     for i in range(rows):
         for j in range(cols):
-            seen[i, j] = np.sqrt(max(y[i, j], zero) + dark)
+            seen[i, j] = np.sqrt(max(y[i, j], ZERO) + dark)
     extremes(seen, seen, _REACH, low, high)
     for i in range(rows):
         for j in range(cols):
             more = room[i, j] * (high[i, j] - low[i, j])
-            least, most = max(low[i, j] - more, zero), high[i, j] + more
+            least, most = max(low[i, j] - more, ZERO), high[i, j] + more
             x[i, j] = min(max(x[i, j], least * least - dark), most * most - dark)
 
 
@@ -347,9 +342,9 @@ def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow:
         extremes(dimmest, y[c], 1, least, unused)  # within 3
         for i in range(rows):
             for j in range(cols):
-                near[i, j] = kind[i, j] > np.float32(0.0)
-                low = dimmest[i, j] if kind[i, j] > np.float32(1.0) else least[i, j]
-                high = y[c, i, j] if glare[i, j] > np.float32(0.0) else brightest[i, j]
+                near[i, j] = kind[i, j] > ZERO
+                low = dimmest[i, j] if kind[i, j] > ONE else least[i, j]
+                high = y[c, i, j] if glare[i, j] > ZERO else brightest[i, j]
                 if fixed[c, i, j]:
                     x[c, i, j] = y[c, i, j]
                 elif near[i, j]:
@@ -359,11 +354,11 @@ def _beside_lamps(y: Real, x: Real, fixed: Mask, kinds: Real, white: Real, glow:
 @jit
 def _axes(planes: Real, floor: Real, i: int, shares: Real, axes: Real) -> None:
     """Each colour's share of a row's light, and its coordinates, whose ranges are half planes of a hull."""
-    zero, third = np.float32(0.0), np.float32(1.0 / 3.0)
+    third = np.float32(1.0 / 3.0)
     for j in range(floor.size):
-        r, g, b = max(planes[0, i, j], zero), max(planes[1, i, j], zero), max(planes[2, i, j], zero)
+        r, g, b = max(planes[0, i, j], ZERO), max(planes[1, i, j], ZERO), max(planes[2, i, j], ZERO)
         grey = third * floor[j]
-        total = np.float32(1.0) / (r + g + b + floor[j])
+        total = ONE / (r + g + b + floor[j])
         r, g, b = (r + grey) * total, (g + grey) * total, (b + grey) * total
         shares[0, j], shares[1, j], shares[2, j] = r, g, b
         axes[0, j], axes[1, j], axes[2, j] = r - g, g - b, b - r
@@ -378,8 +373,8 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
     `most` is the brightest light within 2 pixels, as seen.
     """
     rows, cols = most.shape
-    zero, one, purer = np.float32(0.0), np.float32(1.0), np.float32(_PURER) * known
-    grey_share = min(np.float32(_OWN_COLOURLESS / _COLOURLESS) * known, one)
+    purer = np.float32(_PURER) * known
+    grey_share = min(np.float32(_OWN_COLOURLESS / _COLOURLESS) * known, ONE)
     lost = number.size > 0  # whether anything clips: of two clipped colours the hue is not known
     reach, side = _HUE_REACH, 2 * _HUE_REACH + 1
     least, floors = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
@@ -416,22 +411,22 @@ def _hold_colour(  # noqa: C901, PLR0912 - one pass over the tile, row by row
         _axes(y, floors[i], i, own, here)
         if lost:
             _of_white(y, x, number, clip, i, low, high, own, here, kept)
-        share[:] = one
+        share[:] = ONE
         for k in range(_AXES):
             for j in range(cols):
                 step = there[k, j] - here[k, j]
-                room = high[k, j] - here[k, j] if step > zero else here[k, j] - low[k, j]
-                share[j] = min(share[j], (max(room, zero) + purer) / max(abs(step), np.float32(1e-6)))
+                room = high[k, j] - here[k, j] if step > ZERO else here[k, j] - low[k, j]
+                share[j] = min(share[j], (max(room, ZERO) + purer) / max(abs(step), np.float32(1e-6)))
         for j in range(cols):
-            t = one if kept[j] else max(share[j], zero)
+            t = ONE if kept[j] else max(share[j], ZERO)
             floor, grey = floors[i, j], floors[i, j] * np.float32(1.0 / 3.0)
-            total = max(x[0, i, j], zero) + max(x[1, i, j], zero) + max(x[2, i, j], zero) + floor
+            total = max(x[0, i, j], ZERO) + max(x[1, i, j], ZERO) + max(x[2, i, j], ZERO) + floor
             r = (own[0, j] + t * (made[0, j] - own[0, j])) * total - grey
             g = (own[1, j] + t * (made[1, j] - own[1, j])) * total - grey
             b = (own[2, j] + t * (made[2, j] - own[2, j])) * total - grey
-            x[0, i, j] = r if t < one else x[0, i, j]
-            x[1, i, j] = g if t < one else x[1, i, j]
-            x[2, i, j] = b if t < one else x[2, i, j]
+            x[0, i, j] = r if t < ONE else x[0, i, j]
+            x[1, i, j] = g if t < ONE else x[1, i, j]
+            x[2, i, j] = b if t < ONE else x[2, i, j]
 
 
 @jit
@@ -442,7 +437,7 @@ def _along(line: Real, number: Real, i: int, padded: Real, low: Real, high: Real
     padded[1, reach : reach + cols] = line
     if number.size > 0:
         for j in range(cols):
-            if number[i, j] > np.float32(1.0):
+            if number[i, j] > ONE:
                 padded[0, reach + j], padded[1, reach + j] = np.float32(np.inf), np.float32(-np.inf)
     for j in range(reach):
         for k in range(2):
@@ -471,7 +466,7 @@ def _of_white(
     """Give pixels of a row that lost their hue to clipping that of their surroundings to be drawn to."""
     for j in range(number.shape[1]):
         kept[j] = False
-        if number[i, j] <= np.float32(1.0):
+        if number[i, j] <= ONE:
             continue
         kept[j] = True
         for c in range(3):
@@ -487,6 +482,6 @@ def _of_white(
         for k in range(_AXES):
             axes[k, j] = np.float32(0.5) * (low[k, j] + high[k, j])
         red, green = axes[0, j], axes[1, j]  # over green, and over blue
-        own[0, j] = np.float32(1.0 / 3.0) * (np.float32(1.0) + np.float32(2.0) * red + green)
+        own[0, j] = np.float32(1.0 / 3.0) * (ONE + np.float32(2.0) * red + green)
         own[1, j] = own[0, j] - red
         own[2, j] = own[1, j] - green

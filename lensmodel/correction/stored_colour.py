@@ -31,33 +31,20 @@ denoising takes what is left of them, and a blur's transfer function is smallest
 pixels a correction makes the rounding of one coefficient, seen as a comb."""
 
 
+Tables = tuple[NDArray[np.float32], ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredColour:
-    """How a file stores colour.
+    """How a file stores colour."""
 
-    Parameters
-    ----------
-    step : tuple of int
-        Rows and columns of pixels that share one value of chroma; powers of two.
-    curves : tuple of ndarray of float32, shape (65536,)
-        Linear light of evenly spaced file values, by channel.
-    tables : tuple of ndarray of float32
-        The inverses, of `photo.colour.inverse`.
-    """
-
-    step: tuple[int, int]
-    curves: tuple[NDArray[np.float32], ...]
-    tables: tuple[NDArray[np.float32], ...]
+    step: tuple[int, int]  # rows and columns of pixels that share one value of chroma; powers of two
+    curves: Tables  # linear light of 65536 evenly spaced file values, by channel
+    tables: Tables  # the inverses, of `photo.colour.inverse`
 
     @classmethod
     def of(cls, step: tuple[int, int], curves: Sequence[NDArray[np.float32]]) -> StoredColour:
-        """Make one from the curves of a file.
-
-        Raises
-        ------
-        InvalidInputError
-            If the steps are no powers of two, or there are not three curves.
-        """
+        """Make one from the curves of a file."""
         if len(curves) != len(CHANNELS) or any(size < 1 or size & (size - 1) for size in step):
             raise InvalidInputError(
                 f"chroma needs three curves and steps that are powers of two, got {len(curves)} and {step}"
@@ -82,16 +69,6 @@ class StoredColour:
         A correction assumes that each colour was measured at every pixel. In a JPEG that holds for luma
         alone: the finest detail of red and blue is that of luma, and colour that a correction adds to it
         comes from rounding and from errors of the kernels, and shows as coloured pixels.
-
-        Parameters
-        ----------
-        photo, restored : Planes, shape (3, rows, cols)
-            Linear light of a tile, and its correction.
-
-        Returns
-        -------
-        Planes
-            Within what the file can hold.
         """
         before, change = np.empty(photo.shape, np.float32), np.empty(photo.shape, np.float32)
         _values(photo, self.tables, before)
@@ -111,9 +88,6 @@ class StoredColour:
             for _ in range(size.bit_length() - 1):
                 chroma = ndimage.convolve1d(chroma, _PAIRED, axis=axis, mode="nearest")
         return chroma
-
-
-Tables = tuple[NDArray[np.float32], ...]
 
 
 @jit

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -148,29 +149,16 @@ def correct_planes(
     ----------
     planes : Planes, shape (3, height, width)
         Linear light, saturation 1; may be memory-mapped.
-    field : PsfField or PosteriorField
-        The lens.
-    frame : Frame
-        Size of the photo.
-    noise : sequence of NoiseModel
-        One per channel.
-    clip : sequence of float
-        Level per channel at and above which a value is only a lower bound.
-    method : str or Deconvolver
-        A name in `deconvolvers`, or a method of your own.
-    strength : float
-        0 leaves the photo as it is, 1 applies what the noise allows.
-    psf_error : float
-        Expected relative L2 error of the PSFs of a `PsfField`: the larger, the more of a point is mixed into
-        them, and the less is allowed beside edges.
+    field, psf_error : PsfField or PosteriorField, float
+        The lens, and the expected relative L2 error of the PSFs of a `PsfField`.
+    noise, clip : sequence of NoiseModel, sequence of float
+        By channel; at and above its level of `clip` a value is only a lower bound.
     lateral : LateralColour or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
     cfa : BayerPattern or None
         The mosaic on which the planes were measured; what demosaicing filled in is then not data, and
         "standard" and "fast" demosaic and deblur in one step. `noise` is then that of the sensor.
-    bounds : Bounds or None
-        What to allow beside edges and in flat areas; None lets `psf_error` decide.
     layers : sequence of Bounds
         Further bounds within which to correct the photo, for a preview: they share the solution, a third of
         the work.
@@ -178,32 +166,14 @@ def correct_planes(
         Return what the method makes of the PSFs as they are: nothing is weighed, bounded, added back or
         audited, as in a paper's own experiments. Not for photos that anyone wants to keep.
     least_gain_db : float or None
-        Correct some cells first, and return the photo as it is where they gain less than this; None always
-        corrects all.
-    stored : StoredColour or None
-        How the photo's file stored chroma, if not at full resolution.
+        Correct some cells first, and return the photo as it is where they gain less than this.
     processed : bool
         Whether a camera sharpened, denoised and compressed the photo: then less of the correction is made the
         larger the expected error of the PSF.
     roi : tuple of int or None
         `(top, left, height, width)`: return only this part, with the same pixels as the whole.
-    workers : int
-        Threads.
     pitch : int or None
         Side of a cell in pixels; None chooses.
-    on_step : StepHook
-        Called after each cell; may raise to stop.
-
-    Returns
-    -------
-    Corrected
-
-    Raises
-    ------
-    InvalidInputError
-        If shapes, strength, window or worker count make no sense.
-    UnknownMethodError
-        If `method` is in no registry.
     """
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
@@ -289,20 +259,15 @@ def _restored(
     job: CorrectionJob, cells_in_order: Sequence[Cell], workers: int
 ) -> Iterator[tuple[Cell, RestoredCell]]:
     """Restore cells in order, a few ahead of the one that the caller adds."""
-    if workers == 1:
-        for cell in cells_in_order:
-            yield cell, restore_cell(job, cell)
-        return
     with ThreadPoolExecutor(workers) as pool:
         ahead: deque[tuple[Cell, Future[RestoredCell]]] = deque()
         queue = iter(cells_in_order)
         try:
-            for cell in queue:
-                ahead.append((cell, pool.submit(restore_cell, job, cell)))
-                if len(ahead) > 2 * workers:
-                    first, future = ahead.popleft()
-                    yield first, future.result()
-            while ahead:
+            while True:
+                for cell in islice(queue, 2 * workers + 1 - len(ahead)):
+                    ahead.append((cell, pool.submit(restore_cell, job, cell)))
+                if not ahead:
+                    return
                 first, future = ahead.popleft()
                 yield first, future.result()
         finally:

@@ -48,7 +48,7 @@ enough pixels for a variance, and little of the next object)."""
 
 @dataclass(frozen=True, slots=True)
 class DirectFilter:
-    r"""Wiener's filter of each colour, with a part of the grain that it takes [1]_.
+    r"""Wiener's filter of each colour (N. Wiener, 1949), with a part of the grain that it takes.
 
     With S = c |f|^-a the power of the scene in the very cell (`scene_power.scene_law`) and n its noise::
 
@@ -61,10 +61,6 @@ class DirectFilter:
         result = y + w ( x - y ),    w within 0..1
 
     Of a mosaic, what demosaicing made of it is filtered.
-
-    References
-    ----------
-    .. [1] N. Wiener, "Extrapolation, interpolation, and smoothing of stationary time series", 1949.
     """
 
     cell_factor = 2

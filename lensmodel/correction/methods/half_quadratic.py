@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ _RAMP: Final = 0.1
 kept, and steps that follow make a visible pixel of it; a wide one is no longer the prior's own answer)."""
 
 
+Prox = tuple[Number, Number, Real]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Shrinkage:
     """The minimiser of t |w|^alpha + (w - v)² / 2, by one polynomial for all t.
@@ -39,9 +42,9 @@ class Shrinkage:
     """
 
     alpha: float  # exponent of the hyper-Laplacian in (0, 1]; 1 is soft thresholding
-    edge: np.float32  # 1 / v for t = 1 where the answer begins to rise
-    steepness: np.float32  # slope of the ramp that begins there, per 1 / v
-    terms: Real  # coefficients of p, highest power first
+    # 1 / v for t = 1 where the answer begins to rise, slope of the ramp that begins there per 1 / v, and
+    # coefficients of p, highest power first
+    prox: Prox
 
     @classmethod
     @lru_cache(maxsize=16)  # one fit per exponent, not one per tile
@@ -63,7 +66,7 @@ class Shrinkage:
             w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
         terms = np.polynomial.Polynomial.fit(inverse, v - w, _DEGREE).convert().coef[::-1]
         steepness = jump / (1.0 - 1.0 / (1.0 + _RAMP))
-        return cls(alpha, np.float32(1.0 / jump), np.float32(steepness), terms.astype(np.float32))
+        return cls(alpha, (np.float32(1.0 / jump), np.float32(steepness), terms.astype(np.float32)))
 
     def scale(self, threshold: Real) -> Real:
         """The scale s for a threshold t."""
@@ -71,8 +74,9 @@ class Shrinkage:
 
 
 @jit
-def shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  # noqa: ANN401 - float32
+def shrink(v: Number, scale: Number, prox: Prox) -> Number:
     """Shrink one gradient; see `Shrinkage`."""
+    edge, steepness, terms = prox
     size = max(abs(v), np.float32(1e-20))
     below = scale / size
     inverse = min(max(below, _REACH), edge)
@@ -91,16 +95,7 @@ def shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  
 
 
 @jit
-def _shrink_row(
-    slopes: Real,
-    scale: Real,
-    factors: Real,
-    rotation: Real,
-    edge: Number,
-    steepness: Number,
-    terms: Real,
-    kept: Real,
-) -> None:
+def _shrink_row(slopes: Real, scale: Real, factors: Real, rotation: Real, prox: Prox, kept: Real) -> None:
     """Rotate three gradients to luma and chroma, shrink each, rotate back."""
     t00, t01, t02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     t10, t11, t12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
@@ -108,9 +103,9 @@ def _shrink_row(
     f0, f1, f2 = factors[0], factors[1], factors[2]
     for j in range(scale.size):
         r, g, b, s = slopes[0, j], slopes[1, j], slopes[2, j], scale[j]
-        p = shrink(t00 * r + t01 * g + t02 * b, s * f0, edge, steepness, terms)
-        q = shrink(t10 * r + t11 * g + t12 * b, s * f1, edge, steepness, terms)
-        o = shrink(t20 * r + t21 * g + t22 * b, s * f2, edge, steepness, terms)
+        p = shrink(t00 * r + t01 * g + t02 * b, s * f0, prox)
+        q = shrink(t10 * r + t11 * g + t12 * b, s * f1, prox)
+        o = shrink(t20 * r + t21 * g + t22 * b, s * f2, prox)
         kept[0, j] = t00 * p + t10 * q + t20 * o
         kept[1, j] = t01 * p + t11 * q + t21 * o
         kept[2, j] = t02 * p + t12 * q + t22 * o
@@ -118,14 +113,7 @@ def _shrink_row(
 
 @jit
 def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
-    x: Real,
-    scale: Real,
-    factors: Real,
-    rotation: Real,
-    edge: Number,
-    steepness: Number,
-    terms: Real,
-    pull: Real,
+    x: Real, scale: Real, factors: Real, rotation: Real, prox: Prox, pull: Real
 ) -> None:
     """sum_j F_j^T prox(F_j x) of three planes, periodic forward differences, into `pull`."""
     channels, height, width = x.shape
@@ -137,7 +125,7 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
         for c in range(channels):
             for j in range(width):
                 slopes[c, j] = x[c, below, j] - x[c, i, j]
-        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
+        _shrink_row(slopes, scale[i], factors, rotation, prox, kept)
         for c in range(channels):
             for j in range(width):
                 pull[c, below, j] += kept[c, j]
@@ -146,7 +134,7 @@ def _pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
             for j in range(width - 1):
                 slopes[c, j] = x[c, i, j + 1] - x[c, i, j]
             slopes[c, width - 1] = x[c, i, 0] - x[c, i, width - 1]
-        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
+        _shrink_row(slopes, scale[i], factors, rotation, prox, kept)
         for c in range(channels):
             pull[c, i, 0] += kept[c, width - 1]
             for j in range(width):
@@ -212,38 +200,31 @@ def _predict(X: Complex, K: Complex, E: Complex, P: Complex) -> None:
 
 @jit
 def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
-    x: Real,
     y: Real,
     known: NDArray[np.bool_],
-    whole: bool,
     K: Complex,
-    smooth: Real,
-    decay: Real,
-    prior_power: Real,
     noise: Real,
     variance: Real,
+    prior: tuple[Real, Real],
+    gradient_power: Real,
     scale: Real,
     factors: Real,
     couplings: Real,
-    turns: NDArray[np.bool_],
-    drift: Complex,
-    down: Real,
-    across: Real,
     rotation: Real,
-    edge: Number,
-    steepness: Number,
-    terms: Real,
-    explained: Real,
-) -> None:
-    """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
+    prox: Prox,
+    moved: tuple[Complex, Real, Real],
+) -> tuple[Real, Real]:
+    """Wiener start and half-quadratic steps of `SparseGradient` on a canvas.
 
-    `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
-    `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
-    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
-    `explained` receives what the result makes of the data, blurred again.
+    `known` marks the pixels that hold data: where all do, none needs a prediction. `moved` is the change of K
+    per pixel down and across, empty where there is none, and the distances down and across from where the
+    kernel is K; what it contributes is recomputed in the first step and half way. Returned are the planes and
+    what they make of the data, blurred again.
     """
-    channels, height, width = x.shape
-    half = width // 2 + 1
+    channels, height, width = y.shape
+    half, steps, whole = width // 2 + 1, couplings.size, known.all()
+    (decay, prior_power), (drift, down, across) = prior, moved
+    x, explained = np.empty_like(y), np.empty_like(y)
     S = np.empty((channels, height, half), np.complex64)  # of the data, and of what is predicted between them
     X = np.empty((0 if whole else channels, height, half), np.complex64)
     E = np.zeros((channels, height, half) if drift.shape[0] > 0 else (0, 0, 0), np.complex64)
@@ -257,10 +238,10 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
         if not whole:
             X[c] = P
         to_plane(P, x[c])
-    for step in range(couplings.shape[0]):
-        _pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
+    for step in range(steps):
+        _pull_of(x, scale, factors[step], rotation, prox, pull)
         for c in range(channels):
-            if drift.shape[0] > 0 and turns[step]:
+            if drift.shape[0] > 0 and (step == 0 or step == steps // 2):
                 _drifted(x[c], drift[c], down, across, work, D, E[c])
             if not whole:
                 _predict(X[c], K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
@@ -281,7 +262,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                     if drift.shape[0] > 0:
                         spectrum -= E[c, i, j]
                     P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
-                        ONE / (power + weight * smooth[i, j])
+                        ONE / (power + weight * gradient_power[i, j])
                     )
             if not whole:
                 X[c] = P
@@ -292,5 +273,5 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
         else:
             D[:] = X[c]
         _predict(D, K[c], E[c] if drift.shape[0] > 0 else D[:0], P)
-        to_plane(P, work)
-        explained[c] = work
+        to_plane(P, explained[c])
+    return x, explained

@@ -7,13 +7,14 @@ from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
+from scipy import special
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.types import Plane
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.transforms import BACK, FORWARD, ONE, ZERO, Complex, Number, Real, through
+from lensmodel.correction.transforms import BACK, FORWARD, ONE, ZERO, Complex, Number, Real, smooth, through
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
@@ -38,33 +39,24 @@ _LEAST_PREDICTED: Final = np.float32(0.1)
 """Least prediction as a share of the datum, so that a step raises light tenfold at most (chosen): a transfer
 function that belongs to no positive kernel, such as that of a point moved by a part of a pixel, predicts zero
 or negative light here and there."""
+_SOFT: Final = special.softmax(-(np.arange(-10, 11) ** 2) / 18.0).astype(np.float32)
+"""Weights that soften the places of lights: a Gaussian of 3 pixels (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)
 class RichardsonLucy:
-    """Richardson-Lucy iteration, the maximum-likelihood ascent for Poisson noise [1]_.
+    """Richardson-Lucy iteration, the maximum-likelihood ascent for Poisson noise.
 
     Each step multiplies the estimate by the back-projected ratio of data to prediction::
 
         x <- x / (F^T 1) * F^T ( (y + b) / (F x + b) )
 
-    The background b = read / shot variance makes read noise nearly Poisson [2]_; without it the
-    dark parts diverge.
-
-    Parameters
-    ----------
-    iterations : int
-        Number of steps; the only regulariser. Noise grows with it.
-
-    References
-    ----------
-    .. [1] W. H. Richardson, "Bayesian-based iterative method of image restoration",
-       J. Opt. Soc. Am. 62, 55-59, 1972.
-    .. [2] D. L. Snyder, C. W. Helstrom, A. D. Lanterman, M. Faisal, R. L. White, "Compensation for
-       readout noise in CCD images", J. Opt. Soc. Am. A 12, 272-283, 1995.
+    W. H. Richardson, J. Opt. Soc. Am. 62, 55-59, 1972. The background b = read / shot variance makes read
+    noise nearly Poisson (D. L. Snyder et al., J. Opt. Soc. Am. A 12, 272-283, 1995); without it the dark
+    parts diverge.
     """
 
-    iterations: int = 15
+    iterations: int = 15  # the only regulariser: noise grows with it
 
     def __post_init__(self) -> None:
         _check(self.iterations)
@@ -84,9 +76,10 @@ class RichardsonLucy:
 
 @dataclass(frozen=True, slots=True)
 class SaturationAwareRichardsonLucy:
-    """Richardson-Lucy for a sensor that clips, without rings around lights [1]_, accelerated [2]_.
+    """Richardson-Lucy for a sensor that clips, without rings around lights, accelerated.
 
-    The sensor answers with a smooth minimum of light and clipping level t::
+    After O. Whyte, J. Sivic, A. Zisserman, "Deblurring shaken and partially saturated images", IJCV 110,
+    185-201, 2014, eq. 13 to 19. The sensor answers with a smooth minimum of light and clipping level t::
 
         R(z) = z - log(1 + exp(a (z - t))) / a,     R'(z) = 1 / (1 + exp(a (z - t)))
         e    = ( (y + b) / (R(F x) + b) - 1 ) R'(F x)
@@ -102,30 +95,14 @@ class SaturationAwareRichardsonLucy:
         fixed      alpha_k = (k - 1) / (k + 2), at most 0.9
         adaptive   alpha_k = <g_{k-1}, g_{k-2}> / <g_{k-2}, g_{k-2}>, within 0..1,   g_k = x_{k+1} - y_k
 
-    The second is that of Biggs and Andrews [2]_. It measures alpha tile by tile, so the result
-    depends a little on where the tiles lie.
-
-    Parameters
-    ----------
-    iterations : int
-        Number of steps.
-    acceleration : {"fixed", "adaptive", "none"}
-        How to extrapolate, or not at all.
-    warped : bool
-        Whether lateral colour is to be removed by resampling before; otherwise the shift is part of the
-        kernels.
-
-    References
-    ----------
-    .. [1] O. Whyte, J. Sivic, A. Zisserman, "Deblurring shaken and partially saturated images",
-       IJCV 110, 185-201, 2014, eq. 13 to 19.
-    .. [2] D. S. C. Biggs, M. Andrews, "Acceleration of iterative image restoration algorithms",
-       Applied Optics 36, 1766-1775, 1997.
+    The second is that of D. S. C. Biggs and M. Andrews, "Acceleration of iterative image restoration
+    algorithms", Applied Optics 36, 1766-1775, 1997. It measures alpha tile by tile, so the result depends a
+    little on where the tiles lie.
     """
 
     iterations: int = 25
     acceleration: Acceleration = "fixed"
-    warped: bool = False
+    warped: bool = False  # whether lateral colour is removed by resampling before, not as part of the kernels
 
     def __post_init__(self) -> None:
         _check(self.iterations)
@@ -225,32 +202,6 @@ def _response() -> tuple[Real, np.float32, np.float32]:
 
 
 @jit
-def _blur_marks(hard: Real, soft: Real) -> None:
-    """Gaussian of sigma 3, cut at 10 pixels, zero outside; at most 1."""
-    rows, cols = hard.shape
-    weights = np.empty(21, np.float32)
-    for k in range(21):
-        weights[k] = np.exp(-np.float32((k - 10) * (k - 10)) / np.float32(18.0))
-    weights /= weights.sum()
-    soft[:] = ZERO
-    for i in range(rows):
-        for k in range(max(0, 10 - i), min(21, rows + 10 - i)):
-            weight = weights[k]
-            for j in range(cols):
-                soft[i, j] += weight * hard[i + k - 10, j]
-    padded = np.zeros(cols + 20, np.float32)
-    for i in range(rows):
-        padded[10 : cols + 10] = soft[i]
-        soft[i] = ZERO
-        for k in range(21):
-            weight = weights[k]
-            for j in range(cols):
-                soft[i, j] += weight * padded[j + k]
-        for j in range(cols):
-            soft[i, j] = min(soft[i, j], ONE)
-
-
-@jit
 def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
     latent: Real, level: Number, reach: int, clean: Real, soft: Real
 ) -> bool:
@@ -290,7 +241,8 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
                 last = i
             if i >= 2 * reach:
                 clean[i - 2 * reach, b] = ZERO if i - last <= 2 * reach else ONE
-    _blur_marks(hard, soft)
+    smooth(hard, _SOFT, soft, wrapped=False)
+    soft[:] = np.minimum(soft, ONE)
     return True
 
 

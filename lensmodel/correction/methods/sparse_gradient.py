@@ -61,46 +61,26 @@ class SparseGradient:
 
         min  sum_c |y_c - k_c * x_c|² / (2 var_c)  +  sum_{j,i} kappa_i |(T f_j * x)_i / level|^alpha
 
-    solved by half-quadratic splitting [1]_ with auxiliary gradients w, whose coupling b grows::
+    solved by half-quadratic splitting (`half_quadratic`) with auxiliary gradients w, whose coupling b grows::
 
         w = T' prox( T f_j * x ; kappa / b ),
         X_c = ( conj(K) Y~ + b var sum_j conj(F_j) W_j ) / ( |K|² + b var sum_j |F_j|² )
 
-    Three departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
-    local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
-    because edges of all colours coincide; and unmeasured pixels take the model's own prediction as
-    data, Y~ = F x, which maximises the likelihood of what was measured. Such a guess converges too
-    slowly for lights above the clipping level: see `Lights`, which removes them first.
-
-    Parameters
-    ----------
-    weight : float
-        kappa of luma; the strength relative to the noise found in the data. Where the data say little
-        about the gradients, it is lowered to as little as 0.4 of that.
-    mosaic_weight : float
-        kappa of luma for a mosaic, where the prior must also fill in two colours of three.
-    chroma : float
-        kappa of chroma over that of luma.
-    alpha : float
-        Exponent of the prior.
-    steps : int
-        Half-quadratic steps.
-    coupling, growth : float
-        First b, in units of one over the squared light, and its factor per step.
-
-    References
-    ----------
-    .. [1] D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors",
-       NIPS 2009, eq. 3 to 5.
+    Three departures from Krishnan and Fergus (NIPS 2009, eq. 3 to 5): the threshold follows the noise
+    variance pixel by pixel, and the local light and contrast (gradients of a scene scale with both);
+    chroma is shrunk harder than luma, because edges of all colours coincide; and unmeasured pixels take the
+    model's own prediction as data, Y~ = F x, which maximises the likelihood of what was measured. Such a
+    guess converges too slowly for lights above the clipping level: see `Lights`, which removes them first.
     """
 
+    # kappa of luma; where the data say little about the gradients, it is lowered to as little as 0.4 of that
     weight: float = 2.0
-    mosaic_weight: float = 4.0
-    chroma: float = 2.5
+    mosaic_weight: float = 4.0  # the same for a mosaic: the prior must also fill in two colours of three
+    chroma: float = 2.5  # kappa of chroma over that of luma
     alpha: float = 0.67
     steps: int = 8
-    coupling: float = 1.5
-    growth: float = 3.0
+    coupling: float = 1.5  # first b, in units of one over the squared light
+    growth: float = 3.0  # its factor per step
 
     def __post_init__(self) -> None:
         if not (self.weight > 0.0 and self.chroma > 0.0 and self.coupling > 0.0 and self.growth >= 1.0):
@@ -153,7 +133,7 @@ class SparseGradient:
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
         level = np.maximum(_smoothed(blocks.luma), _DARK)
         relative = (var / noise[:, None, None]).mean(axis=0)
-        prox = Shrinkage.of(self.alpha)
+        shrinkage = Shrinkage.of(self.alpha)
         calm = _calm(blocks, level, var.mean(axis=0) / len(blurred), self.alpha)
         threshold = relative * calm / level ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
@@ -168,32 +148,21 @@ class SparseGradient:
         y = canvas.filled(blurred, light, K, blurs, sensors, _LIGHT_STEPS)
         if mosaic:
             refill(y, K, noise, variance, sensors, canvas)
-        known = _known(sensors, canvas)
-        x, explained = np.empty_like(y), np.empty_like(y)
-        half_quadratic(
-            x,
+        return half_quadratic(
             y,
-            known,
-            bool(known.all()),
+            _known(sensors, canvas),
             K,
-            _gradient_power(canvas.shape),
-            *prior(canvas.shape),
             noise,
             variance,
-            spread_blocks(prox.scale(threshold), canvas),
-            prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
+            prior(canvas.shape),
+            _gradient_power(canvas.shape),
+            spread_blocks(shrinkage.scale(threshold), canvas),
+            shrinkage.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
             couplings.astype(np.float32),
-            # what a kernel's change within the tile adds is recomputed in the first step and half way
-            np.isin(np.arange(self.steps), (0, self.steps // 2)),
-            rates,
-            *_from_middle(canvas, blurs[0]),
             _OPPONENT,
-            prox.edge,
-            prox.steepness,
-            prox.terms,
-            explained,
+            shrinkage.prox,
+            (rates, *_from_middle(canvas, blurs[0])),
         )
-        return x, explained
 
 
 def _from_middle(canvas: Canvas, blur: UniformBlur) -> tuple[Real, Real]:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from lensmodel.correction.blur import crop_to_support
-from lensmodel.correction.deconvolver import ColourDeconvolver, Deconvolver, Sensor, restore_planes
-from lensmodel.correction.expected_gain import ZoneReport
+from lensmodel.correction.deconvolver import Deconvolver, Sensor, restore_planes
 from lensmodel.correction.lattice import Roi
 from lensmodel.correction.limit import Bounds
-from lensmodel.correction.methods.direct import DirectFilter
 from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
-from lensmodel.correction.posterior import PosteriorField, PsfPosterior
+from lensmodel.correction.posterior import PsfPosterior
 from lensmodel.correction.stored_colour import StoredColour
 from lensmodel.correction.whole_photo import KERNEL_SIZE, Corrected, correct_planes, deconvolvers
 
 __all__ = [
     "KERNEL_SIZE",
     "Bounds",
-    "ColourDeconvolver",
     "Corrected",
     "Deconvolver",
-    "DirectFilter",
-    "PosteriorField",
     "PsfPosterior",
     "RichardsonLucy",
     "Roi",
@@ -29,7 +24,6 @@ __all__ = [
     "Sensor",
     "SparseGradient",
     "StoredColour",
-    "ZoneReport",
     "correct_planes",
     "crop_to_support",
     "deconvolvers",

@@ -14,7 +14,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.jit import jit
 from lensmodel.core.psf import as_kernel, resized
 from lensmodel.core.types import Kernel, Plane
-from lensmodel.correction.transforms import Complex, Number, Real, through, transfer
+from lensmodel.correction.transforms import Complex, Number, through, transfer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,19 +201,13 @@ def transfers(
     half = shape[1] // 2 + 1
     K = np.empty((len(blurs), shape[0], half), dtype=np.complex64)
     rates = np.empty((len(drifts) if drifting else 0, 2, shape[0], half), dtype=np.complex64)
-    _spectra_of(taps, np.float32(reach), shape[1], K, rates)
+    for c in range(len(blurs)):
+        transfer(taps[c, 0], K[c], shape[1])
+    for c in range(len(rates)):
+        transfer(taps[c, 1], rates[c, 0], shape[1])
+        transfer(taps[c, 2], rates[c, 1], shape[1])
+        _limit_change(K[c], rates[c], np.float32(reach))
     return K, rates
-
-
-@jit
-def _spectra_of(taps: Real, reach: Number, width: int, K: Complex, rates: Complex) -> None:
-    """Transfer functions of kernels `(channel, 1 or 3, k, k)`, and how they change, limited."""
-    for c in range(taps.shape[0]):
-        transfer(taps[c, 0], K[c], width)
-        if taps.shape[1] > 1:
-            transfer(taps[c, 1], rates[c, 0], width)
-            transfer(taps[c, 2], rates[c, 1], width)
-            _limit_change(K[c], rates[c], reach)
 
 
 @jit

@@ -19,6 +19,8 @@ from lensmodel.correction.transforms import BACK, FORWARD, ONE, ZERO, Complex, N
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
 
+_Response: TypeAlias = tuple[Real, Number, Number]
+
 _ACCELERATIONS: Final = get_args(Acceleration)
 _ALPHA_MAX: Final = 0.9
 """Cap of the fixed extrapolation; above it the noise is accelerated as well."""
@@ -171,7 +173,7 @@ def richardson_lucy_steps(
         blur.spectrum(shape),
         np.float32(base),
         np.float32(sensor.clip),
-        *_response(),
+        _response(),
         fixed.astype(np.float32),
         acceleration == "adaptive",
         shape[1],
@@ -188,7 +190,7 @@ def _background(sensor: Sensor) -> float:
 
 
 @lru_cache(maxsize=1)
-def _response() -> tuple[Real, np.float32, np.float32]:
+def _response() -> _Response:
     """R and R' at even steps of light over clipping level, and the first and last step.
 
     Below that range R equals the light and above it the clipping level, to a millionth.
@@ -247,15 +249,13 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
 
 
 @jit
-def _errors(
-    light: Real, data: Real, base: Number, clip: Number, bend: Real, first: Number, last: Number
-) -> None:
+def _errors(light: Real, data: Real, base: Number, clip: Number, response: _Response) -> None:
     """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
 
-    `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; below, the sensor
-    records the light itself, above it `clip`. A logarithm and two exponentials for each pixel of
-    a blown area would take ten times as long as all transforms.
+    Below the `response` the sensor records the light itself, above it `clip`. A logarithm and two
+    exponentials for each pixel of a blown area would take ten times as long as all transforms.
     """
+    bend, first, last = response
     brightest = ZERO
     for j in range(light.size):
         brightest = max(brightest, light[j])
@@ -307,9 +307,7 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     K: Complex,
     base: Number,
     clip: Number,
-    bend: Real,
-    first: Number,
-    last: Number,
+    response: _Response,
     alphas: Real,
     adaptive: bool,
     width: int,
@@ -320,7 +318,6 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     The transforms live on the grid of `K`, `width` columns wide; the latent plane lies in its
     first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
     step is measured on the changes of the two before it, and `alphas` only gives their number.
-    `bend`, `first` and `last` are those of `_errors`.
     """
     rows, cols = latent.shape
     high, wide = data.shape
@@ -339,7 +336,7 @@ def _steps(  # noqa: C901 - one pass over memory per loop
     for step in range(steps):
         through(work, P, K, FORWARD, 0, rows, top, bottom)
         for i in range(high):
-            _errors(work[top + i, left:right], data[i], base, clip, bend, first, last)
+            _errors(work[top + i, left:right], data[i], base, clip, response)
             work[top + i, :left] = ZERO
             work[top + i, right:] = ZERO
         split = lights and _lights(start, np.float32(_LIGHT) * clip, top, clean, soft)

@@ -8,6 +8,7 @@ from scipy import signal
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel, delta
+from lensmodel.core.types import Kernel
 from lensmodel.correction.blur import (
     Drift,
     UniformBlur,
@@ -22,22 +23,11 @@ def kernels(side: int = 7) -> st.SearchStrategy[np.ndarray]:
     return values.filter(lambda a: a.sum() > 0.1).map(as_kernel)
 
 
-@given(kernel=kernels(), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=25, deadline=None)
-def test_adjoint_is_the_transpose_of_forward(kernel: np.ndarray, seed: int) -> None:
+@given(kernel=kernels(), offset=st.sampled_from([(0.0, 0.0), (0.4, -1.3)]), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_adjoint_is_the_transpose_of_forward(kernel: Kernel, offset: tuple[float, float], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    blur = UniformBlur(kernel)
-    blurred = rng.random((24, 31), dtype=np.float32)
-    latent = rng.random(blur.adjoint(blurred).shape, dtype=np.float32)
-
-    left, right = np.vdot(blur.forward(latent), blurred), np.vdot(latent, blur.adjoint(blurred))
-
-    assert left == pytest.approx(right, rel=1e-5)
-
-
-def test_adjoint_is_the_transpose_of_forward_with_a_shift() -> None:
-    rng = np.random.default_rng(3)
-    blur = UniformBlur(gaussian(9, np.eye(2)), offset=(0.4, -1.3))
+    blur = UniformBlur(kernel, offset)
     blurred = rng.standard_normal((24, 31), dtype=np.float32)
     latent = rng.standard_normal(blur.adjoint(blurred).shape, dtype=np.float32)
 
@@ -47,7 +37,7 @@ def test_adjoint_is_the_transpose_of_forward_with_a_shift() -> None:
 
 
 @given(kernel=kernels(), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_forward_is_the_convolution_where_all_light_is_known(kernel: np.ndarray, seed: int) -> None:
     latent = np.random.default_rng(seed).random((22, 27), dtype=np.float32)
 
@@ -64,15 +54,6 @@ def test_blur_of_a_constant_is_the_constant(offset: tuple[float, float]) -> None
     np.testing.assert_allclose(blur.forward(latent), 0.7, rtol=1e-4)
 
 
-def test_blur_moves_a_point_to_where_the_kernel_says() -> None:
-    kernel, point = np.zeros((5, 5)), np.zeros((9, 9), dtype=np.float32)
-    kernel[2, 4] = point[4, 4] = 1.0  # two columns to the right of the middle
-
-    blurred = UniformBlur(kernel).forward(point)
-
-    assert np.unravel_index(blurred.argmax(), blurred.shape) == (2, 4)
-
-
 def test_offset_moves_a_point_by_whole_pixels() -> None:
     point = np.zeros((21, 21), dtype=np.float32)
     point[10, 10] = 1.0
@@ -82,13 +63,6 @@ def test_offset_moves_a_point_by_whole_pixels() -> None:
 
     row, col = np.unravel_index(blurred.argmax(), blurred.shape)
     assert (row + blur.reach - 10, col + blur.reach - 10) == (-1, 2)
-
-
-def test_delta_changes_nothing() -> None:
-    latent = np.random.default_rng(1).random((20, 21), dtype=np.float32)
-    blur = UniformBlur(delta(5))
-
-    np.testing.assert_allclose(blur.forward(latent), blur.frame(latent), atol=1e-6)
 
 
 def test_forward_refuses_a_latent_plane_without_a_frame() -> None:
@@ -120,7 +94,7 @@ def test_drift_is_the_change_of_the_transfer_function_per_pixel() -> None:
         np.testing.assert_allclose(rate, change / pixels, atol=1e-7)
 
 
-@pytest.mark.parametrize("shift", [0.28, 0.5, 0.72, 1.3, -0.4])
+@pytest.mark.parametrize("shift", [0.28, 0.5, 0.72, 1.3, -0.4, 2.0, -3.0])
 def test_shifted_point_stays_where_it_is_put(shift: float) -> None:
     """A sinc would cross the picture; undone, it draws nets of dots."""
     blur = UniformBlur(delta(1), (0.0, shift))
@@ -133,13 +107,3 @@ def test_shifted_point_stays_where_it_is_put(shift: float) -> None:
     assert np.abs(spread[:, far]).max() < 1e-6
     assert spread.sum() == pytest.approx(1.0)
     assert (spread[16] * np.arange(64)).sum() == pytest.approx(at, abs=1e-5)
-
-
-def test_shift_by_whole_pixels_changes_nothing_else() -> None:
-    rng = np.random.default_rng(5)
-    picture = rng.random((16, 20))
-    moved = np.fft.irfft2(
-        np.fft.rfft2(picture) * UniformBlur(delta(1), (2.0, -3.0)).spectrum((16, 20)), (16, 20)
-    )
-
-    np.testing.assert_allclose(moved, np.roll(picture, (2, -3), (0, 1)), atol=1e-6)

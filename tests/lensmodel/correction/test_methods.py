@@ -9,7 +9,7 @@ from scipy import ndimage
 from skimage import restoration
 
 from lab.kernels import gaussian
-from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta
 from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel
@@ -181,11 +181,6 @@ def test_method_answers_float32_of_the_frame_is_repeatable_and_leaves_its_input_
     assert (first.shape, first.dtype) == (blurred.shape, np.float32)
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(blurred, before)
-
-
-def test_unknown_method_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownMethodError, match="standard"):
-        deconvolvers.create("sharpen")
 
 
 @pytest.mark.parametrize("method", [RichardsonLucy, SaturationAwareRichardsonLucy])

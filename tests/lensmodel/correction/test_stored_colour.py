@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from lab.images import to_srgb
 from lab.kernels import gaussian
 from lensmodel import correction, photo
 from lensmodel.core.errors import InvalidInputError
@@ -21,14 +22,8 @@ LUMA = np.array([0.299, 0.587, 0.114])
 CURVES = curves_of("srgb")
 
 
-def encoded(planes: Planes) -> NDArray[np.float64]:
-    return np.where(
-        planes <= 0.0031308, 12.92 * planes, 1.055 * np.maximum(planes, 1e-9) ** (1 / 2.4) - 0.055
-    )
-
-
 def luma_and_hue(planes: Planes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    values = encoded(planes)
+    values = to_srgb(planes)
     luma = np.tensordot(LUMA, values, axes=1)
     return luma, values - luma
 
@@ -73,8 +68,8 @@ def test_detail_of_luma_stays_whatever_the_hue() -> None:
     made = np.clip(before + 0.1 * (before - before.mean()), 0.0, 1.0)
     held = StoredColour.of((2, 2), CURVES).held(before, made)
 
-    wanted = encoded(before) + kept_of_the_finest(encoded(made) - encoded(before))
-    np.testing.assert_allclose(encoded(held)[:, 4:-4, 4:-4], wanted[:, 4:-4, 4:-4], atol=1e-4)
+    wanted = to_srgb(before) + kept_of_the_finest(to_srgb(made) - to_srgb(before))
+    np.testing.assert_allclose(to_srgb(held)[:, 4:-4, 4:-4], wanted[:, 4:-4, 4:-4], atol=1e-4)
 
 
 @pytest.mark.parametrize("step", [(1, 1), (1, 2), (2, 2)])

@@ -64,11 +64,6 @@ _SURE_DB: Final = 0.1
 _KEPT: Final = 640
 """Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
 megapixels."""
-_COMPILE_S: Final = 30
-"""Seconds that compiling takes on a usual machine (chosen: it is only said, lest the silence look like a
-fault; slow machines take longer)."""
-_FREED: Final = 31 << 20
-"""Bytes of the block to free: just below the 32 MiB up to which glibc adapts (see `_keep_freed_memory`)."""
 
 first_use = logging.getLogger(f"{__name__}.first_use")
 """Says when loops are compiled, during which nothing else happens that a user could see."""
@@ -310,7 +305,8 @@ def tell_of_compiling() -> None:
             del started
             if not self.logged:
                 self.logged = True
-                first_use.info("compiling the inner loops, once on this machine: about %d s", _COMPILE_S)
+                # as long as on a usual machine, lest the silence look like a fault
+                first_use.info("compiling the inner loops, once on this machine: about 30 s")
 
         def on_end(self, ended: object) -> None:
             """The progress display shows the end."""
@@ -326,4 +322,4 @@ def _keep_freed_memory() -> None:
     "fast". It stops doing so for blocks smaller than the largest block, up to 32 MiB, that it has seen freed;
     the pages of this one are never touched. Other C libraries are not affected.
     """
-    np.empty(_FREED, dtype=np.uint8)
+    np.empty(31 << 20, dtype=np.uint8)

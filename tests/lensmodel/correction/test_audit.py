@@ -87,9 +87,6 @@ PHOTO = photo_of(LIGHT)
 SOUND = LIGHT + np.float32(0.002) * np.random.default_rng(2).standard_normal(LIGHT.shape).astype(np.float32)
 
 
-# --- what is sound ------------------------------------------------------------------------------
-
-
 def test_a_photo_that_was_not_changed_is_kept_to_the_last_bit() -> None:
     planes, audit = held_back(PHOTO, PHOTO.copy(), None, [Sensor(NOISE, 1.0)] * 3, [0.0] * 3, WHOLE)
 
@@ -115,9 +112,6 @@ def test_what_is_kept_is_a_share(seed: int) -> None:
     assert keep.min() >= 0.0
     assert keep.max() <= 1.0
     assert set(checks) == set(LIMITS) - {"re-blur"}  # no PSF is known
-
-
-# --- each fault ---------------------------------------------------------------------------------
 
 
 def test_a_single_dot_is_isolated_and_taken_away_there_alone() -> None:
@@ -196,9 +190,6 @@ def test_light_beyond_saturation_is_judged_as_it_is_written() -> None:
     glowing[:, 70:90, 70:90] = 1.0 + 5.0 * np.random.default_rng(7).random((3, 20, 20))
 
     assert kept(photo, glowing, None)[0].mean() > 0.99
-
-
-# --- the map ------------------------------------------------------------------------------------
 
 
 def test_the_map_is_smooth() -> None:

@@ -74,18 +74,6 @@ def test_noise_of_a_developed_mosaic_is_spread_as_it_is_reckoned_with(tmp_path: 
         np.testing.assert_allclose(rings, noise_power(float(variance), channel, mosaic=True), rtol=0.1)
 
 
-def test_what_is_out_of_focus_is_left_alone_by_a_kernel_that_is_hardly_known() -> None:
-    rng, sigma = np.random.default_rng(11), 0.004
-    blobs = ndimage.gaussian_filter(rng.standard_normal((3, 200, 200)), (0, 5.0, 5.0))
-    scene = 0.3 + 0.05 * blobs / blobs.std()
-    photo = (scene + sigma * rng.standard_normal(scene.shape)).astype(np.float32)
-
-    made = correct_planes(photo, TooWide(), Frame(200, 200), noise=[NoiseModel(0.0, sigma**2)] * 3)
-
-    np.testing.assert_allclose(made.planes, photo, rtol=1e-6)  # cells fade into each other
-    assert all(report.left == report.cells for report in made.zones.values())
-
-
 def test_an_edge_in_focus_before_what_is_not_is_sharpened() -> None:
     rng, sigma = np.random.default_rng(7), 0.004
     blobs = ndimage.gaussian_filter(rng.standard_normal((3, 300, 300)), (0, 7.0, 7.0))

@@ -392,14 +392,8 @@ def test_waiting_photos_are_grouped_by_body_and_focal_length() -> None:
 def test_a_lens_is_proposed_a_name(
     maker: str | None, model: str | None, said: dict[str, Any], own_lens: bool, name: str
 ) -> None:
-    seen = {
-        "width": 2832,
-        "height": 2128,
-        "focal_mm": 20.0,
-        "camera_maker": maker,
-        "camera_model": model,
-        **said,
-    }
+    seen = {"width": 2832, "height": 2128, "focal_mm": 20.0, "camera_maker": maker, "camera_model": model}
+    seen |= said
     more = seen | ({"focal_mm": 5.85} if own_lens else {})
 
     (group,) = grouped([PhotoRow(**seen), PhotoRow(**more)])
@@ -473,16 +467,14 @@ def test_a_lens_that_was_named_before_any_photo_is_listed_and_no_ghost(
     assert "Lens on the bench" in page
 
 
-def test_a_lens_page_shows_the_newest_of_many_versions(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
+def test_a_lens_page_shows_the_newest_of_many_versions(client: TestClient, steps: Steps) -> None:
     photo = steps.counted()
     page = f"/lenses/{steps.lens_id(photo)}/tests"
     assert "<td>not yet known</td>" in client.get(page).text
     for _ in range(201):
-        store.photos.change([photo.public_id], "local", {"aperture": 2.0})
+        steps.store.photos.change([photo.public_id], "local", {"aperture": 2.0})
     metrics = {"error": {"center": 0.4, "corner": None}, "coverage": {"corner": 77}}
-    store.lenses.record_metrics(steps.lens_id(photo), 202, metrics)
+    steps.store.lenses.record_metrics(steps.lens_id(photo), 202, metrics)
 
     shown = client.get(page).text
 

@@ -76,9 +76,7 @@ def test_bounds_and_a_new_photo_of_the_lens_make_other_corrections(
     assert [(each.get("halo"), each["denoise"]) for each in params] == [(None, 0.0), (0.2, 0.5)]
 
 
-def test_a_photo_with_other_settings_is_corrected_anew(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
+def test_a_photo_with_other_settings_is_corrected_anew(client: TestClient, steps: Steps) -> None:
     of, lens_id = stored(steps).public_id, steps.lens_id(steps.counted())
     first = post(client, photo_id=of)  # the lens that was calibrated later
     finish(client, first.json()["id"])
@@ -88,7 +86,7 @@ def test_a_photo_with_other_settings_is_corrected_anew(
 
     assert first.json()["lens_id"] == again.json()["lens_id"] == lens_id
     assert (again.status_code, again.json()["id"] != first.json()["id"]) == (202, True)
-    row = store.jobs.get(again.json()["id"], ANY_OWNER)
+    row = steps.store.jobs.get(again.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.params["settings"]["aperture"] == 8.0
 

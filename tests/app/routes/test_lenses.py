@@ -247,15 +247,13 @@ def test_the_history_has_one_item_for_each_version(client: TestClient, steps: St
     assert client.get(page["next"]).json()["items"][0]["version"] == 2
 
 
-def test_lateral_colour_is_the_middle_of_what_the_photos_show(
-    client: TestClient, steps: Steps, store: Store
-) -> None:
+def test_lateral_colour_is_the_middle_of_what_the_photos_show(client: TestClient, steps: Steps) -> None:
     photos = [steps.counted() for _ in range(4)]
     for photo, shift in zip(photos, (1e-4, 9e-4, 2e-4, 0.0), strict=True):
         points = 50 if shift else 0  # the last could not tell
         red, blue = [0.0, 0.0, shift, 1.0], [0.0, 0.0, -shift, 1.0]
         lateral = {"red": red, "blue": blue, "red_points": points, "blue_points": points}
-        store.photos.record_lateral(photo.public_id, photo.epoch, lateral)
+        steps.store.photos.record_lateral(photo.public_id, photo.epoch, lateral)
 
     shown = client.get(f"/v1/lenses/{steps.lens_id(photos[0])}/lateral-colour").json()
 
@@ -362,20 +360,6 @@ def test_a_profile_goes_out_and_comes_back_once(
     assert client.put("/v1/lenses/gone/profile", content=profile).status_code == 404
     listed = client.get("/v1/photos").json()["items"]
     assert {entry["kind"] for entry in listed} == {None}  # photos, and no files of profiles
-
-
-@pytest.mark.usefixtures("reading")
-def test_a_profile_of_another_lens_is_refused_until_its_owner_insists(
-    client: TestClient, steps: Steps, profile: bytes
-) -> None:
-    second = steps.lens_id(steps.counted(serial="2"))
-
-    refused, untouched = put_profile(client, second, profile)
-    taken, lens = put_profile(client, second, profile, any_lens=True)
-
-    assert (refused["error"]["status"], refused["error"]["code"]) == (409, "other_lens")
-    assert "its serial number is 123, that of the lens 2" in refused["error"]["detail"]
-    assert (untouched["photos"], taken["state"], lens["photos"]) == (1, "succeeded", 2)
 
 
 D750, BODY = Camera("NIKON CORPORATION", "NIKON D750", "1"), Camera("Leica", "M8")

@@ -30,8 +30,6 @@ class ModelSettings:
     r, phi, stops : float or None
         Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
         eq. (8) of the paper [1]_.
-    excluded : tuple of str
-        Photos whose samples do not count; they stay listed.
     mode : {"default", "paper"}
         "default": attention over the encoded patches of photos, and regression over the samples that were
         measured or estimated otherwise, each with the weight of its expected error. "paper": the regression
@@ -52,7 +50,6 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    excluded: tuple[str, ...] = ()
     mode: str = DEFAULT
 
     def __post_init__(self) -> None:
@@ -66,7 +63,6 @@ class ModelSettings:
             raise UnknownMethodError(
                 f"no mode {self.mode!r} of the lens model; choose one of {', '.join(MODES)}"
             )
-        object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -45,10 +45,8 @@ class LensModel:
     ) -> None:
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        encoded, kernels = _parted(samples, settings)
-        if not (encoded or kernels):
-            raise NoSamplesError(f"all photos of the {len(samples)} samples are excluded; include one again")
         self.samples, self.settings = samples, settings
+        encoded, kernels = _parted(samples, settings)
         self._attention = LearnedField(encoded) if encoded else None
         self._regression = before if before is not None and before.samples == kernels else None
         if kernels and self._regression is None:
@@ -166,7 +164,7 @@ class LensModel:
 
     def expected_errors(self) -> dict[Zone, float]:
         """Mean error that green answers expect of themselves in each zone, at the commonest settings."""
-        kinds = [s.settings.with_channel("g") for s in self.samples if s.photo not in self.settings.excluded]
+        kinds = [s.settings.with_channel("g") for s in self.samples]
         settings = max(dict.fromkeys(kinds), key=kinds.count)
 
         def expected(r: float) -> list[float]:
@@ -202,15 +200,14 @@ class ModelField:
 
 
 def _parted(samples: Sequence[PsfSample], settings: ModelSettings) -> tuple[list[PsfSample], list[PsfSample]]:
-    """One sample of each encoded patch, and those whose kernels are averaged; no excluded photos."""
-    counted = [s for s in samples if s.photo not in settings.excluded]
+    """One sample of each encoded patch, and those whose kernels are averaged."""
     if settings.mode == PAPER:
-        return [], counted
+        return [], list(samples)
     encoded: dict[Hashable, PsfSample] = {}
-    for sample in counted:
+    for sample in samples:
         if sample.encoded is not None:
             encoded.setdefault(_place_of(sample), sample)
-    return list(encoded.values()), [s for s in counted if s.encoded is None]
+    return list(encoded.values()), [s for s in samples if s.encoded is None]
 
 
 def _place_of(sample: PsfSample) -> Hashable:

@@ -18,7 +18,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -153,7 +153,8 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
-        model = LensModel.fit(samples, ModelSettings(**document["model"]))
+        chosen = {f.name: document["model"][f.name] for f in fields(ModelSettings)}
+        model = LensModel.fit(samples, ModelSettings(**chosen))
         cameras = (_texts(camera) for camera in document.get("cameras", []))
         return LensProfile(
             model,

@@ -110,7 +110,7 @@ def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
         own, asked = sample.settings.stops, settings.stops
         return own is None or asked is None or abs(own - asked) <= _NEAR_STOPS
 
-    counted = [s for s in model.samples if s.weight > 0 and s.photo not in model.settings.excluded]
+    counted = [s for s in model.samples if s.weight > 0]
     return [s for s in counted if s.settings.channel == settings.channel and near(s)]
 
 

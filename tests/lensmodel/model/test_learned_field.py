@@ -16,7 +16,6 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.kernels import distance, gaussian
-from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, rms_width
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
@@ -145,16 +144,6 @@ def test_a_photo_that_comes_twice_changes_nothing(network: SmallNetwork, again: 
     assert len(twice.samples) == len(once.samples)
     for place in PLACES:
         assert np.array_equal(once.query(place, F2).kernel, twice.query(place, F2).kernel)
-
-
-def test_an_excluded_photo_does_not_count(network: SmallNetwork) -> None:
-    samples = [*photo("a", 1), *photo("b", 2, width=6.0)]
-    model = LensModel.fit(samples, ModelSettings(excluded=("b",)))
-
-    assert model.query(PLACES[0], F2).photos == 1
-    assert rms_width(model.query(PLACES[0], F2).kernel) == pytest.approx(2.0, rel=0.05)
-    with pytest.raises(NoSamplesError, match="excluded"):
-        LensModel.fit(samples, ModelSettings(excluded=("a", "b")))
 
 
 def test_keys_are_computed_once_for_each_neighbourhood(network: SmallNetwork) -> None:

@@ -138,7 +138,7 @@ def profile(count: int = 48) -> LensProfile:
         )
         for i in range(count)
     ]
-    model = LensModel.fit(taken, ModelSettings(excluded=("p1",), phi=0.4))
+    model = LensModel.fit(taken, ModelSettings(phi=0.4))
     return LensProfile(model, {"serial": "1"}, {"p0": "a.dng"})
 
 
@@ -168,8 +168,8 @@ def test_other_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
     ("change", "said"),
     [
         ({"format": 1, "samples": []}, "calibrate again"),
-        ({"model": {"mode": "magic"}}, "no mode"),
-        ({"model": {"unknown": 1}}, "damaged"),
+        ({"model": {"r": 1, "phi": 1, "stops": 1, "mode": "magic"}}, "no mode"),
+        ({"model": {"mode": "paper"}}, "damaged"),
         ({"samples": []}, "one is needed"),
         ({"lens": 7}, "damaged"),
         ({"samples": [{"r": "far"}] * 48}, "damaged"),

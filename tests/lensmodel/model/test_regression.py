@@ -340,13 +340,6 @@ def test_one_bad_photo_moves_the_field_by_less_than_a_tenth_of_a_plain_mean() ->
     assert moved("default") < 0.1 * moved("paper")
 
 
-def test_excluded_photo_stays_and_has_no_weight() -> None:
-    without = LensModel.fit(photos(3), ModelSettings(excluded=("p1",)))
-
-    assert without.query(FieldPosition(0.5, 0.5), GREEN, SIZE).photos == 2
-    assert len(without.samples) == len(photos(3))
-
-
 def test_error_falls_with_the_number_of_photos() -> None:
     assert error(LensModel.fit(photos(10, noise=0.3, samples=16))) < 0.75 * error(
         LensModel.fit(photos(1, noise=0.3, samples=16))

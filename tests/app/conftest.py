@@ -36,11 +36,6 @@ BODY = {"width": 6000, "height": 4000, "pixel_pitch_um": 6.0}
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
 
-def window(r: float, phi: float, **more: Any) -> dict[str, Any]:
-    """Return a window of a photo as a task tells of it."""
-    return {"row": 0, "col": 0, "size": 64, "r": r, "phi": phi, **more}
-
-
 class Steps:
     """Does to the tables what uploads and workers do, step by step."""
 
@@ -89,8 +84,10 @@ class Steps:
     def plan(self, photo: PhotoRow, count: int = 2) -> None:
         self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
         places = enumerate(itertools.islice(itertools.cycle(PLACES), count))
-        patches = [window(r, phi, row=100, col=100 * k, cell=k % 2, score=1.0) for k, (r, phi) in places]
-        self.store.photos.plan_patches(photo.public_id, photo.epoch, patches, [window(0, 0, reason="flat")])
+        chosen = {"row": 100, "size": 64, "score": 1.0}
+        patches = [{**chosen, "col": 100 * k, "r": r, "phi": phi, "cell": k % 2} for k, (r, phi) in places]
+        rejected = [{"row": 0, "col": 0, "size": 64, "r": 0, "phi": 0, "reason": "flat"}]
+        self.store.photos.plan_patches(photo.public_id, photo.epoch, patches, rejected)
         self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
 
     def planned(self, count: int = 2, *, filename: str = "", **header: Any) -> PhotoRow:

@@ -35,9 +35,9 @@ def quick(environment: Mapping[str, str]) -> dict[str, str]:
 class Crew:
     """Workers with quick tasks; to be closed."""
 
-    def __init__(self, settings: Settings, log: Path, extra: Mapping[str, str] | None = None) -> None:
+    def __init__(self, settings: Settings, log: Path) -> None:
         self.log = log
-        self._environment = os.environ | environment(settings) | quick(os.environ) | dict(extra or {})
+        self._environment = os.environ | environment(settings) | quick(os.environ)
         self.processes: list[subprocess.Popen[bytes]] = []
 
     def hire(self) -> subprocess.Popen[bytes]:

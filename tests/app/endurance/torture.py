@@ -23,7 +23,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -107,51 +106,41 @@ def cramped(server: Postgres, disk: Path) -> Iterator[None]:
     server.start_if_down()
 
 
-@dataclass(frozen=True)
-class Installation:
-    """Settings, what the environment of workers holds besides, and what outages and full disks can be."""
-
-    settings: Settings
-    extra: dict[str, str]
-    outages: list[Spell]
-    full_disks: list[Spell]
-
-
-@contextlib.contextmanager
-def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
-    with contextlib.ExitStack() as stack:
-        disk = folder / "disk"
-        disk.mkdir()
-        common: dict[str, Any] = {"data_dir": disk / "data", "lease_seconds": 4.0, "worker_slots": 2}
-        common["min_free_mb"] = 0
-        full: list[Spell] = []
-        if stack.enter_context(small_disk(disk, 128)):
-            full.append(lambda: kept_full(disk))
-        if not servers:
-            settings = Settings(**common)
-            yield Installation(settings, {}, [lambda: folder_away(settings)], full)
-            return
-        cluster = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmodel-pg-")))
-        small = stack.enter_context(small_disk(cluster, 512))
-        server = stack.enter_context(postgres(folder=cluster))
-        if small:
-            full.append(lambda: cramped(server, cluster))
-        s3 = stack.enter_context(moto("torture"))
-        stack.enter_context(mock.patch.dict(os.environ, s3.environment()))
-        addresses = {"database_url": server.url("app"), "storage_url": "s3://torture"}
-        settings = Settings(**common, **addresses, storage_seconds=3.0)
-        yield Installation(settings, s3.environment(), [lambda: crashed(server), s3.hanging], full)
+def installation(
+    stack: contextlib.ExitStack, folder: Path, *, servers: bool
+) -> tuple[Settings, list[Spell], list[Spell]]:
+    """Begin what an installation needs; return its settings, and what outages and full disks can be."""
+    disk, full = folder / "disk", list[Spell]()
+    disk.mkdir()
+    common: Any = {"data_dir": disk / "data", "lease_seconds": 4.0, "worker_slots": 2, "min_free_mb": 0}
+    if stack.enter_context(small_disk(disk, 128)):
+        full.append(lambda: kept_full(disk))
+    if not servers:
+        settings = Settings(**common)
+        return settings, [lambda: folder_away(settings)], full
+    cluster = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmodel-pg-")))
+    small = stack.enter_context(small_disk(cluster, 512))
+    server = stack.enter_context(postgres(folder=cluster))
+    if small:
+        full.append(lambda: cramped(server, cluster))
+    s3 = stack.enter_context(moto("torture"))
+    stack.enter_context(mock.patch.dict(os.environ, s3.environment()))  # of the workers too
+    addresses = {"database_url": server.url("app"), "storage_url": "s3://torture"}
+    settings = Settings(**common, **addresses, storage_seconds=3.0)
+    return settings, [lambda: crashed(server), s3.hanging], full
 
 
 class Torture:
     """One installation, and what is done to it."""
 
-    def __init__(self, given: Installation, log: Path, chance: random.Random) -> None:
-        self.given, self.chance, self.settings = given, chance, given.settings
-        self.settings.data_dir.mkdir(parents=True)
-        self.store, self.storage = Store(self.settings), Storage(self.settings.storage)
+    def __init__(self, settings: Settings, log: Path, chance: random.Random) -> None:
+        self.settings, self.chance = settings, chance
+        settings.data_dir.mkdir(parents=True)
+        self.store, self.storage = Store(settings), Storage(settings.storage)
         upgrade(self.store.database)
-        self.crew, self.ended = Victims(self.settings, log, given.extra), threading.Event()
+        self.crew, self.ended = Victims(settings, log), threading.Event()
+        is_file = settings.database.startswith("sqlite")
+        self.files = databases(settings) if is_file else []
 
     def close(self) -> None:
         self.ended.set()
@@ -172,19 +161,19 @@ class Torture:
                 else:
                     break
 
-    def do(self, deed: str, files: list[Path]) -> None:
+    def do(self, deed: str, outages: list[Spell], full_disks: list[Spell]) -> None:
         """Let one thing happen."""
         crew, chance = self.crew, self.chance
         time.sleep(chance.uniform(0.2, 1.5))
         if deed == "kill":
             crew.lose_one(chance)
         elif deed == "pause":
-            crew.pause_one(chance, files, self.settings.lease_seconds + 2.0)
+            crew.pause_one(chance, self.files, self.settings.lease_seconds + 2.0)
         elif deed == "outage":
-            with chance.choice(self.given.outages)():
+            with chance.choice(outages)():
                 time.sleep(chance.uniform(1.0, 5.0))
         else:
-            with chance.choice(self.given.full_disks)():
+            with chance.choice(full_disks)():
                 time.sleep(chance.uniform(0.5, 2.5))
                 crew.lose_one(chance)  # the next one starts without room
                 time.sleep(chance.uniform(0.5, 2.5))
@@ -230,20 +219,20 @@ def torture(
     """
     chance, began = random.Random(seed), time.monotonic()
     with contextlib.ExitStack() as stack:
-        given = stack.enter_context(installation(folder, servers=servers))
+        settings, ways, full = installation(stack, folder, servers=servers)
         late_thread = stack.enter_context(ThreadPoolExecutor(1))
-        work = stack.enter_context(contextlib.closing(Torture(given, folder / "workers.log", chance)))
+        work = stack.enter_context(contextlib.closing(Torture(settings, folder / "workers.log", chance)))
         for number in range(photos - LATE):
             work.send(number)
         late_ones = range(photos - LATE, photos)
         late = late_thread.submit(work.send_late, late_ones, random.Random(chance.random()))
         for _ in range(WORKERS):
             work.crew.hire()
-        full_disks = FULL_DISKS if given.full_disks else 0
+        full_disks = FULL_DISKS if full else 0
         deeds = ["kill"] * kills + ["outage"] * outages + ["full disk"] * full_disks + ["pause"] * PAUSES
         chance.shuffle(deeds)
         for deed in deeds:
-            work.do(deed, [] if servers else databases(given.settings))
+            work.do(deed, ways, full)
         work.settle(late.done)
         late.result()  # what it did not foresee
         work.check(photos)

@@ -61,12 +61,6 @@ def spawn(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
     time.sleep(60)
 
 
-def write(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
-    with (folder / "large").open("wb") as file:
-        for _ in range(arguments["mb"]):
-            file.write(bytes(1 << 20))
-
-
 def open_files(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
     held = []
     try:

@@ -111,7 +111,7 @@ TOO_MUCH = (("error", "memory_limit"), "2 MiB or 40 files")
         ("refuse", {"more": 1_000_000}, {}, NO_PATCHES, "xxx"),
         ("swell", {"mb": 4096}, {}, MEMORY, "512 MiB"),
         ("swell", {"mb": 64}, {}, ("ok", ""), ""),
-        ("write", {"mb": 8}, {"file_mb": 4}, MEMORY, ""),
+        ("litter", {"files": 1, "bytes": 8 << 20}, {"file_mb": 4}, MEMORY, ""),
         ("spin", {}, {"wall_s": 0.6}, TIME, "0.6 s"),
         ("spin", {}, {"cpu_s": 1}, TIME, "1 s of processor time"),
         ("crash", {}, {}, CRASHED, "SIGSEGV"),

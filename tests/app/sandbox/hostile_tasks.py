@@ -192,46 +192,33 @@ def litter(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> N
 def hoard(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[str]:
     """Fill the disk by files that no folder names; say how far each way came."""
     libc = ctypes.CDLL(None, use_errno=True)
-    held = []
+    path, other = folder / "hoarded", folder / "other"
 
-    def without(remove: Callable[[Path], object]) -> Callable[[], None]:
-        def fill() -> None:
-            path = folder / "hoarded"
-            with path.open("wb") as file:
-                remove(path)
-                path.with_suffix(".seen").touch()
-                file.write(bytes(arguments["bytes"]))
-                file.flush()
-                held.append(os.dup(file.fileno()))
+    def removed() -> int:
+        number = os.open(path, os.O_CREAT | os.O_RDWR)
+        path.unlink()
+        return number
 
-        return fill
+    def replaced() -> int:
+        number = os.open(path, os.O_CREAT | os.O_RDWR)
+        other.touch()
+        other.rename(path)
+        return number
 
-    def replaced(path: Path) -> None:
-        (folder / "other").touch()
-        (folder / "other").rename(path)
+    def unnamed() -> int:
+        return os.open(folder, os.O_TMPFILE | os.O_RDWR)
 
-    def unnamed() -> None:
-        held.append(os.open(folder, os.O_TMPFILE | os.O_RDWR))
-        os.write(held[-1], bytes(arguments["bytes"]))
-
-    def in_memory() -> None:
-        held.append(libc.memfd_create(b"", 0))
-        if held[-1] < 0:
+    def in_memory() -> int:
+        number = libc.memfd_create(b"", 0)
+        if number < 0:
             raise OSError(ctypes.get_errno(), "memfd_create")
+        return number
 
-    ways = {
-        "removed": without(Path.unlink),
-        "replaced": without(replaced),
-        "unnamed": unnamed,
-        "in memory": in_memory,
-    }
     done = []
-    for name, way in ways.items():
-        try:
-            way()
-            done.append(name)
-        except OSError:
-            continue
+    for way in (removed, replaced, unnamed, in_memory):
+        with contextlib.suppress(OSError):
+            os.write(way(), bytes(arguments["bytes"]))
+            done.append(way.__name__)
     return done
 
 

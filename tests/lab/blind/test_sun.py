@@ -8,7 +8,7 @@ from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
-from lab.blind.methods.sun import default_prior, edge_mask, edge_terms, image_step, target
+from lab.blind.methods.sun import default_prior, edge_mask, edge_terms, target
 from lab.blind.steps.pyramid import View
 from lab.kernels import gaussian
 from lab.training import blind_data
@@ -33,15 +33,6 @@ def test_the_generating_kernel_costs_least_where_the_scene_is_known() -> None:
     wrong = (delta(13), OVAL, as_kernel(np.rot90(truth)), as_kernel(truth[::-1, ::-1]), as_kernel(truth**1.5))
 
     assert all(explained(y, inner, kernel) > explained(y, inner, truth) for kernel in wrong)
-
-
-def test_the_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> None:
-    sharp = scene(100)
-    y = signal.convolve(np.pad(sharp, 6, mode="symmetric"), OVAL, mode="valid", method="direct")
-
-    x = image_step(y, OVAL, sharp, np.full(sharp.shape, 25.0), 0.2, 0.0, steps=25)
-
-    assert np.abs(x - sharp)[12:-12, 12:-12].max() < 2e-3
 
 
 def test_stored_patterns_are_those_that_the_command_makes() -> None:

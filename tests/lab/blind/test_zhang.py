@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blurred_scenes import OVAL, SIGMA, scene, shot, stroke
+from blurred_scenes import OVAL, SIGMA, shot, stroke
 from numpy.typing import NDArray
 from scipy import signal
 
 from lab.blind.methods.zhang import PatchPosterior
-from lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
-from lab.kernels import distance, gaussian
+from lab.blind.steps.kernel_step import Grid
+from lab.kernels import gaussian
 from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import Kernel
 
@@ -79,15 +79,3 @@ def test_products_with_the_convolution_are_each_others_transposes() -> None:
     assert np.vdot(grid.onto_kernel(grid.spectrum(x), e), k) == pytest.approx(np.vdot(e, blurred), rel=1e-4)
     # sum_i c_i w_i(k) = sum_j k_j² (sum of c under j)
     assert np.vdot(grid.reach_of(k), x**2) == pytest.approx(np.vdot(grid.sums_of(x**2), k**2), rel=1e-4)
-
-
-def test_the_kernel_step_recovers_the_kernel_of_a_known_scene() -> None:
-    truth, y = stroke(), scene(140)
-    x = np.diff(y, axis=1)
-    observed = signal.fftconvolve(x, truth, mode="valid")
-    frame = (observed.shape[0], observed.shape[1])
-    term = Term(Grid(frame, 13), observed.astype(np.float32), x.astype(np.float32), 1.0)
-
-    found = least_squares_kernel([term], gaussian(13, np.eye(2)), turns=6)
-
-    assert distance(as_kernel(found), truth).rel_l2 < 0.01

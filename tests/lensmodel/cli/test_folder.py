@@ -305,24 +305,12 @@ def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
 
-def _of_four_colours(path: Path) -> None:
-    data = path.read_bytes()
-    at = data.index(b"\x8e\x82\x01\x00\x04\x00\x00\x00") + 8  # the value of CFAPattern
-    path.write_bytes(data[:at] + bytes((0, 1, 3, 2)) + data[at + 4 :])
-
-
 def _without_aperture(path: Path) -> None:
     write_photo(path, 1, shape=SMALL, aperture=None)
 
 
 def _quad_bayer(path: Path) -> None:
-    path.write_bytes((REPORTS / "quad-bayer.dng").read_bytes())
-
-
-def _picture_without_aperture(path: Path) -> None:
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)).save(
-        path, "JPEG"
-    )
+    shutil.copy(REPORTS / "quad-bayer.dng", path)
 
 
 def _cut_picture(path: Path) -> None:
@@ -336,10 +324,8 @@ def _cut_picture(path: Path) -> None:
 USELESS = {
     "a.dng": (_without_aperture, "does not say its aperture"),
     "b.dng": (_cut, "copy it again"),
-    "c.dng": (_of_four_colours, "colours"),
-    "d.dng": (_quad_bayer, "4 x 4"),
-    "e.jpg": (_picture_without_aperture, "does not say its aperture"),
-    "f.jpg": (_cut_picture, "ends before its picture"),
+    "c.dng": (_quad_bayer, "4 x 4"),
+    "d.jpg": (_cut_picture, "ends before its picture"),
 }
 
 

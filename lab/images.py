@@ -17,7 +17,7 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame, zone_of
 from lensmodel.core.types import ZONES, Direction, FieldPosition, Planes, Zone
-from lensmodel.quality.edge import Box, EdgeResponse, slanted_edge
+from lensmodel.quality.mtf import Box, EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 

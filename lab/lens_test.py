@@ -30,7 +30,7 @@ from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.photo import develop
 from lensmodel.quality import tangential_sagittal_mtf50
-from lensmodel.quality.edge import edge_area
+from lensmodel.quality.mtf import edge_area
 from lensmodel.report import lens_report
 from lensmodel.report.lens_report import Range
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo

@@ -35,8 +35,7 @@ from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import full_name
 from lensmodel.correction.audit import HELD
 from lensmodel.photo.values import ENDINGS
-from lensmodel.report import LensReport, Unit, caution, sharpness
-from lensmodel.report.tables import place_table
+from lensmodel.report import LensReport, Unit, caution, place_table, sharpness
 
 STATIC: Final = Path(__file__).parent / "static"
 HEADERS: Final = {

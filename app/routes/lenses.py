@@ -24,8 +24,7 @@ from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.model.profile import LensProfile, write_profile
-from lensmodel.report import LensReport, provenance
-from lensmodel.report.tables import to_csv
+from lensmodel.report import LensReport, provenance, to_csv
 
 router = APIRouter(tags=["lenses"], route_class=OneSession)
 

@@ -29,11 +29,11 @@ from lensmodel.report import (
     lens_report,
     provenance,
     psf_grid,
+    to_csv,
     widest,
 )
 from lensmodel.report import export as write_psfs
 from lensmodel.report.lens_report import SensorGeometry
-from lensmodel.report.tables import to_csv
 
 Aperture = Annotated[float | None, options.aperture("f-number; default: the widest that a photo had.")]
 

@@ -298,14 +298,17 @@ def _with_bounded_noise(photos: Sequence[LinearPhoto]) -> list[LinearPhoto]:
 
     Photos of one camera at one ISO share the bound, since they share the sensor's noise.
     """
-    known = [(photo.info.metadata.camera_model, photo.info.metadata.iso) for photo in photos]
-    bounds = [[_quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos]
-    bounded = []
-    for photo, own in zip(photos, known, strict=True):
-        least = np.min([bound for bound, other in zip(bounds, known, strict=True) if other == own], axis=0)
-        sensor = None if photo.sensor_noise is None else _bounded(photo.sensor_noise, least)
-        bounded.append(replace(photo, noise=_bounded(photo.noise, least), sensor_noise=sensor))
-    return bounded
+    bounds = np.array([[_quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos])
+    if len({(photo.info.metadata.camera_model, photo.info.metadata.iso) for photo in photos}) == 1:
+        bounds[:] = bounds.min(axis=0)
+    return [
+        replace(
+            photo,
+            noise=_bounded(photo.noise, least),
+            sensor_noise=photo.sensor_noise and _bounded(photo.sensor_noise, least),
+        )
+        for photo, least in zip(photos, bounds.tolist(), strict=True)
+    ]
 
 
 def _quietest(photo: LinearPhoto, channel: int) -> float:

@@ -1,8 +1,14 @@
 """Sharpness: slanted edges and MTF."""
 
-from lensmodel.quality.edge import EdgeResponse, crossing, slanted_edge
 from lensmodel.quality.edge_finder import find_edges
-from lensmodel.quality.kernels import mtf50_from_kernel, mtf_from_kernel, tangential_sagittal_mtf50
+from lensmodel.quality.mtf import (
+    EdgeResponse,
+    crossing,
+    mtf50_from_kernel,
+    mtf_from_kernel,
+    slanted_edge,
+    tangential_sagittal_mtf50,
+)
 
 __all__ = [
     "EdgeResponse",

@@ -28,7 +28,7 @@ from scipy import ndimage
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.geometry import block_means
 from lensmodel.core.types import NoiseModel
-from lensmodel.quality.edge import Box, EdgeResponse, slanted_edge
+from lensmodel.quality.mtf import Box, EdgeResponse, slanted_edge
 
 SIDES: Final = (128, 96, 64)
 """Sides of a window in pixels: the largest that holds the edge and nothing else is taken."""

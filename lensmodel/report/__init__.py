@@ -4,7 +4,7 @@ Figures are drawn by `lensmodel.report.plots`, which needs matplotlib, and is im
 """
 
 from lensmodel.report.centring import centring
-from lensmodel.report.export import PsfGrid, export, exporters, psf_grid
+from lensmodel.report.export import PsfGrid, export, exporters, place_table, psf_grid, to_csv
 from lensmodel.report.lens_report import (
     LensReport,
     Unit,
@@ -28,8 +28,10 @@ __all__ = [
     "exporters",
     "filled_aspect",
     "lens_report",
+    "place_table",
     "provenance",
     "psf_grid",
     "sharpness",
+    "to_csv",
     "widest",
 ]

@@ -14,6 +14,7 @@ import numpy as np
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Channel
+from lensmodel.report.export import place_table
 from lensmodel.report.lens_report import (
     NYQUIST,
     ApertureReport,
@@ -21,7 +22,6 @@ from lensmodel.report.lens_report import (
     LensReport,
     Unit,
 )
-from lensmodel.report.tables import place_table
 
 try:
     import matplotlib as mpl

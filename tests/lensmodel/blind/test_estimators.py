@@ -16,7 +16,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import centroid, delta, rms_width
 from lensmodel.core.types import NoiseModel, Plane
-from lensmodel.quality.edge import edge_area
+from lensmodel.quality.mtf import edge_area
 from lensmodel.simulate import demo_scene
 
 SIGMA = 0.01

@@ -29,13 +29,14 @@ from lensmodel.report import (
     compare,
     filled_aspect,
     lens_report,
+    place_table,
     sharpness,
+    to_csv,
 )
 from lensmodel.report.centring import Asymmetry, Centring
 from lensmodel.report.lens_report import UNKNOWN, SensorGeometry
 from lensmodel.report.places import direction_in_words, grid, half_sides, place_in_words, ring
 from lensmodel.report.plots import charts, pages, to_pdf, to_png
-from lensmodel.report.tables import place_table, to_csv
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mode="paper")
 SIZE = 15

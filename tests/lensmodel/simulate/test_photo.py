@@ -19,7 +19,7 @@ from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import Kernel, LensSettings, Planes
-from lensmodel.quality.edge import edge_area
+from lensmodel.quality.mtf import edge_area
 from lensmodel.simulate import (
     DEMO_SCENES,
     Aberrations,

@@ -35,8 +35,8 @@ from scipy.sparse.csgraph import connected_components
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel
-from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.core.types import Channel, Kernel, StepHook
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, psf_at
 from lensmodel.measured.solve import Window, on_simplex
 from lensmodel.photo import LinearPhoto
 from lensmodel.quality.edge_finder import FoundEdge, find_edges
@@ -64,29 +64,22 @@ _STEPS: Final = 40  # of the fit, at most (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class SlantedEdges:
+class SlantedEdges(Measurer):
     """PSFs from the squares of a chart, wherever they are in the frame."""
 
     name: ClassVar[str] = "edges"
     version: ClassVar[int] = 1
     photos: ClassVar[int] = 1
 
-    def measure(
-        self,
-        photos: Sequence[LinearPhoto],
-        *,
-        size: int,
-        channels: Sequence[Channel] = CHANNELS,
-        on_step: StepHook = ignore_step,
-    ) -> list[MeasuredPsf]:
-        """Measure a PSF at every square of which two edges and their corner are seen; see `Measurer`."""
-        require(self, photos, size)
-        return at_each(
-            squares_of(chart_edges(photos[0])), channels,
-            lambda square, channel: _square_psf(photos[0], channel, square, size), on_step,
-            none="no square could be measured, which takes two of its edges and the corner between them; "
-            "photograph dark squares or a checkerboard, in focus and unclipped",
-        )  # fmt: skip
+    nothing: ClassVar[str] = (
+        "no square could be measured, which takes two of its edges and the corner between them; photograph "
+        "dark squares or a checkerboard, in focus and unclipped"
+    )
+
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        """Find squares of which two edges and their corner are seen."""
+        squares = squares_of(chart_edges(photos[0]))
+        return squares, lambda square, channel: _square_psf(photos[0], channel, square, size)
 
 
 def chart_edges(photo: LinearPhoto) -> tuple[FoundEdge, ...]:

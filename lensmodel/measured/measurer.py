@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, StepHook, ignore_step
 from lensmodel.photo import LinearPhoto
 
-_Place = TypeVar("_Place")
 PREFIX = "measured-"  # How the names of measuring estimators begin: blind ones never do
 
 
@@ -35,13 +35,18 @@ class MeasuredPsf:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
 
 
-class Measurer(Protocol):
+Prepared: TypeAlias = tuple[Sequence[Any], Callable[[Any, Channel], MeasuredPsf]]
+
+
+class Measurer(ABC):
     """One way to measure the PSF of a lens on photos made for it."""
 
     name: ClassVar[str]
     version: ClassVar[int]
     photos: ClassVar[int]
     """How many photos one measurement takes."""
+    nothing: ClassVar[str]
+    """What is missing where no place gives a PSF."""
 
     def measure(
         self,
@@ -71,6 +76,27 @@ class Measurer(Protocol):
         NotEnoughEvidenceError
             If they do not show what this way of measuring needs; the text says what is missing.
         """
+        if len(photos) != self.photos:
+            raise InvalidInputError(
+                f"measuring by {self.name} takes {self.photos} photo{'s' * (self.photos > 1)} at a time, "
+                f"got {len(photos)}"
+            )
+        if size < 3 or size % 2 == 0:
+            raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
+        places, psf_in = self._prepare(photos, size, on_step)
+        psfs = []
+        for done, place in enumerate(places, start=1):
+            for channel in channels:
+                with contextlib.suppress(LensModelError):
+                    psfs.append(psf_in(place, channel))
+            on_step(done, len(places))
+        if not psfs:
+            raise NotEnoughEvidenceError(self.nothing)
+        return psfs
+
+    @abstractmethod
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        """Find the places that photos show, and what measures one of them in a colour or raises."""
 
 
 def samples_of(
@@ -104,37 +130,6 @@ def samples_of(
 def is_measured(sample: PsfSample) -> bool:
     """Whether a sample was measured, and not estimated from an ordinary photo."""
     return sample.estimator.startswith(PREFIX)
-
-
-def require(method: Measurer, photos: Sequence[LinearPhoto], size: int) -> None:
-    """Refuse a wrong number of photos, and sides that no kernel has."""
-    if len(photos) != method.photos:
-        raise InvalidInputError(
-            f"measuring by {method.name} takes {method.photos} photo{'s' * (method.photos > 1)} at a time, "
-            f"got {len(photos)}"
-        )
-    if size < 3 or size % 2 == 0:
-        raise InvalidInputError(f"kernels have an odd side of 3 pixels or more, got {size}")
-
-
-def at_each(
-    places: Sequence[_Place],
-    channels: Sequence[Channel],
-    measured_at: Callable[[_Place, Channel], MeasuredPsf],
-    on_step: StepHook,
-    *,
-    none: str,
-) -> list[MeasuredPsf]:
-    """Measure at each place in each colour where that is possible; `none` says what is missing if nowhere."""
-    psfs = []
-    for done, place in enumerate(places, start=1):
-        for channel in channels:
-            with contextlib.suppress(LensModelError):
-                psfs.append(measured_at(place, channel))
-        on_step(done, len(places))
-    if not psfs:
-        raise NotEnoughEvidenceError(none)
-    return psfs
 
 
 def psf_at(

@@ -33,8 +33,8 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import block_means
-from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require
+from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms
 from lensmodel.photo import LinearPhoto
@@ -58,7 +58,7 @@ _SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class AperturePair:
+class AperturePair(Measurer):
     """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more."""
 
     across: int = 8  # cells of the frame, in each of which the window with most detail is taken
@@ -69,30 +69,22 @@ class AperturePair:
     version: ClassVar[int] = 1
     photos: ClassVar[int] = 2
 
-    def measure(
-        self,
-        photos: Sequence[LinearPhoto],
-        *,
-        size: int,
-        channels: Sequence[Channel] = CHANNELS,
-        on_step: StepHook = ignore_step,
-    ) -> list[MeasuredPsf]:
-        """Measure the PSF of the first photo; see `Measurer`."""
-        require(self, photos, size)
+    nothing: ClassVar[str] = (
+        "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat and in "
+        "focus"
+    )
+
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        """Lay the closed photo under the open one, and find windows with most detail."""
         _require_pair(*photos)
         opened, closed = _with_bounded_noise(photos)
         warp = self.register(opened, closed, on_step)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
-        return at_each(
-            corners, channels,
-            lambda corner, channel: self._window(
-                closed, warp, Window.of(opened, channel, corner, self.side), size
-            ), on_step,
-            none="no part of the pair determines a PSF; photograph a scene with fine detail everywhere, "
-            "flat and in focus",
-        )  # fmt: skip
+        return corners, lambda corner, channel: self._window(
+            closed, warp, Window.of(opened, channel, corner, self.side), size
+        )
 
-    def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook = ignore_step) -> Warp:
+    def register(self, opened: LinearPhoto, closed: LinearPhoto, on_step: StepHook) -> Warp:
         """Lay the closed photo under the open one."""
         plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
         shift, clarity = match(

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar, Final
 
 import numpy as np
@@ -26,8 +27,8 @@ from scipy import ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
-from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at, require
+from lensmodel.core.types import CHANNELS, Channel, StepHook
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, psf_at
 from lensmodel.measured.solve import NEAR_CLIP, Solved, Window, solve
 from lensmodel.photo import LinearPhoto
 
@@ -42,7 +43,7 @@ _SURE: Final = 0.45  # expected error beyond which a kernel helps no model: blin
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class Points(Measurer):
     """PSFs from isolated, unsaturated points of light."""
 
     across: int = 7  # cells of the frame; the points of a cell are stacked
@@ -52,16 +53,13 @@ class Points:
     version: ClassVar[int] = 1
     photos: ClassVar[int] = 1
 
-    def measure(
-        self,
-        photos: Sequence[LinearPhoto],
-        *,
-        size: int,
-        channels: Sequence[Channel] = CHANNELS,
-        on_step: StepHook = ignore_step,
-    ) -> list[MeasuredPsf]:
-        """Measure the PSF wherever there are points; see `Measurer`."""
-        require(self, photos, size)
+    nothing: ClassVar[str] = (
+        "what looks like points of light gives no PSF: they are too faint, or parts of an ordinary scene; "
+        "photograph stars or pinholes before a dark ground, and expose longer"
+    )
+
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        """Find points that are alone and unsaturated, by the cells of the frame."""
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
         spots = find_lights(plane)
@@ -83,15 +81,12 @@ class Points:
                 f"{len(lights)} isolated points of light, {len(usable)} of them unsaturated and whole, and "
                 f"no part of the frame with {_FEWEST}; expose less, or photograph more points"
             )
-        skies = {
-            c: sky_of(np.asarray(photo.planes[CHANNELS.index(c)], dtype=np.float64))[0] for c in channels
-        }
-        return at_each(
-            good, channels,
-            lambda cell, channel: _cell_psf(photo, channel, cell[:_MOST], size, skies[channel]), on_step,
-            none="what looks like points of light gives no PSF: they are too faint, or parts of an ordinary "
-            "scene; photograph stars or pinholes before a dark ground, and expose longer",
-        )  # fmt: skip
+
+        @cache
+        def sky(channel: Channel) -> NDArray[np.float64]:
+            return sky_of(np.asarray(photo.planes[CHANNELS.index(channel)], np.float64))[0]
+
+        return good, lambda cell, channel: _cell_psf(photo, channel, cell[:_MOST], size, sky(channel))
 
 
 def _is_usable(photo: LinearPhoto, row: float, col: float, size: int) -> bool:

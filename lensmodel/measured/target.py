@@ -31,8 +31,8 @@ from scipy import fft
 from scipy.signal.windows import tukey
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
-from lensmodel.measured.measurer import MeasuredPsf, at_each, require
+from lensmodel.core.types import Kernel, StepHook
+from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared
 from lensmodel.measured.page import DETAILS, MEAN, TargetPage
 from lensmodel.measured.registration import CLEAR, Warp, find_marks, homography_of, match, matched
 from lensmodel.measured.solve import (
@@ -60,7 +60,7 @@ _TRIED: Final = 6  # windows looked at along each axis for one that is measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class Target(Measurer):
     """Non-blind PSFs from one photo of the printed target."""
 
     # places along the sides of the frame; fewer where windows would overlap by more than a quarter
@@ -73,16 +73,10 @@ class Target:
     version: ClassVar[int] = 1
     photos: ClassVar[int] = 1
 
-    def measure(
-        self,
-        photos: Sequence[LinearPhoto],
-        *,
-        size: int,
-        channels: Sequence[Channel] = CHANNELS,
-        on_step: StepHook = ignore_step,
-    ) -> list[MeasuredPsf]:
-        """Measure the PSF all over the page; see `Measurer`."""
-        require(self, photos, size)
+    nothing: ClassVar[str] = "no window of the page determines a PSF; is the photo in focus?"
+
+    def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+        """Find the page, its tones, and windows all over it."""
         photo = photos[0]
         placed = self.find(photo, on_step)
         height, width = photo.planes.shape[1:]
@@ -99,14 +93,11 @@ class Target:
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         tones = tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side, on_step)
         placed = replace(placed, tones=tones)
-        return at_each(
-            corners, channels,
-            lambda corner, channel: self._window(placed, Window.of(photo, channel, corner, self.side), size),
-            on_step,
-            none="no window of the page determines a PSF; is the photo in focus?",
-        )  # fmt: skip
+        return corners, lambda corner, channel: self._window(
+            placed, Window.of(photo, channel, corner, self.side), size
+        )
 
-    def find(self, photo: LinearPhoto, on_step: StepHook = ignore_step) -> PlacedPage:
+    def find(self, photo: LinearPhoto, on_step: StepHook) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel."""
         plane, side = np.asarray(photo.planes[1]), self.side
         placed = _identified(photo, self.details, on_step)
@@ -245,7 +236,7 @@ def tones_of(
     placed: PlacedPage,
     corners: Sequence[tuple[int, int]],
     side: int,
-    on_step: StepHook = ignore_step,
+    on_step: StepHook,
 ) -> tuple[float, float, float]:
     """Fit the tones of the print where the lens is sharpest: how the photo follows R.
 

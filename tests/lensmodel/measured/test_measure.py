@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,9 +23,9 @@ from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, resized
-from lensmodel.core.types import Channel, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
+from lensmodel.core.types import Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
-from lensmodel.measured.measurer import MeasuredPsf, at_each, psf_at
+from lensmodel.measured.measurer import Measurer, Prepared, psf_at
 from lensmodel.measured.page import PAPERS, TargetPage
 from lensmodel.measured.pair import AperturePair, diffraction_otf
 from lensmodel.measured.points import Points, find_lights, isolated_lights
@@ -266,14 +267,22 @@ def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> N
 
 
 def test_a_psf_whose_error_is_not_known_is_left_out_and_the_others_stay() -> None:
+    class Sure(Measurer):
+        name, version, photos, nothing = "sure", 1, 1, "nowhere"
+
+        def __init__(self, *errors: float) -> None:
+            self.errors = errors
+
+        def _prepare(self, photos: Sequence[LinearPhoto], size: int, on_step: StepHook) -> Prepared:
+            kernel, at = gaussian(size, np.eye(2)), np.array([30.0, 30.0])
+            return self.errors, lambda error, channel: psf_at(photos[0], channel, kernel, at, 9, error, 0.5)
+
     photo = photo_of(np.full((128, 128), 0.3), gaussian(5, np.eye(2)))
-
-    def measured_at(error: float, channel: Channel) -> MeasuredPsf:
-        return psf_at(photo, channel, gaussian(9, np.eye(2)), np.array([30.0, 30.0]), 9, error, 0.5)
-
-    found = at_each([math.nan, 0.1, 0.6], ["g"], measured_at, ignore_step, none="nowhere")
+    found = Sure(math.nan, 0.1, 0.6).measure([photo], size=9, channels=("g",))
 
     assert [psf.error for psf in found] == [0.1]
+    with pytest.raises(NotEnoughEvidenceError, match="nowhere"):
+        Sure(math.nan).measure([photo], size=9)
 
 
 # --- the ways -----------------------------------------------------------------------------------

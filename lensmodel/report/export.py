@@ -163,8 +163,7 @@ def place_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
     words, units = report.sensor.words, report.sensor.units
     head = ["Aperture", "Place", *(f"{side}, {UNIT_NAMES[unit]}" for unit in units for side in "TS")]
     rows = []
-    for aperture in report.apertures:
-        found = report.at(aperture)
+    for found in report.green:
         for spot in (found.spots[0], *found.sides, *found.spots[1:]):
             place = spot.place.removeprefix("the ") + (" (not known)" if spot.unknown else "")
             figures = [words(value, unit, between) for unit in units for _, value, between in spot.directions]

@@ -246,7 +246,7 @@ class LensReport:
     @property
     def apertures(self) -> tuple[float | None, ...]:
         """Those that were tested."""
-        return tuple(dict.fromkeys(one.settings.aperture for one in self.tested))
+        return tuple(one.settings.aperture for one in self.green)
 
     @property
     def facts(self) -> str:

@@ -123,8 +123,7 @@ def pages(report: LensReport) -> list[Figure]:
     """Draw what a photographer shows around on one page, and some for testers for each aperture."""
     with mpl.rc_context(_STYLE):
         drawn = [_photographer(report)]
-        for number in report.apertures:
-            found = report.at(number)
+        for found in report.green:
             panels = [
                 *_panels(report, found, "c/px"),
                 (f"MTF50 by place{_at(found)}", _on(_table, report, found)),

@@ -150,8 +150,7 @@ class SimulatedLens:
         pitch_um: float = DEFAULT_PITCH_UM,
     ) -> Kernel:
         """Exact kernel at a place of the field, integrated over square pixels, centred."""
-        h = (position.r * math.cos(position.phi), position.r * math.sin(position.phi))
-        return self.kernel_at_field(h, settings or LensSettings(), size, pitch_um=pitch_um)
+        return self.kernel_at_field(position.xy, settings or LensSettings(), size, pitch_um=pitch_um)
 
     def kernel_at_field(
         self,

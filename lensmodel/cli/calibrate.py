@@ -27,31 +27,19 @@ def calibrate(
     aperture: options.Aperture = None,
     model: Annotated[
         Literal["default", "paper"] | None,
-        typer.Option(
-            help="paper: the paper's method alone, for comparison: kernels by Michaeli and Irani, their "
-            "regression, and correction by Richardson-Lucy. A profile keeps its model."
-        ),
+        typer.Option(help="paper: the paper's method alone, for comparison. A profile keeps its model."),
     ] = None,
     estimator: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}; default: that of the model."
-        ),
+        str | None, typer.Option(help=f"{', '.join(estimators)}; default: that of the model.")
     ] = None,
     kernel_size: Annotated[
         int | None,
-        typer.Option(
-            metavar="PIXELS",
-            help="Side of the kernels, an odd number from 3 to 55; default: 31, with --model paper 55.",
-        ),
+        typer.Option(help="Side of the kernels, odd, 3 to 55; default: 31, with --model paper 55."),
     ] = None,
-    selector: Annotated[
-        str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
-    ] = "r-map",
+    selector: Annotated[str, typer.Option(help=f"Of patches: {', '.join(selectors)}.")] = "r-map",
     workers: options.Workers = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Address of a Dask cluster that estimates the photos."),
+        str | None, typer.Option(help="Address of a Dask cluster that estimates the photos.")
     ] = None,
     any_lens: options.AnyLens = False,
     force: Annotated[

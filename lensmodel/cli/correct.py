@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,9 +24,8 @@ from lensmodel.cli.console import Display, gain_words
 from lensmodel.cli.ending import UsageError, reason
 from lensmodel.cli.groups import PhotoGroup, Shot, groups
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
-from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
+from lensmodel.core.types import LensSettings, StepHook
 from lensmodel.correction import Bounds, deconvolvers
-from lensmodel.correction.audit import HELD
 from lensmodel.lens import Lens
 from lensmodel.model.identity import Identity, difference
 from lensmodel.photo import OutputFormat, PhotoMetadata, inspect
@@ -52,14 +51,11 @@ LEARNING, CORRECTING = "Learning (--lens auto)", "Correcting"
 def correct(
     photos: options.Photos,
     profile: Annotated[
-        Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The profile of their lens.")
+        Path | None, typer.Option("--profile", "-p", help="The profile of their lens.")
     ] = None,
     lens: Annotated[
         Literal["auto"] | None,
-        typer.Option(
-            help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
-            "correct those that visibly gain."
-        ),
+        typer.Option(help="auto: sort the photos by lens, learn each, and correct those that visibly gain."),
     ] = None,
     output: Annotated[
         str | None,
@@ -71,34 +67,17 @@ def correct(
             "`corrected` beside each photo.",
         ),
     ] = None,
-    strength: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            metavar="0..1",
-            help="0: correct nothing; 1: all that the noise allows (JPEGs: less where the PSF is unsure).",
-        ),
-    ] = 1.0,
+    strength: Annotated[float, typer.Option(min=0.0, max=1.0, help="1: all that the noise allows.")] = 1.0,
     file_format: Annotated[
-        OutputFormat | None,
-        typer.Option(
-            "--format", help="dng: linear, for a raw converter. Default: by the name after -o, else tiff16."
-        ),
+        OutputFormat | None, typer.Option("--format", help="Default: by the name after -o, else tiff16.")
     ] = None,
     aperture: options.Aperture = None,
     force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Replace existing files; with --profile, correct JPEGs whatever they gain."
-        ),
+        bool, typer.Option("--force", help="Replace existing files; correct JPEGs whatever they gain.")
     ] = False,
     any_lens: options.AnyLens = False,
     keep_location: Annotated[
-        bool,
-        typer.Option(
-            "--keep-location", help="Keep where the photo was taken (GPS). Default: it is left out."
-        ),
+        bool, typer.Option("--keep-location", help="Keep where the photo was taken (GPS).")
     ] = False,
     workers: options.Workers = None,
     json_output: options.Json = False,
@@ -107,48 +86,31 @@ def correct(
     profiles: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
-            rich_help_panel=LEARNING,
-            help="Folder of the lens profiles. Default: a folder `lenses` in the output.",
+            rich_help_panel=LEARNING, help="Folder of lens profiles; default: `lenses` in the output."
         ),
     ] = None,
     learn_from: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            metavar="N",
-            rich_help_panel=LEARNING,
-            help="Learn from at most this many photos of each group.",
-        ),
+        int, typer.Option(min=1, rich_help_panel=LEARNING, help="Most photos that a group is learned from.")
     ] = LEARN_FROM,
     method: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME",
-            rich_help_panel=CORRECTING,
-            help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned.",
+            rich_help_panel=CORRECTING, help=f"{', '.join(deconvolvers)}; default: as the lens was learned."
         ),
     ] = None,
     halo: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE",
             rich_help_panel=CORRECTING,
             help="How far results may go beyond the photo's own range beside edges, as a share of that "
             "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
         ),
     ] = None,
     texture: Annotated[
-        float,
-        typer.Option(
-            metavar="0..1", rich_help_panel=CORRECTING, help="How much of its faint texture a photo keeps."
-        ),
+        float, typer.Option(rich_help_panel=CORRECTING, help="Share of its faint texture that a photo keeps.")
     ] = 1.0,
     denoise: Annotated[
-        float,
-        typer.Option(
-            metavar="0..1", rich_help_panel=CORRECTING, help="How much of the photo's grain to take away."
-        ),
+        float, typer.Option(rich_help_panel=CORRECTING, help="Share of the photo's grain to take away.")
     ] = 0.0,
 ) -> None:
     """Remove the blur of the lens from photos.
@@ -275,8 +237,8 @@ class Correction:
                     tell(f"{target}: {gain_words(result['expected_gain_db'])} expected")
                 else:
                     display.result(str(target))
-                for remark in _remarks(result):
-                    tell(f"{path.name}, {remark}")
+                if result["nothing_to_correct"]:
+                    tell(f"{path.name}: nothing to correct, its pixels stayed as they were")
 
     def _photo(self, path: Path, target: Path, lens: Lens | None, on_step: StepHook) -> dict[str, Any]:
         """Correct one photo; return what became of it: `corrected`, `kept`, `left` or `failed`."""
@@ -345,24 +307,6 @@ def _why_left(corrected: lensmodel.Corrected, *, lossy: bool) -> str:
         else "at this aperture the lens is about as sharp as its pixels, or the photo shows little detail"
     )
     return f"a correction would gain too little to be seen (less than {SEEN_DB:g} dB): {why}"
-
-
-def _remarks(result: Mapping[str, Any]) -> Iterator[str]:
-    """Say where nothing was done, where the audit held back more than a tenth, and where colour is coarse."""
-    if result["nothing_to_correct"]:
-        yield "nothing to correct: its pixels stayed as they were"
-        return
-    for zone, audit in result["audit"].zones.items():
-        if audit.held_back > HELD and audit.checks:
-            most = sorted(audit.checks, key=lambda name: -audit.checks[name])[:3]
-            part = f"{audit.held_back:.0%} of the correction was held back"
-            yield f"{ZONE_WORDS[zone]}: {part} ({', '.join(most)})"
-    rows, cols = result["chroma_step"]
-    if max(rows, cols) > 1:
-        yield (
-            f"the JPEG stores one colour for {rows} x {cols} pixels: "
-            "brightness is corrected pixel by pixel, colour no more finely than that"
-        )
 
 
 # --- photos sorted by their lens ---------------------------------------------------------------

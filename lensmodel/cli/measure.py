@@ -32,10 +32,7 @@ def measure(
     profile: options.Profile,
     aperture: options.Aperture = None,
     size: Annotated[
-        int,
-        typer.Option(
-            min=9, max=101, metavar="N", callback=options.odd, help="Side of a PSF in pixels, an odd number."
-        ),
+        int, typer.Option(min=9, max=101, callback=options.odd, help="Side of a PSF in pixels, odd.")
     ] = 31,
     replace_blind: Annotated[
         bool,

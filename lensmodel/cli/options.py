@@ -34,34 +34,19 @@ def aperture(words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
 
 
 Photos = Annotated[list[Path], typer.Argument(metavar="PHOTO", help="Photos, or folders of them.")]
-Profile = Annotated[
-    Path, typer.Option("--profile", "-p", metavar="FILE", help="The lens profile to write or add to.")
-]
+Profile = Annotated[Path, typer.Option("--profile", "-p", help="The lens profile to write or add to.")]
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
 Aperture = Annotated[float | None, aperture("f-number, for photos that do not record their own.")]
 AnyLens = Annotated[
     bool, typer.Option("--any-lens", help="Also accept photos that seem to be of a different lens.")
 ]
 Channel = Annotated[types.Channel, typer.Option(help="Colour channel.")]
-RADIUS = typer.Option(
-    "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the centre: 0 centre, 1 corner."
-)
+RADIUS = typer.Option("--r", min=0.0, max=1.0, help="Distance from the centre: 0 centre, 1 corner.")
 ANGLE = typer.Option(
-    "--phi",
-    min=-math.tau,
-    max=math.tau,
-    metavar="RADIAN",
-    help="Angle of the place, counter-clockwise from the right.",
+    "--phi", min=-math.tau, max=math.tau, help="Angle in radians, counter-clockwise from the right."
 )
-Size = Annotated[
-    int, typer.Option(min=3, max=255, metavar="N", callback=odd, help="Side in pixels, an odd number.")
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers", "-j", min=1, metavar="N", help="How many cores to use, as processes or threads; or all."
-    ),
-]
+Size = Annotated[int, typer.Option(min=3, max=255, callback=odd, help="Side in pixels, an odd number.")]
+Workers = Annotated[int | None, typer.Option("--workers", "-j", min=1, help="Cores to use; default: all.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors: no progress and no notes.")]

@@ -52,17 +52,10 @@ def report(
         ),
     ] = None,
     aperture: Aperture = None,
-    against: Annotated[
-        Path | None,
-        typer.Option("--against", metavar="FILE", help="Profile of another copy to compare with."),
-    ] = None,
+    against: Annotated[Path | None, typer.Option(help="Profile of another copy to compare with.")] = None,
     photo: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--photo",
-            metavar="PHOTO",
-            help="A photo of this lens on which lateral colour is measured; may be repeated; needs --output.",
-        ),
+        typer.Option(help="A photo of the lens whose lateral colour is measured; again for more; needs -o."),
     ] = None,
     force: options.Force = False,
 ) -> None:
@@ -150,19 +143,12 @@ def export(
     profile: options.ProfileFile,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help=f"Where to write: a file that ends in .{', .'.join(exporters)}.",
-        ),
+        typer.Option("--output", "-o", help=f"Where to write: a file that ends in .{', .'.join(exporters)}."),
     ],
     aperture: Aperture = None,
     channel: options.Channel = "g",
-    rows: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Rows of the grid of places.")] = 5,
-    cols: Annotated[
-        int, typer.Option(min=1, max=100, metavar="N", help="Columns of the grid of places.")
-    ] = 7,
+    rows: Annotated[int, typer.Option(min=1, max=100, help="Rows of the grid of places.")] = 5,
+    cols: Annotated[int, typer.Option(min=1, max=100, help="Columns of the grid of places.")] = 7,
     r: Annotated[float | None, options.RADIUS] = None,
     phi: Annotated[float | None, options.ANGLE] = None,
     size: options.Size = 31,

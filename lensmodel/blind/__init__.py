@@ -1,4 +1,4 @@
-"""Blind estimation: one PSF from the patches of one field position, or from all patches of a photo."""
+"""Blind estimation: one PSF from patches of a field position, or from all of a photo; see `sampling`."""
 
 from lensmodel.blind.estimator import PhotoEstimator, PsfEstimate, PsfEstimator
 from lensmodel.blind.learned import LearnedEstimator

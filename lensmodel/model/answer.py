@@ -13,9 +13,8 @@ from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
 from lensmodel.model.variables import Support
 
-DEFAULT: Final = "default"
 PAPER: Final = "paper"
-MODES: Final = (DEFAULT, PAPER)  # ways to answer from samples, see `ModelSettings.mode`
+MODES: Final = ("default", PAPER)  # ways to answer from samples, see `ModelSettings.mode`
 
 AnsweredBy: TypeAlias = Literal["network", "regression", "network and regression", "paper"]
 """What made an answer."""
@@ -50,7 +49,7 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    mode: str = DEFAULT
+    mode: str = "default"
 
     def __post_init__(self) -> None:
         for name in ("r", "phi", "stops"):

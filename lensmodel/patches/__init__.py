@@ -1,4 +1,4 @@
-"""Step 1, where: the regions of a photo that are informative about the PSF."""
+"""Step 1, where: the regions of a photo that tell about the PSF, by `rmap`, `good_regions` or `spread`."""
 
 from lensmodel.patches.checks import LEAST_PARTS, LEAST_PATCHES, require_enough
 from lensmodel.patches.rmap import r_map

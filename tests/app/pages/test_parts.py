@@ -355,6 +355,14 @@ def test_a_photo_that_failed_offers_what_can_help_and_says_once_why(client: Test
         assert not detail or html.unescape(page).count(detail) == 1, code
 
 
+def test_a_photo_says_how_much_it_taught_and_why_no_more(client: TestClient, steps: Steps) -> None:
+    page = client.get(f"/photos/{steps.counted().public_id}").text
+
+    used = page.partition('id="patches-title"')[2].partition("</section>")[0]
+    assert "2 places showed the blur" in used
+    assert re.findall(r"<li><b>(\d+)</b> (.*?)</li>", used) == [("1", "no detail")]
+
+
 def test_every_raw_ending_can_be_picked(client: TestClient) -> None:
     (picker,) = re.findall(r'<input id="files"[^>]* accept="([^"]*)"', client.get("/").text)
 
@@ -455,16 +463,18 @@ def test_a_photo_that_lacks_only_its_aperture_is_asked_for_nothing_else(
 # --- lenses -------------------------------------------------------------------------------------------
 
 
-def test_a_lens_that_was_named_before_any_photo_is_listed_and_no_ghost(
+def test_a_lens_that_was_named_before_any_photo_is_listed_and_none_whose_photos_failed(
     client: TestClient, steps: Steps
 ) -> None:
-    client.post("/v1/lenses", json={"label": "Lens on the bench"})
-    failed(steps, serial="2")
+    named, tried = (client.post("/v1/lenses", json={"label": label}).json() for label in ("Bench", "Tried"))
+    photo = steps.receive(lens_id=tried["id"])
+    steps.inspect(photo, serial=None)
+    steps.store.photos.fail(photo.public_id, photo.epoch, "raw_decode_failed", "damaged")
 
     page = client.get("/").text
 
-    assert page.count('class="card"') == 1
-    assert "Lens on the bench" in page
+    assert client.get(f"/v1/lenses/{tried['id']}").status_code == 200
+    assert [f'href="/lenses/{lens["id"]}"' in page for lens in (named, tried)] == [True, False]
 
 
 def test_a_lens_page_shows_the_newest_of_many_versions(client: TestClient, steps: Steps) -> None:

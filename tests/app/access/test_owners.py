@@ -471,6 +471,7 @@ def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
     assert kernel.size == sample["entry"]["size"] ** 2
     assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
     assert foreign.public_id not in str(files)
+    assert not {"owner_id", "key_hash"} & {name for table in rows.values() for row in table for name in row}
 
 
 def test_an_archive_of_many_files_takes_time_in_proportion_to_them() -> None:

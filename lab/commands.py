@@ -54,9 +54,7 @@ def gallery(
 
     Results are kept by the content of the photo and the version of the code: the same command again goes on.
 
-    Examples:
-
-        lensmodel bench gallery --only simulated/text
+    Example:
 
         lensmodel bench gallery --only simulated/snow --only simulated/sky -o two-pictures
 
@@ -105,8 +103,6 @@ def blind(
     with --force.
 
     Examples:
-
-        lensmodel bench blind --cases 12
 
         lensmodel bench blind --photos sharp --noise 0.01 --methods default -o mine
 

@@ -107,7 +107,7 @@ NOT_RUN = {
     "reproduce --size quick -o reproduction",  # tests/lab/reproduce runs one lens from end to end
     "reproduce --lens 1003 --lens aspheric-f2.7.npz -o two-lenses",
     "bench blind --photos sharp --scenes 80 --half all --cases 200",
-    "bench gallery --only simulated/snow --only simulated/sky -o two-pictures",  # tests/lab/gallery makes its page
+    "bench gallery --only simulated/snow --only simulated/sky -o two-pictures",  # tests/lab makes its page
 }
 """Hours or minutes of the laboratory: that they are understood is tested, and their parts are."""
 

@@ -18,7 +18,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -152,9 +152,10 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
+        chosen = dict(document["model"])
+        excluded = chosen.pop("excluded", ())  # photos that do not count, of earlier profiles
         samples = unpack_samples(PackedSamples(entries, stack, encoded))
-        chosen = {f.name: document["model"][f.name] for f in fields(ModelSettings)}
-        model = LensModel.fit(samples, ModelSettings(**chosen))
+        model = LensModel.fit([s for s in samples if s.photo not in excluded], ModelSettings(**chosen))
         cameras = (_texts(camera) for camera in document.get("cameras", []))
         return LensProfile(
             model,

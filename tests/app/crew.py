@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from deadline import until
+from deadline import Deadline, until
 from quick_tasks import CELLS
 from sqlalchemy import func, select
 
@@ -65,11 +65,13 @@ class Crew:
 
 def pause(pid: int, files: Sequence[Path]) -> None:
     """Stop a process while it has locked none of the databases: else it would stop all the others too."""
+    deadline = Deadline(120.0)
     while True:
         os.kill(pid, signal.SIGSTOP)
         if all(_unlocked(path) for path in files):
             return
         os.kill(pid, signal.SIGCONT)
+        assert not deadline.passed(), "a database is always locked"
         time.sleep(0.02)
 
 

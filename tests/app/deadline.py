@@ -1,4 +1,4 @@
-"""Deadlines in seconds of an idle machine: they last longer where others use its processors too."""
+"""Deadlines in seconds of an idle machine: longer, to a limit, where others use its processors too."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
+MOST: Final = 7.0  # times as long at most (chosen): what hangs is told within half an hour, however busy
 Found = TypeVar("Found")
 
 
 def slowness() -> float:
     """How many processes share a processor, over the last minute; 1 on an idle machine."""
-    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    return min(max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1)), MOST)
 
 
 def stretched(seconds: float) -> float:

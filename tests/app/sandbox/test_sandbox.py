@@ -194,7 +194,7 @@ def probed(data: Path, *, but: Sequence[str] = (), **asked: Any) -> dict[str, st
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
         arguments = {"port": listener.getsockname()[1], "but": but}
         command, environment = boxed(data, "probe", arguments=arguments, **asked), clean() | secrets
-        said = subprocess.check_output(command, env=environment, text=True, timeout=stretched(400))
+        said = subprocess.check_output(command, env=environment, text=True, timeout=stretched(240))
     ending, detail, found, _ = json.loads(said)
     assert ending == "ok", detail
     assert (data / "app.db").read_text() == "rows of all owners"

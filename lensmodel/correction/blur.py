@@ -127,12 +127,13 @@ class UniformBlur:
             return self.adjoint(np.ones(shape, dtype=np.float32))
         side = self.kernel.shape[0]
         sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        starts = [side - 1 - np.arange(extent + side - 1) for extent in shape]
-        above, before = (np.clip(start, 0, side) for start in starts)
-        below, after = (np.clip(start + n, 0, side) for start, n in zip(starts, shape, strict=True))
-        inside = sums[np.ix_(below, after)] - sums[np.ix_(above, after)]
-        inside += sums[np.ix_(above, before)] - sums[np.ix_(below, before)]
-        return inside.astype(np.float32)
+        for axis, extent in enumerate(
+            shape
+        ):  # four look-ups for each point of the plane take five times as long
+            start = side - 1 - np.arange(extent + side - 1)
+            above, below = np.clip(start, 0, side), np.clip(start + extent, 0, side)
+            sums = sums.take(below, axis) - sums.take(above, axis)
+        return sums.astype(np.float32)
 
     def frame(self, latent: Plane) -> Plane:
         """Return the part of the latent plane that the photo shows."""

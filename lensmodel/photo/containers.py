@@ -225,9 +225,10 @@ _OF_PICTURE: Final = {b"PLTE", b"tRNS", b"IDAT"}
 # x, y of white, red, green, blue, and how far others round these (chosen)
 _OF_SRGB: Final = {
     b"cICP": (">4B", (1, 13, 0, 1), 0),
-    b"gAMA": (">I", (45455,), 400),
+    b"gAMA": (">I", (45455,), 500),
     b"cHRM": (">8I", (31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), 400),
 }
+_HDR: Final = {b"\x10", b"\x12"}  # curves PQ and HLG in cICP, which goes before a profile
 _READ: Final = {b"IDAT", b"eXIf", b"iCCP", b"iTXt", b"sRGB", *_OF_SRGB}
 _PNG_END: Final = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
@@ -256,7 +257,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
     exif, text = TiffReader.open(found.get(b"eXIf", b"")), found.get(b"iTXt", b"")
     xmp = text[20:].partition(b"\0")[2].partition(b"\0")[2]
     icc = _inflated(found[b"iCCP"].partition(b"\0")[2][1:]) if b"iCCP" in found else None
-    if icc is None:
+    if icc is None or found.get(b"cICP", b"")[1:2] in _HDR:
         _require_srgb(found)
     return Header(
         "png",
@@ -271,7 +272,7 @@ def _read_png(buffer: Buffer, limits: Limits) -> Header:
 
 
 def _require_srgb(chunks: Mapping[bytes, bytes]) -> None:
-    """Refuse a PNG without a profile whose chunks declare other colours: they would be lost."""
+    """Refuse a PNG whose chunks declare other colours where no profile gives them: they would be lost."""
     for name, (numbers, of_srgb, tolerance) in _OF_SRGB.items():
         body = chunks.get(name, b"")
         said = struct.unpack(numbers, body) if len(body) == struct.calcsize(numbers) else ()

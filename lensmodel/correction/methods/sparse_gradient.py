@@ -140,7 +140,7 @@ class SparseGradient:
         K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0)
         variance = (blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32)
         mosaic = any(sensor.measured is not None for sensor in sensors)
-        weights = np.full(len(blurred), self.mosaic_weight if mosaic else self.weight)
+        weights = np.full(len(blurred), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
         if not mosaic and glow is None:
             # beside removed lights the rest is no natural scene: the prior keeps its weight
             weights *= _reliance(_determined_share(K[1], canvas.shape, noise[1], variance[1]))

@@ -197,6 +197,15 @@ def test_parameters_out_of_range_are_refused(method: type, wrong: dict, said: st
         method(**wrong)
 
 
+def test_weights_may_be_whole_numbers() -> None:
+    tile, blurs = np.stack([scene(40, 44)] * 3), [UniformBlur(gaussian(5, np.eye(2)))] * 3
+    whole, real = (
+        SparseGradient(weight=w).deconvolve_planes(tile, blurs, [CLEAN] * 3).planes for w in (2, 2.0)
+    )
+
+    np.testing.assert_array_equal(whole, real)
+
+
 def test_richardson_lucy_raises_the_likelihood_with_every_step() -> None:
     rng = np.random.default_rng(5)
     blur = UniformBlur(gaussian(9, np.eye(2) * 2))

@@ -28,6 +28,9 @@ def chunk(name: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
 
+PROFILE = chunk(b"iCCP", b"x\0\0" + zlib.compress(ADOBE_RGB))
+
+
 def png_with(*chunks: bytes) -> bytes:
     out = io.BytesIO()
     Image.fromarray(PIXELS).save(out, "PNG")
@@ -97,8 +100,7 @@ def test_adobe_rgb_that_only_exif_declares_stays_adobe_rgb(case: str, tmp_path: 
 def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     (tmp_path / "x.jpg").write_bytes(jpeg_with(parts_of(srgb, [(1, 1)]), exif(2)))
-    profile = chunk(b"iCCP", b"x\0\0" + zlib.compress(ADOBE_RGB))
-    (tmp_path / "x.png").write_bytes(png_with(profile, gama(1.0)))
+    (tmp_path / "x.png").write_bytes(png_with(PROFILE, gama(1.0)))
 
     assert photo.develop(tmp_path / "x.jpg").encoding.icc == srgb
     assert photo.develop(tmp_path / "x.png").encoding.icc == ADOBE_RGB
@@ -110,9 +112,10 @@ def test_a_profile_goes_before_what_else_is_declared(tmp_path: Path) -> None:
         chunk(b"cICP", bytes((1, 13, 0, 1))),
         chunk(b"sRGB", b"\0") + gama(1.0),
         gama(0.45455) + chrm(0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06),
+        gama(0.45),
         gama(0.0) + chrm(*(0.0,) * 8),
     ],
-    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated", "nonsense"],
+    ids=["cICP", "sRGB before gAMA", "as sRGB is approximated", "rounded", "nonsense"],
 )
 def test_a_png_that_declares_srgb_is_read(chunks: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(png_with(chunks))
@@ -129,6 +132,7 @@ def test_a_png_that_declares_srgb_is_read(chunks: bytes, tmp_path: Path) -> None
         (png_with(gama(1.0)), "gAMA"),
         (png_with(chrm(0.3127, 0.3290, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)), "cHRM"),
         (png_with(chunk(b"sRGB", b"\0"), chunk(b"cICP", bytes((9, 16, 0, 1)))), "cICP"),
+        (png_with(chunk(b"cICP", bytes((9, 18, 0, 1))), PROFILE), "cICP"),
     ],
 )
 def test_colours_that_only_chunks_declare_are_refused_before_the_file_is_stored(

@@ -127,9 +127,8 @@ class UniformBlur:
             return self.adjoint(np.ones(shape, dtype=np.float32))
         side = self.kernel.shape[0]
         sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        for axis, extent in enumerate(
-            shape
-        ):  # four look-ups for each point of the plane take five times as long
+        # one axis after the other: four look-ups for each point of the plane take five times as long
+        for axis, extent in enumerate(shape):
             start = side - 1 - np.arange(extent + side - 1)
             above, below = np.clip(start, 0, side), np.clip(start + extent, 0, side)
             sums = sums.take(below, axis) - sums.take(above, axis)

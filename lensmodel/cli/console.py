@@ -115,7 +115,8 @@ class Bar(Progress):
         every_s: float = EVERY_S,
         **given: Any,  # noqa: ANN401 - as `Progress` takes them
     ) -> None:
-        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+        words = TextColumn("{task.description}", markup=False)  # names of files may hold brackets
+        columns = words, BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
         super().__init__(*columns, TextColumn("{task.fields[left]}"), **given)
         self._say, self._every_s = say, every_s
         self._last = self.get_time()
@@ -131,7 +132,9 @@ class Bar(Progress):
         if "completed" in changes:
             changes["completed"] = max(changes["completed"], task.completed)
         self.update(task.id, **changes)
-        left = "" if task.time_remaining is None else clock(task.time_remaining)
+        # photos that an earlier run has done are passed in no time, which says nothing of the others
+        early = (task.elapsed or 0.0) < 2.0 * self.speed_estimate_period
+        left = "" if early or task.time_remaining is None else clock(task.time_remaining)
         task.fields["left"] = left and f"ETA {left}"
         if self._say is not None and self.get_time() - self._last >= self._every_s:
             self._last = self.get_time()

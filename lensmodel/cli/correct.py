@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 from rich import box
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 import lensmodel
 from lensmodel.api import FORMATS, SEEN_DB
@@ -402,7 +402,7 @@ def _row(
 def table_of(rows: Iterable[Mapping[str, Any]]) -> Table:
     """Return the table of groups, which fits a terminal of 80 columns."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("camera, lens, focal length", max_width=_LENS_WIDTH)
+    table.add_column("camera, lens, focal length", max_width=_LENS_WIDTH, overflow="fold")
     for head in ("photos", "learned\nfrom", "corrected", "left", "failed", "expected\ngain"):
         table.add_column(head, justify="right")
     for row in rows:
@@ -410,5 +410,5 @@ def table_of(rows: Iterable[Mapping[str, Any]]) -> Table:
         corrected = row["corrected"] + row["corrected_before"]
         counts = row["photos"], row["learned_from"], corrected, row["left"], row["failed"]
         names = ", ".join((row["camera"], row["lens"], row["focal_length"]))
-        table.add_row(escape(names), *map(str, counts), "" if gain is None else gain_words(gain))
+        table.add_row(Text(names), *map(str, counts), "" if gain is None else gain_words(gain))
     return table

@@ -89,6 +89,8 @@ def refuse_photo(target: Path, photos: Sequence[Path]) -> None:
 
 def profile_at(path: Path) -> LensProfile:
     """Open a profile."""
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; give the file of a lens profile")
     if not path.exists():
         raise UsageError(
             f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"

@@ -341,6 +341,7 @@ REFUSED = {
     "profile is a photo": ((*CALIBRATE, "-p", "sub/one.dng", "--force"), 2, "one.dng is a photo; name a new"),
     "profile is the photo": (("calibrate", "there.npy", "-p", "there.npy", "--force"), 2, "npy is a photo"),
     "profile is a folder": ((*CALIBRATE, "-p", "empty"), 2, "empty is a folder"),
+    "folder of profiles": ((*CORRECT, "-p", "empty"), 2, "empty is a folder; give the file"),
     "output is a file": (("correct", "one.dng", "-p", PROFILE, "-o", "bad"), 2, "bad is a file"),
     "halo that is none": ((*CORRECT, "-p", PROFILE, "--halo", "nan"), 2, "halo must not be negative.*nan"),
     "a name of another format": (
@@ -629,6 +630,7 @@ def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(
     on_a_terminal: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Task, "time_remaining", 83.0)  # the photo is too quick for any to be told
+    monkeypatch.setattr(Task, "elapsed", 61.0)
     said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]

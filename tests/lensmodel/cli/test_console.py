@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from in_process import lensmodel
+from rich.console import Console
 from running import SMALL, write_photo
 
 from lab.kernels import gaussian
@@ -41,6 +42,30 @@ def test_the_time_left_is_told_and_no_share_falls() -> None:
         bar.show(completed=done)
 
     assert said == ["[1:00]  20 % photos", "[1:10]  20 % photos", "[1:20]  30 % photos, about 2:20 left"]
+
+
+def test_photos_that_are_passed_promise_no_early_end() -> None:
+    said: list[str] = []
+    now = [0.0]
+    bar = Bar("photos", 200, say=said.append, every_s=0.0, disable=True, get_time=lambda: now[0])
+    bar.show(completed=50)
+    now[0] = 1.0
+    bar.show(completed=100)
+    for at in range(5, 80, 5):  # then 20 seconds for each
+        now[0] = at
+        bar.part(100, at, 20)
+
+    left = [line.partition("about ")[2] for line in said if "left" in line]
+    assert left
+    assert all(int(words.partition(":")[0]) > 30 for words in left), said
+
+
+def test_names_with_brackets_are_shown_whole() -> None:
+    out = io.StringIO()
+    with Bar("correcting IMG[b].dng", 1, console=Console(file=out, force_terminal=True, width=100)):
+        pass
+
+    assert "IMG[b].dng" in out.getvalue()
 
 
 def test_a_measurement_and_its_report_count_the_same_places(

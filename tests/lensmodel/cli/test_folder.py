@@ -92,12 +92,18 @@ def test_the_table_fits_a_terminal_of_80_columns() -> None:
         "expected_gain_db": 0.0,
     }
 
+    long = row | {
+        "focal_length": "400 mm",
+        "expected_gain_db": None,
+        "lens": "[24-105]:camera:_IS_USM_without_blanks",
+    }
     console = Console(width=200, file=io.StringIO())
-    console.print(table_of([row, row | {"focal_length": "400 mm", "expected_gain_db": None}]))
+    console.print(table_of([row, long]))
     text = console.file.getvalue()  # type: ignore[attr-defined]  # of `io.StringIO`
 
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert "400 mm" in text
+    assert long["lens"] in "".join(line[:26].rstrip() for line in text.splitlines())  # whole, as it is
 
 
 def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> None:

@@ -123,6 +123,8 @@ def load_developed(folder: Path) -> LinearPhoto:
         stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
+    if "turns" in stored["info"]:  # of earlier versions: None where nothing told which way
+        stored["info"]["turned"] = stored["info"]["turns"] is None
     return codec.from_json(LinearPhoto, {**stored, "planes": planes})
 
 

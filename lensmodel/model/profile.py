@@ -141,9 +141,7 @@ def read_profile(source: Path | str | IO[bytes], name: str) -> LensProfile:
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
-        raise InvalidInputError(
-            f"{name} is no lens profile; choose one whose name ends in .lensprofile"
-        ) from error
+        raise InvalidInputError(f"{name} is no lens profile, or a damaged one; give another file") from error
     try:
         entries = document["samples"]
         fits = stack.ndim == 3 and len(entries) == len(stack) and _within_limits(*stack.shape[:2])

@@ -337,7 +337,7 @@ REFUSED = {
     "add other lens": (("calibrate", "other.dng", "-p", PROFILE), 1, "lens: .*L-43.*profile of its own"),
     "no profile": ((*CORRECT, "-p", "gone"), 2, "no lens profile at gone; make it"),
     "bad profile": ((*CORRECT, "-p", "bad"), 1, "bad is no lens profile"),
-    "bad profile to add to": ((*CALIBRATE, "-p", "bad"), 1, "bad is no lens profile"),
+    "bad profile to add to": ((*CALIBRATE, "-p", "bad"), 1, "bad is .*a damaged one; give another"),
     "profile is a photo": ((*CALIBRATE, "-p", "sub/one.dng", "--force"), 2, "one.dng is a photo; name a new"),
     "profile is the photo": (("calibrate", "there.npy", "-p", "there.npy", "--force"), 2, "npy is a photo"),
     "profile is a folder": ((*CALIBRATE, "-p", "empty"), 2, "empty is a folder"),

@@ -341,7 +341,11 @@ def _develop_raw(raw: rawpy.RawPy, said: Said, info: PhotoInfo) -> LinearPhoto:
         remarks=(
             *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
             *((f"{defects} defective pixel{many} replaced",) if defects else ()),
-            *(() if own_balance else ("it does not say its white balance, and that of daylight is taken",)),
+            *(
+                ()
+                if own_balance
+                else ("it does not say its white balance: its picture is made grey on average",)
+            ),
         ),
     )
 
@@ -414,9 +418,21 @@ def _plane_noise(
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], bool]:
-    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own, not daylight's."""
-    for own, multipliers in ((True, raw.camera_whitebalance), (False, raw.daylight_whitebalance)):
-        r, g, b = multipliers[:3]
+    """Multipliers of r, g, b, that of green 1, and whether they are the camera's own.
+
+    Where it wrote none, LibRaw makes what is not saturated grey on average; of the dark, daylight's serve.
+    """
+
+    def of_the_picture() -> Sequence[float]:
+        raw.postprocess(use_auto_wb=True, half_size=True, output_bps=8)
+        return raw.auto_whitebalance or (0.0, 0.0, 0.0)
+
+    for own, multipliers in (
+        (True, lambda: raw.camera_whitebalance),
+        (False, of_the_picture),
+        (False, lambda: raw.daylight_whitebalance),
+    ):
+        r, g, b = multipliers()[:3]
         if min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20:  # others are absurd
             return (float(r) / float(g), 1.0, float(b) / float(g)), own
     return (1.0, 1.0, 1.0), False

@@ -323,7 +323,7 @@ def test_demo_files_are_listed_with_their_licence() -> None:
     readme = demo_data_path("README.md").read_text(encoding="utf-8")
     names = [entry.name for entry in demo_data_path("README.md").parent.iterdir() if entry.suffix != ".md"]
 
-    assert len(names) == 6
+    assert len(names) == 5
     assert all(name in readme for name in names)
 
 

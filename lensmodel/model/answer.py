@@ -28,7 +28,8 @@ class ModelSettings:
     ----------
     r, phi, stops : float or None
         Bandwidths of the regression in half-diagonals, chord of the unit circle, and stops. Automatic:
-        eq. (8) of the paper [1]_.
+        eq. (8) of the paper [1]_, and from three photos on the factors on it with the least
+        leave-one-photo-out error.
     mode : {"default", "paper"}
         "default": attention over the encoded patches of photos, and regression over the samples that were
         measured or estimated otherwise, each with the weight of its expected error. "paper": the regression

@@ -1,11 +1,12 @@
-"""Bandwidths by eq. (8) of the paper; robust weights and errors of samples by leaving one photo out.
+"""Bandwidths by eq. (8) of the paper and by leaving one photo out; with that robust weights, held-out errors.
 
 Every answer is a linear combination f_i = sum_j w_ij C_j, so the squared error of all held-out
 samples follows from the Gram matrix G = C C' alone::
 
     |C_i - f_i|^2 = G_ii - 2 (W G)_ii + (W G W')_ii
 
-Samples of one photo share its shake, focus and noise: leaving out single samples would be optimistic. With a
+Trying another bandwidth costs products of n x n matrices and touches no kernel. Samples of one
+photo share its shake, focus and noise: leaving out single samples would be optimistic. With a
 single photo there is no other choice, and each sample is its own group.
 
 A spoilt photo (defocus, shake, another lens) spoils all its samples, so photos are judged first, by the
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.local_frame import LocalKernels
@@ -42,11 +44,22 @@ FALLBACK: Final[Mapping[str, float]] = {
 _FLOOR_R, _FLOOR_PHI = 0.02, 0.12  # least bandwidths: blur does not change faster over the field (chosen)
 _SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
 _PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
+
+MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+"""Of the bandwidth by the rule: in steps of a root of two, in which errors hardly differ (chosen)."""
+PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
+"""The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
+_CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
+_AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
+_CV_PHOTOS = 3
+"""Photos from which on leaving one out tells of bandwidths: of two, one would foretell one (chosen)."""
+_CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
 _SCORED = 800
-"""Samples whose held-out error is measured, at a cost of their square; others get the median (chosen)."""
+"""Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
 _ONE_FOCAL_LENGTH = 0.25
 """Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
 _UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
+_FEWEST = 2  # one sample cannot be left out
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
 _ROUNDS = 4  # of reweighting: each costs as much, and later ones change the weights less (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
@@ -58,8 +71,10 @@ def reference_bandwidth(sigma: float, dimensions: int, count: int) -> float:
     return sigma * (4.0 / ((dimensions + 2) * max(count, 1))) ** (1.0 / (dimensions + 4))
 
 
-def bandwidths(where: NDArray[np.float64], settings: ModelSettings) -> dict[str, float]:
-    """Bandwidths of points `(n, 7)` by eq. (8) and the wishes of a user.
+def bandwidths(
+    where: NDArray[np.float64], settings: ModelSettings, factors: tuple[float, float] = (1.0, 1.0)
+) -> dict[str, float]:
+    """Bandwidths of points `(n, 7)` by eq. (8), factors on r and phi, and the wishes of a user.
 
     n counts PSF samples of one channel, not their pixels: a million pixels of one PSF say nothing
     about another place. d counts the place and those settings that vary. (u, v) have none.
@@ -76,78 +91,38 @@ def bandwidths(where: NDArray[np.float64], settings: ModelSettings) -> dict[str,
         for sigma, floor in ((float(where[:, 0].std()), _FLOOR_R), (math.sqrt(0.5), _FLOOR_PHI))
     )
     rule = {name: min(FALLBACK[name], reference_bandwidth(sigma, d, n)) for name, sigma in varying.items()}
-    rule = {"r": settings.r or r, "phi": settings.phi or phi, **FALLBACK, **rule}
+    rule = {"r": settings.r or r * factors[0], "phi": settings.phi or phi * factors[1], **FALLBACK, **rule}
     return rule if settings.stops is None else {**rule, "aperture_stops": settings.stops}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CrossValidation:
-    """What the samples say of each other."""
-
-    weights: NDArray[np.float64]  # (n,), after robust weighting
-    errors: NDArray[np.float64]  # (n,), held-out relative L2
-    noise: NDArray[np.float64]  # (n,), the part of its square that is the samples' own scatter
-    spoilt: bool = False  # whether a photo counts for less than half of what it claims
-
-
-def cross_validate(
-    samples: Sequence[PsfSample],
-    settings: ModelSettings,
-    local: LocalKernels,
-    where: NDArray[np.float64],
-    base: NDArray[np.float64],
-) -> CrossValidation:
-    """Weigh samples at points `where` (n, 7), of weights `base`, robustly and note their held-out errors."""
-    errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))
-    rows = np.flatnonzero(base > 0)
-    if len(rows) < 2:  # a single one cannot be left out
-        return CrossValidation(base, errors, noise)
-    if len(rows) > _SCORED:
-        rows = rows[np.linspace(0, len(rows) - 1, _SCORED).round().astype(np.intp)]
-    photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
-    held_out = HeldOut(
-        local.upright(rows).reshape(len(rows), -1),
-        where[rows],
-        va.scales(bandwidths(where, settings)),
-        base[rows],
-        _held_together(photo, where[:, 5])[rows],
-    )
-    of_photos = np.ones(photo.max() + 1)
-    known, own_photo = np.unique(photo[rows], return_inverse=True)
-    by_sample, of_photos[known], errors[rows] = held_out.robust(own_photo)
-    noise[rows] = np.minimum(held_out.noise(), errors[rows] ** 2)
-    others = np.setdiff1d(np.arange(len(samples)), rows)
-    errors[others], noise[others] = np.median(errors[rows]), np.median(noise[rows])
-    if settings.mode == PAPER:
-        return CrossValidation(base, errors, noise)
-    weights = base * of_photos[photo]
-    weights[rows] *= by_sample
-    return CrossValidation(weights, errors, noise, bool((of_photos < _SPOILT).any()))
-
-
 class HeldOut:
-    """What samples of other groups say of each sample.
+    """Samples prepared for cross-validation: what those of other groups say of each.
 
-    `kernels` (n, m) are flat, at points `where` (n, 7); `scale` are bandwidths, `claims` (n,) the weights of
-    the samples; those of one of `groups` (n,) are held out together.
+    `rows` (n, m) are kernels as flat rows of a square grid, at points `where` (n, 7); `scale` are bandwidths,
+    `claims` (n,) the weights of the samples; those of one of `groups` (n,) are held out together.
     """
 
     def __init__(
         self,
-        kernels: NDArray[np.floating],
+        rows: NDArray[np.floating],
         where: NDArray[np.float64],
         scale: NDArray[np.float64],
         claims: NDArray[np.float64],
         groups: NDArray[np.intp],
     ) -> None:
-        kernels = np.asarray(kernels, dtype=np.float64)  # errors are small differences of these products
-        self._gram = kernels @ kernels.T
+        rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
+        gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
+        self.claims, self._gram = claims, rows @ rows.T
         self._own = np.maximum(np.diag(self._gram), 1e-30)
-        squared = (np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2).sum(axis=-1)
-        squared[groups[:, None] == groups[None, :]] = np.inf
+        self._place, self._turn = gap[..., 0], gap[..., 1] + gap[..., 2]
+        self._others = np.where(groups[:, None] == groups[None, :], np.inf, gap[..., 3:].sum(axis=-1))
+
+    def weights(self, r: float = 1.0, phi: float = 1.0) -> NDArray[np.float64]:
+        """Held-out Nadaraya-Watson weights at multiples of the bandwidths, rows of sum 1."""
+        squared = self._place / r**2 + self._turn / phi**2 + self._others
         nearest = squared.min(axis=1, keepdims=True)
-        weight = claims * np.exp(-0.5 * (squared - np.where(np.isfinite(nearest), nearest, 0.0)))
-        self._weights = _of_sum_one(weight)  # Nadaraya-Watson weights of the others
+        weight = self.claims * np.exp(-0.5 * (squared - np.where(np.isfinite(nearest), nearest, 0.0)))
+        return _of_sum_one(weight)
 
     def errors(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Relative L2 of each sample against its weighted mean of others."""
@@ -155,25 +130,50 @@ class HeldOut:
         squared = np.diag(self._gram) - 2 * np.diag(mean) + np.einsum("ij,ij->i", mean, weight)
         return np.where(weight.sum(axis=1) > 0, np.sqrt(np.maximum(squared, 0.0) / self._own), 1.0)
 
-    def noise(self) -> NDArray[np.float64]:
+    def noise(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Squared relative scatter of each sample's others about their weighted mean.
 
-        It is sum_j w_j |C_j - f|^2 / (1 - sum_j w_j^2), over the sample's |C_i|^2.
+        From the weights of `weights`: sum_j w_j |C_j - f|^2 / (1 - sum_j w_j^2), over the sample's |C_i|^2.
         """
-        weight = self._weights
         spread = weight @ np.diag(self._gram) - np.einsum("ij,ij->i", weight @ self._gram, weight)
         free = np.maximum(1.0 - (weight**2).sum(axis=1), 0.1)
         return np.asarray(np.maximum(spread, 0.0) / free / self._own)
 
+    def score(self, r: float, phi: float) -> float:
+        """Mean error by weight at multiples of the bandwidths; gross errors count at most 1.5."""
+        errors = self.errors(self.weights(r, phi))
+        return float(np.average(np.minimum(errors, _CAP), weights=np.maximum(self.claims, 1e-9)))
+
+    def best_factors(self, *, r: bool, phi: bool) -> tuple[float, float]:
+        """Search the factors on r and phi, each only where it is free, for the least held-out error."""
+
+        def best(options: list[tuple[float, float]]) -> tuple[float, float]:
+            # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
+            scores = {option: self.score(*option) for option in options}
+            most = min(scores.values()) * _AS_GOOD + _NEGLIGIBLE
+            return next(option for option, score in scores.items() if score <= most)
+
+        chosen = (1.0, 1.0)
+        for _ in range(2):
+            before = chosen
+            if r:
+                chosen = best([(factor, chosen[1]) for factor in MULTIPLES])
+            if phi:
+                chosen = best([(chosen[0], factor) for factor in PHI_MULTIPLES])
+            if chosen == before:
+                break
+        return chosen
+
     def robust(
-        self, photos: NDArray[np.intp]
+        self, photos: NDArray[np.intp], factors: tuple[float, float]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Factors on the weights of samples and of photos (0 to the last), and the held-out errors."""
         count = int(photos.max()) + 1
         by_sample, by_photo = np.ones(photos.size), np.ones(count)
-        errors = self.errors(self._weights)
+        plain = self.weights(*factors)
+        errors = self.errors(plain)
         for _ in range(_ROUNDS if count >= _MIN_PHOTOS else 0):
-            errors = self.errors(_of_sum_one(self._weights * (by_sample * by_photo[photos])))
+            errors = self.errors(_of_sum_one(plain * (by_sample * by_photo[photos])))
             medians = np.array([np.median(errors[photos == p]) for p in range(count)])
             by_photo = _biweight(medians, medians, floor=0.25)
             by_sample = _biweight(errors, errors[by_photo[photos] > _SPOILT], floor=0.35)
@@ -196,6 +196,65 @@ def _biweight(
     return np.asarray(np.where(t < 1.0, (1.0 - t * t) ** 2, 0.0))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossValidation:
+    """What the samples say of each other."""
+
+    # (n,), weights after robust weighting; held-out relative L2; the part of its square that is the samples'
+    # own scatter
+    weights: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    factors: tuple[float, float] = (1.0, 1.0)  # on the bandwidths in r and phi
+    spoilt: bool = False  # whether a photo counts for less than half of what it claims
+
+
+def cross_validate(
+    samples: Sequence[PsfSample],
+    settings: ModelSettings,
+    local: LocalKernels,
+    where: NDArray[np.float64],
+    base: NDArray[np.float64],
+) -> CrossValidation:
+    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
+    paper = settings.mode == PAPER
+    photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
+    groups, scale = _held_together(photo, where[:, 5]), va.scales(bandwidths(where, settings))
+    counting = np.flatnonzero(base > 0)
+    automatic = not paper and len(np.unique(photo[counting])) >= _CV_PHOTOS
+    searched = _thinned(counting[_judging(where[counting, 4])], _CV_SAMPLES)
+    scored = _thinned(counting, _SCORED)
+    errors, noise = np.full(len(samples), _UNKNOWN_ERROR), np.zeros(len(samples))
+    if len(scored) < _FEWEST:
+        return CrossValidation(base, errors, noise)
+
+    def held(rows: NDArray[np.intp], weights: NDArray[np.float64]) -> HeldOut:
+        kernels = local.upright(rows).reshape(len(rows), -1)
+        return HeldOut(kernels, where[rows], scale, weights[rows], groups[rows])
+
+    def searched_factors(weights: NDArray[np.float64]) -> tuple[float, float]:
+        if not automatic:
+            return 1.0, 1.0
+        return held(searched, weights).best_factors(r=settings.r is None, phi=settings.phi is None)
+
+    factors, weights, spoilt = searched_factors(base), base, False
+    prepared = held(scored, base)
+    known, own_photo = np.unique(photo[scored], return_inverse=True)
+    by_sample, by_photo, held_out = prepared.robust(own_photo, factors)
+    if not paper:
+        of_photos = np.ones(photo.max() + 1)
+        of_photos[known] = by_photo
+        weights = base * of_photos[photo]
+        weights[scored] *= by_sample
+        spoilt = bool((by_photo < _SPOILT).any())
+        if spoilt or bool((by_sample < _SPOILT).any()):
+            factors = searched_factors(weights)
+    scatter = np.minimum(prepared.noise(prepared.weights(*factors)), held_out**2)
+    errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
+    errors[scored], noise[scored] = held_out, scatter
+    return CrossValidation(weights, errors, noise, factors, spoilt)
+
+
 def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDArray[np.intp]:
     """Group samples by photo; those of a photo that is alone at its focal length are held out one by one."""
     groups = photo.copy()  # without that photo the error would be that of zooming, not of its samples
@@ -206,3 +265,16 @@ def _held_together(photo: NDArray[np.intp], octaves: NDArray[np.float64]) -> NDA
         if not (~own & ~(np.abs(octaves - middle) > _ONE_FOCAL_LENGTH)).any():
             groups[own] = len(photo) + np.flatnonzero(own)
     return groups
+
+
+def _judging(wavelengths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which samples are green, which has the least noise; without any, of the channel of the most samples."""
+    known, counts = np.unique(wavelengths, return_counts=True)
+    green = WAVELENGTH_NM["g"]
+    return np.asarray(wavelengths == (green if green in known else known[counts.argmax()]))
+
+
+def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]

@@ -110,7 +110,7 @@ class Regression:
         # what the estimators expect of their samples; 0 where they expect nothing
         self._expected = np.array([0.0 if s.error is None else min(s.error, 1.0) for s in samples])
         self._photos = np.array([s.photo for s in samples], dtype=object)
-        self.bandwidth = bandwidths(points, settings)
+        self.bandwidth = bandwidths(points, settings, self._validation.factors)
         self._around = Neighbourhood(points, self._validation.weights, va.scales(self.bandwidth))
 
     def ask(self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None) -> Part:

@@ -113,11 +113,14 @@ def hanging(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_store_that_hangs_is_told_by_readiness_and_uploads_in_time(hanging: TestClient) -> None:
     began = time.monotonic()
-
-    ready, upload = hanging.get("/readyz"), hanging.post("/v1/photos", content=TIFF)
+    ready = hanging.get("/readyz")
+    between = time.monotonic()
+    upload = hanging.post("/v1/photos", content=TIFF)
+    ended = time.monotonic()
 
     assert (ready.status_code, upload.status_code, upload.json()["code"]) == (503, 503, "busy")
     assert "no answer within 0.5 s" in ready.json()["checks"]["storage"]
     assert ready.json()["checks"]["schema"] == "ok"
     assert "storage does not answer" in upload.json()["detail"]
-    assert time.monotonic() - began < 60  # of a busy machine; without a deadline it is minutes
+    # of a busy machine; without a deadline it is minutes
+    assert max(between - began, ended - between) < 30

@@ -325,6 +325,12 @@ def test_older_model_is_untouched_by_samples_added_later() -> None:
     assert kernel_at(left, 0.5, 0.5).max() > kernel_at(right, 0.5, 0.5).max()
 
 
+def test_a_sample_takes_25_bytes_a_pixel() -> None:
+    samples = photos(20)
+
+    assert LensModel.fit(samples).nbytes < 25 * SIZE * SIZE * len(samples) + 8 * 800 * SIZE * SIZE
+
+
 # ---- bad photos, and what it says of itself
 
 
@@ -439,7 +445,7 @@ def test_true_kernels_are_predicted_between_and_beyond_the_patches() -> None:
 
     assert errors[1]["corner"] <= 0.25
     assert errors[1]["center"] <= 0.15
-    assert errors[5]["corner"] <= 0.175
+    assert errors[5]["corner"] <= 0.16
     assert errors[5]["center"] <= 0.06
     for zone in ("center", "mid", "corner"):
         assert errors[1][zone] > errors[2][zone] > errors[5][zone]

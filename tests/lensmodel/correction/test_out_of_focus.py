@@ -57,6 +57,8 @@ def test_a_scene_out_of_focus_does_not_lose_by_a_kernel_that_is_too_wide(
     )
     left = all(report.left == report.cells for report in made.zones.values())
     assert left == (kernels.error == 0.4)
+    if left:
+        np.testing.assert_allclose(made.planes, photo, rtol=1e-6)  # cells fade into each other
     # what the solution amplifies is not added back as well
     assert made_fine < (1.001 if left else 1.14 if cfa is None else 0.93) * seen_fine
 

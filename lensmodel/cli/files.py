@@ -146,6 +146,8 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 def refuse_existing(*paths: Path, force: bool) -> None:
     """Make sure, before any work, that nothing is replaced that the user did not give up."""
     for path in paths:
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder; name a file in it")
         if not force and path.exists():
             raise UsageError(f"{path} is there already; --force replaces it")
 

@@ -83,12 +83,12 @@ def report(
     files.refuse_existing(*targets, force=force)
     with shown.progress("computing its PSFs at 200 places"):
         found = measured(profile, aperture, photo or [], whole=output is not None)
+        compared = None if against is None else compare(found, measured(against, aperture, [], whole=False))
     if output is not None:
         with shown.progress("drawing"):
             for target in targets:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(target, _written(found, target.suffix.lower()))
-    compared = None if against is None else compare(found, measured(against, aperture, [], whole=False))
     at = found.tested[0].at or "unknown aperture"
     lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
     lines += [] if compared is None else [f"- {compared}"]
@@ -125,6 +125,10 @@ def _targets(output: Path | None) -> tuple[Path, ...]:
         return ()
     if output.suffix.lower() in FORMS and not output.is_dir():
         return (output,)
+    if output.suffix[1:].isalpha() and not output.is_dir():
+        raise UsageError(
+            f"a report is no {output.suffix}: end {output} in {', '.join(FORMS)}, or give a folder"
+        )
     return tuple(output / f"report{form}" for form in FORMS)
 
 

@@ -127,6 +127,24 @@ def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
     assert np.load(folder / "psf.npz")["psf"].shape == (35, 31, 31)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("report", NAME, "-o", "mine.html"),
+        ("report", NAME, "-o", "out", "--against", "nobodys.lensprofile"),
+        ("target", "."),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_anything_is(
+    folder: Path, green_alone: None, words: tuple[str, ...]
+) -> None:
+    refused = CliRunner().invoke(app, [*words])
+
+    assert isinstance(refused.exception, UsageError)
+    assert "--force" not in str(refused.exception)
+    assert [p.name for p in folder.iterdir()] == [NAME]
+
+
 def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> None:
     run("export", NAME, "-o", "psf.npz", "--rows", "2", "--cols", "3", "--size", "15", "--aperture", "2")
 

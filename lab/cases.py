@@ -17,8 +17,7 @@ from scipy import signal
 
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes
+from lensmodel.core.types import Frame, Kernel, NoiseModel, Plane, Planes
 from lensmodel.patches import Patch, select
 from lensmodel.simulate import DEMO_SCENES, demo_data_path, load_scene
 

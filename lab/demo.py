@@ -31,8 +31,7 @@ from lab.scenes import photograph_of
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.geometry import zone_of
-from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone
+from lensmodel.core.types import ZONE_WORDS, ZONES, FieldPosition, LensSettings, Planes, Zone, zone_of
 from lensmodel.photo import develop
 from lensmodel.report.lens_report import SensorGeometry
 from lensmodel.simulate import SimulatedCamera, draw_lens, edge_chart, photograph, write_photo

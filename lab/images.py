@@ -15,9 +15,18 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame, zone_of
-from lensmodel.core.types import ZONES, Direction, FieldPosition, Planes, Zone
-from lensmodel.quality.mtf import Box, EdgeResponse, slanted_edge
+from lensmodel.core.types import (
+    CENTER_ZONE_R,
+    CORNER_ZONE_R,
+    ZONES,
+    Direction,
+    FieldPosition,
+    Frame,
+    Planes,
+    Zone,
+    zone_of,
+)
+from lensmodel.quality import Box, EdgeResponse, slanted_edge
 
 logger = logging.getLogger(__name__)
 

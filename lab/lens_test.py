@@ -25,12 +25,10 @@ from scipy import fft
 from lab.blind_gain import CAMERA, KnownLens
 from lab.traced import GridLens
 from lensmodel import calibrate
-from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.core.types import ZONES, FieldPosition, Frame, LensSettings, Planes, zone_of
 from lensmodel.measured.edges import SlantedEdges
 from lensmodel.photo import develop
-from lensmodel.quality import tangential_sagittal_mtf50
-from lensmodel.quality.mtf import edge_area
+from lensmodel.quality import edge_area, tangential_sagittal_mtf50
 from lensmodel.report import lens_report
 from lensmodel.report.lens_report import Range
 from lensmodel.simulate import CameraLens, SimulatedCamera, photograph, write_photo

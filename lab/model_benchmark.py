@@ -22,9 +22,17 @@ from scipy.spatial import cKDTree
 from lab import page
 from lab.kernels import distance
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel, centred
-from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, ignore_step
+from lensmodel.core.types import (
+    ZONES,
+    FieldPosition,
+    Frame,
+    Kernel,
+    LensSettings,
+    StepHook,
+    ignore_step,
+    zone_of,
+)
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES

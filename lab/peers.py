@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 
 _LIMIT_S: Final = 1800  # seconds that a program may take (chosen): one that hangs must end
 _FULL: Final = 65535  # largest number of 16 bits

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from lensmodel.blind import PsfEstimate, PsfEstimator, estimators
     from lensmodel.blind.sampling import CalibrationEvent
     from lensmodel.core.errors import CancelledError, LensModelError
-    from lensmodel.core.geometry import field_grid
     from lensmodel.core.psf import PsfSample
-    from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
+    from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, field_grid
     from lensmodel.correction import Bounds, Corrected, Deconvolver, Sensor, deconvolvers
     from lensmodel.lens import Lens
     from lensmodel.model import ModelSettings, PsfAnswer
@@ -77,10 +76,9 @@ _HOMES: Final = {
     "lensmodel.lens": ("Lens",),
     "lensmodel.photo": ("LinearPhoto", "develop"),
     "lensmodel.blind.sampling": ("CalibrationEvent",),
-    "lensmodel.core.geometry": ("field_grid",),
     "lensmodel.core.psf": ("PsfSample",),
     "lensmodel.model": ("ModelSettings", "PsfAnswer"),
-    "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel"),
+    "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel", "field_grid"),
 }
 """Where each public name is defined."""
 

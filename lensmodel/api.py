@@ -35,9 +35,8 @@ from lensmodel.core.errors import (
     NoUsablePatchesError,
     OutsideSupportError,
 )
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import Channel, FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.core.types import Channel, FieldPosition, Frame, LensSettings, StepHook, ignore_step
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel, ModelField, ModelSettings
 from lensmodel.model.answer import PAPER
@@ -46,7 +45,7 @@ from lensmodel.patches import Selector
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.development import photo_from_array
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.photo.location import gps_directory
+from lensmodel.photo.metadata import gps_directory
 from lensmodel.photo.values import remarks_log
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import field_grid
 from lensmodel.core.names import full_name
 from lensmodel.core.psf import PsfSample, centred
-from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.core.types import Channel, FieldPosition, LensSettings, field_grid
 from lensmodel.model import LensModel, LensProfile, ModelSettings, PsfAnswer, load_profile, save_profile
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
 

@@ -34,8 +34,8 @@ from app.sandbox.child import ProgressHook, Task
 from lensmodel import api, correction, photo
 from lensmodel import measured as lens_measure
 from lensmodel.blind import estimators, sampling
-from lensmodel.core import codec
 from lensmodel.core.errors import ImageTooLargeError, LensModelError
+from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name
 from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.model import LensModel
@@ -44,7 +44,7 @@ from lensmodel.neural import FieldNetwork
 from lensmodel.patches import Patch, selectors
 from lensmodel.patches.windows import Rejection
 from lensmodel.photo.lateral import LateralColour
-from lensmodel.photo.location import find_location
+from lensmodel.photo.metadata import find_location
 from lensmodel.report import lens_report
 
 log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 THUMBNAIL_SIDE: Final = 480
 CIFF: Final = b"HEAPCCDR"  # signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS
 # What the library imports where it is used: here the fork server does it once, not each of its children
-LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
+LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.numerics")
 
 for _module in LATE:
     importlib.import_module(_module)
@@ -100,7 +100,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         log.warning("no small picture: %s: %s", type(error).__name__, error)
     else:
         (folder / THUMBNAIL).write_bytes(picture)
-    header: dict[str, Any] = codec.to_json(info)
+    header: dict[str, Any] = to_json(info)
     header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
     return header
 
@@ -134,14 +134,14 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
         place = _window(window, developed.frame.position(*centre))
         rejected.append({**place, "reason": window.reason})
-    return {"patches": patches, "rejected": rejected, "lateral": codec.to_json(_lateral(developed))}
+    return {"patches": patches, "rejected": rejected, "lateral": to_json(_lateral(developed))}
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[int]:
     """Estimate the PSF of one field cell in each channel; return of which patch each sample is."""
     # The samples go to the folder
     developed = sampling.load_developed(Path(arguments["developed"]))
-    group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
+    group = [from_json(Patch, stored) for stored in arguments["patches"]]
     numbers = {patch.position: idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
     samples = sampling.estimate_cell(
         developed,
@@ -162,7 +162,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     # soon. The photo's own samples join them, unless they are there already: `photo` is what they are called.
     developed = sampling.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
-    lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
+    lateral = _lateral(developed) if stored is None else from_json(LateralColour, stored)
     params = arguments["params"]
     output, roi = params["output"], params.get("roi")
     model = LensModel.fit(read_samples(folder))
@@ -211,7 +211,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         "nothing_to_correct": corrected.nothing_to_correct,
         "audit": corrected.audit,
     }
-    return {"file": name, "report": _numbers(codec.to_json(report))}
+    return {"file": name, "report": _numbers(to_json(report))}
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     `about` has the name of the lens and the shape of its photos.
     """
     model, about = LensModel.fit(read_samples(folder)), arguments["about"]
-    lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
+    lateral = [from_json(LateralColour, stored) for stored in about["lateral"]]
     try:
         report = lens_report(
             model,
@@ -233,9 +233,9 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     except LensModelError as refusal:
         log.info("a lens without a report: %s", refusal)
     else:
-        (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(report))), encoding="utf-8")
-    error = codec.to_json(model.expected_errors())
-    return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
+        (folder / REPORT).write_text(json.dumps(_numbers(to_json(report))), encoding="utf-8")
+    error = to_json(model.expected_errors())
+    return {"error": _numbers(error), "coverage": _numbers(to_json(model.coverage()))}
 
 
 def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:

@@ -24,8 +24,8 @@ from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import LensModel
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
+from lensmodel.photo.writing import write_bayer_dng
 
 SIDE: Final = 384  # of the made-up photo in pixels (chosen): patches fit in, and it takes seconds
 METHODS: Final = ("fast", "standard", "paper")

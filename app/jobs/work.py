@@ -41,8 +41,8 @@ from app.store.photos import stored_settings
 from app.store.tables import PHOTO_RUNNING, PROFILE_FILE, CorrectionRow, LensRow, PatchRow, PhotoRow
 from lensmodel.blind import sampling
 from lensmodel.blind.sampling import KERNEL_PATCHES, PRESETS, Config
-from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, NoSamplesError, NoUsablePatchesError
+from lensmodel.core.files import to_json
 from lensmodel.core.names import full_name, name_key, serial_key
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition
@@ -222,7 +222,7 @@ class _Steps:
                 reads=[developed],
                 developed=str(developed),
                 photo=self._photo.public_id,
-                patches=[codec.to_json(_patch_of(row)) for row in rows],
+                patches=[to_json(_patch_of(row)) for row in rows],
                 numbers=[row.idx for row in rows],
                 settings=stored_settings(self._photo),
                 estimator=self._preset.estimator,

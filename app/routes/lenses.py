@@ -20,8 +20,8 @@ from app.routes.photos import MAX_PHOTOS, receiving, recorded
 from app.schemas import MAX_VERSION, CalibrationOut, JobOut, LateralOut, LensChange, LensOut, NewLens, Page
 from app.store.lenses import report_key
 from app.store.tables import LensRow
-from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.files import from_json, to_json
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.model.profile import LensProfile, write_profile
 from lensmodel.report import LensReport, provenance, to_csv

@@ -28,12 +28,12 @@ from lab.page import table
 from lab.peers import Peer, light_numbers, write_raw
 from lensmodel import correction
 from lensmodel.api import lateral_of
-from lensmodel.core.geometry import Frame
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import (
     BayerPattern,
     Channel,
     FieldPosition,
+    Frame,
     Kernel,
     NoiseModel,
     Planes,

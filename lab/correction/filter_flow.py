@@ -9,9 +9,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import Channel, Kernel, Plane
+from lensmodel.core.types import Channel, Frame, Kernel, Plane
 from lensmodel.correction.blur import UniformBlur
 
 

@@ -21,8 +21,7 @@ from lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lab.population.wavefronts import RandomLens
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import KINDS, PatchKind
-from lensmodel.neural.features import FAR_M
-from lensmodel.neural.network import assembled, outer_cells
+from lensmodel.neural.network import FAR_M, assembled, outer_cells
 from lensmodel.neural.statistics import to_octant
 
 Family = Literal["wavefront", "third-order", "traced"]

@@ -19,9 +19,8 @@ from lensmodel.core.files import atomic
 from lensmodel.core.psf import KINDS
 from lensmodel.core.types import ZONES
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
-from lensmodel.neural.features import from_octant_image, octant_of, to_octant_image
 from lensmodel.neural.network import assembled, outer_cells
-from lensmodel.neural.statistics import group
+from lensmodel.neural.statistics import from_octant_image, group, octant_of, to_octant_image
 
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
 _POWERS: Final = np.arange(0.84, 1.15, 0.02)

@@ -24,9 +24,18 @@ from torch.nn import functional
 from lab.images import zone_masks
 from lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.core.files import write_atomically
-from lensmodel.neural import FieldNetwork, features
-from lensmodel.neural.features import CONDITION, DISTANCES, PLACE, RELATION
-from lensmodel.neural.network import BLOCK, COARSE, FINE, RINGS, outer_cells
+from lensmodel.neural import FieldNetwork, network
+from lensmodel.neural.network import (
+    BLOCK,
+    COARSE,
+    CONDITION,
+    DISTANCES,
+    FINE,
+    PLACE,
+    RELATION,
+    RINGS,
+    outer_cells,
+)
 from lensmodel.neural.statistics import LENGTH
 
 WIDTH, HEADS, HIDDEN, COMPONENTS = 192, 6, 384, 224
@@ -210,12 +219,12 @@ def collate(sets: list[Set]) -> dict[str, Tensor]:
     apart = (photo[:, :, None] != photo[:, None]) | missing[:, None]
     out = {
         "statistics": padded([s.statistics for s in sets]),
-        "place": features.place_features(xy),
-        "condition": features.condition_features(settings),
-        "among": features.relation_features(xy, settings, xy, settings),
-        "query_place": features.place_features(query_xy),
-        "query_condition": features.condition_features(query_settings),
-        "relation": features.relation_features(query_xy, query_settings, xy, settings),
+        "place": network.place_features(xy),
+        "condition": network.condition_features(settings),
+        "among": network.relation_features(xy, settings, xy, settings),
+        "query_place": network.place_features(query_xy),
+        "query_condition": network.condition_features(query_settings),
+        "relation": network.relation_features(query_xy, query_settings, xy, settings),
         "truth": np.stack([s.truth for s in sets]).astype(np.float32),
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in out.items()}

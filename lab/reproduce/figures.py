@@ -17,9 +17,8 @@ from lab.model_benchmark import FITS, PATCHES, Fit, compared, samples_of
 from lab.reproduce.cases import Case, Reproduction, take
 from lensmodel.blind import sampling
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, as_kernel, rms_width
-from lensmodel.core.types import FieldPosition, Kernel
+from lensmodel.core.types import FieldPosition, Frame, Kernel
 from lensmodel.model import LensModel
 from lensmodel.patches import r_map
 from lensmodel.photo import develop

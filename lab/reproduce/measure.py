@@ -13,9 +13,8 @@ from lab.images import blocks, by_zone, fidelity, measure_edges
 from lab.kernels import distance
 from lab.model_benchmark import asked_places
 from lab.reproduce.cases import Case, Shots, guard_of
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, Planes, Zone
+from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Frame, Kernel, Planes, Zone, zone_of
 from lensmodel.simulate import edge_chart
 
 Place: TypeAlias = tuple[FieldPosition, Channel]

@@ -26,8 +26,7 @@ from lab.blind.methods import BlindMethod, compared
 from lab.cases import list_photos, photo_half, scene_of
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
+from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel, ignore_step
 from lensmodel.patches.checks import details_of
 from lensmodel.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.patches.rmap import RMapSelector

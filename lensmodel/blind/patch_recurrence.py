@@ -29,7 +29,7 @@ from scipy import fft, ndimage
 
 from lensmodel.blind.estimator import PsfEstimate, finished, usable
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.numerics import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, delta, otf, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 

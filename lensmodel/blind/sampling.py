@@ -25,7 +25,7 @@ import numpy as np
 from lensmodel import patches, photo
 from lensmodel.blind import PhotoEstimator, PsfEstimate, PsfEstimator, estimators
 from lensmodel.blind.estimator import require_size
-from lensmodel.core import codec, processes
+from lensmodel.core import processes
 from lensmodel.core.errors import (
     InvalidInputError,
     LensModelError,
@@ -33,7 +33,7 @@ from lensmodel.core.errors import (
     NoUsablePatchesError,
     UnknownMethodError,
 )
-from lensmodel.core.files import save_array
+from lensmodel.core.files import from_json, save_array, to_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, Channel, LensSettings, StepHook, ignore_step
 from lensmodel.patches import Patch, Selection, Selector
@@ -105,7 +105,7 @@ def save_developed(developed: LinearPhoto, folder: Path) -> None:
     fields = {
         f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
     }
-    (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
+    (folder / "photo.json").write_text(json.dumps(to_json(fields)), encoding="utf-8")
     path = folder / "planes.npy"
     try:
         with path.open("wb") as file:
@@ -125,7 +125,7 @@ def load_developed(folder: Path) -> LinearPhoto:
         raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
     if "turns" in stored["info"]:  # of earlier versions: None where nothing told which way
         stored["info"]["turned"] = stored["info"]["turns"] is None
-    return codec.from_json(LinearPhoto, {**stored, "planes": planes})
+    return from_json(LinearPhoto, {**stored, "planes": planes})
 
 
 def photo_id(path: Path) -> str:

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from lensmodel.core.codec import to_json
+from lensmodel.core.files import to_json
 
 REMARKS = "lensmodel.remarks"  # Logs what was left out of a photo or replaced in it
 COMPILING = "lensmodel.correction.whole_photo.first_use"  # Logs when loops are compiled, once on a machine

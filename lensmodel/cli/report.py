@@ -14,12 +14,10 @@ from lensmodel.api import lateral_of
 from lensmodel.cli import files, options
 from lensmodel.cli.console import Display
 from lensmodel.cli.ending import UsageError
-from lensmodel.core.codec import to_json
-from lensmodel.core.files import write_atomically
-from lensmodel.core.geometry import zone_of
+from lensmodel.core.files import to_json, write_atomically
 from lensmodel.core.names import camera_name, full_name
 from lensmodel.core.psf import rms_width
-from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings
+from lensmodel.core.types import ZONE_WORDS, FieldPosition, LensSettings, zone_of
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,

@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.clipped import LEAST_CLIPPED

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.psf import as_kernel, resized
 from lensmodel.core.types import Kernel, Plane
 from lensmodel.correction.transforms import Complex, Number, through, transfer

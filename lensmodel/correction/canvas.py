@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.deconvolver import Sensor

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, delta
-from lensmodel.core.types import CHANNELS, BayerPattern, Channel, FieldPosition, NoiseModel, Planes
+from lensmodel.core.types import CHANNELS, BayerPattern, Channel, FieldPosition, Frame, NoiseModel, Planes
 from lensmodel.correction.audit import TileAudit, held_back
 from lensmodel.correction.blur import Drift, UniformBlur
 from lensmodel.correction.canvas import fitted_halo

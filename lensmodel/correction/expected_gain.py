@@ -10,10 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.geometry import zone_of
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.psf import delta
-from lensmodel.core.types import ZONES, Planes, Zone
+from lensmodel.core.types import ZONES, Planes, Zone, zone_of
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition
+from lensmodel.core.types import FieldPosition, Frame
 
 _CELLS_PER_HALF_DIAGONAL: Final = 18.0
 """Half the frame's diagonal over the side of a cell (chosen: cells of 200 pixels at 24 megapixels, over which

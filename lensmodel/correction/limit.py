@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import LEAST_CLIPPED, compact

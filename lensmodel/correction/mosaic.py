@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.canvas import Canvas
 from lensmodel.correction.deconvolver import Sensor

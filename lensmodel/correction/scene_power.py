@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
 from lensmodel.correction.posterior import GRID
 from lensmodel.correction.transforms import Complex, Real, to_spectrum

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Planes
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.colour import curves_of, inverse

@@ -8,7 +8,7 @@ import numpy as np
 import rocket_fft
 from numpy.typing import NDArray
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 
 Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]

@@ -15,8 +15,7 @@ import numpy as np
 from numba.core import event
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.psf import PsfField
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import (
@@ -24,11 +23,13 @@ from lensmodel.core.types import (
     BayerPattern,
     Channel,
     FieldPosition,
+    Frame,
     NoiseModel,
     Planes,
     StepHook,
     Zone,
     ignore_step,
+    zone_of,
 )
 from lensmodel.correction.audit import AuditReport, pooled
 from lensmodel.correction.blur import UniformBlur, crop_to_support

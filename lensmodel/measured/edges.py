@@ -17,7 +17,7 @@ off pixels, and blurred by k; the levels of its four quarters, small shifts of b
 light are linear, and solved for anew in each step (G. Golub and V. Pereyra, SIAM J. Numer. Anal. 10, 1973).
 Squares and checkerboards are alike in this.
 
-Source of the edge spread: ISO 12233:2017, annex D, in `quality.mtf`.
+Source of the edge spread: ISO 12233:2017, annex D, in `quality`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,15 @@ from lensmodel.core.types import Channel, Kernel, StepHook
 from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared, psf_at
 from lensmodel.measured.solve import Window, on_simplex
 from lensmodel.photo import LinearPhoto
-from lensmodel.quality.edge_finder import FoundEdge, find_edges
-from lensmodel.quality.mtf import OVERSAMPLING, EdgeResponse, crossing, edge_area, slanted_edge
+from lensmodel.quality import (
+    OVERSAMPLING,
+    EdgeResponse,
+    FoundEdge,
+    crossing,
+    edge_area,
+    find_edges,
+    slanted_edge,
+)
 
 # Relative L2 that no square shows of itself: kernels are no mixtures of three Gaussians (chosen: half of the
 # squares of five traced lenses are off by .07 to .24)
@@ -217,7 +224,7 @@ def _transfer(response: EdgeResponse) -> tuple[NDArray[np.complex128], float]:
     """Transfer function along the normal at `_FREQUENCIES`, and the middle of the light: phases are 0 there.
 
     The derivative of the profile, tapered where only noise is left, transformed; what the difference over
-    two bins and the bins themselves take off is put back, as `quality.mtf` does.
+    two bins and the bins themselves take off is put back, as `quality` does.
     """
     distance, esf = response.esf_distance, response.esf
     lsf = (esf[2:] - esf[:-2]) / 2.0

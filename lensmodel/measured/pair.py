@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import block_means
-from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook
+from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, NoiseModel, StepHook, block_means
 from lensmodel.measured.measurer import MeasuredPsf, Measurer, Prepared
 from lensmodel.measured.registration import CLEAR, Warp, match, matched
 from lensmodel.measured.solve import Window, window_corners, window_psf, window_terms

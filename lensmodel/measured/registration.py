@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, spatial
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame, block_means
-from lensmodel.core.types import StepHook
+from lensmodel.core.types import Frame, StepHook, block_means
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 DEGREE: Final = 5  # radial distortion of two coefficients, and a decentred middle

@@ -44,7 +44,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.least_squares import fista, nonnegative_least_squares
+from lensmodel.core.numerics import fista, nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, centroid
 from lensmodel.core.types import CHANNELS, Channel, Kernel, NoiseModel
 from lensmodel.measured.measurer import MeasuredPsf, psf_at

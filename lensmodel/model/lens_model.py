@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
-from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import PsfSample, as_kernel
-from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone, zone_of
 from lensmodel.model import camera_bodies
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.learned_field import LearnedField

@@ -36,7 +36,7 @@ import numpy as np
 import scipy  # `interpolate` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.psf import PsfSample, resized, second_moments
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va

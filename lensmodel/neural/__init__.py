@@ -1,10 +1,9 @@
 """The network: `statistics` turns a patch into numbers, `network` encodes the patches of a photo and answers.
 
-`features` makes both the same in all eight octants of the field. `lensmodel.blind.learned` takes the patches
+Both are the same in all eight octants of the field. `lensmodel.blind.learned` takes the patches
 from photos, and `lensmodel.model.learned_field` asks of those of all photos; `lab.population` trains it.
 """
 
-from lensmodel.neural.features import Conditions
-from lensmodel.neural.network import FieldAnswer, FieldNetwork, Memory
+from lensmodel.neural.network import Conditions, FieldAnswer, FieldNetwork, Memory
 
 __all__ = ["Conditions", "FieldAnswer", "FieldNetwork", "Memory"]

@@ -5,19 +5,81 @@ rings and directions, and for interpolated green how the gradient across edges c
 eight directions. The correlation of its third and seventh power with itself belongs to the strongest edges,
 is signed (a halo is negative) and differs between the two sides of an edge where the PSF is one-sided
 (coma).
+
+A pixel grid looks the same after a quarter turn or in a mirror, so that every place is turned into the octant
+0 <= y <= x first. An octant is a triple of flags: mirror x, then mirror y, then exchange x and y. Places have
+x to the right and y upwards; arrays have rows downwards.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Plane
-from lensmodel.neural.features import DIRECTIONS, direction_order, octant_of
+
+OCTANTS: Final = 8
+DIRECTIONS: Final = 16  # of statistics over the full circle, counter-clockwise from the right
+
+
+def octant_of(xy: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Octant of places, shape (..., 2): 1 if x is mirrored, plus 2 if y is, plus 4 if they are exchanged."""
+    x, y = xy[..., 0], xy[..., 1]
+    return (x < 0) + 2 * (y < 0) + 4 * (np.abs(y) > np.abs(x))
+
+
+def to_octant_place(octant: NDArray[np.int64], xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Turn places of shape (..., 2) by octants that broadcast against (...)."""
+    x = np.where(octant & 1, -xy[..., 0], xy[..., 0])
+    y = np.where(octant & 2, -xy[..., 1], xy[..., 1])
+    swap = (octant & 4) > 0
+    return np.stack([np.where(swap, y, x), np.where(swap, x, y)], -1)
+
+
+def direction_order(octant: int) -> NDArray[np.int64]:
+    """Where each of the 16 directions of an array in the octant's frame is found in the image's frame."""
+    k = np.arange(DIRECTIONS)
+    if octant & 1:
+        k = (8 - k) % DIRECTIONS
+    if octant & 2:
+        k = -k % DIRECTIONS
+    if octant & 4:
+        k = (4 - k) % DIRECTIONS
+    return np.argsort(k)
+
+
+def to_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn images of shape (..., n, n) into the frame of an octant."""
+    if octant & 1:
+        image = image[..., ::-1]
+    if octant & 2:
+        image = image[..., ::-1, :]
+    return np.swapaxes(image[..., ::-1, ::-1], -1, -2) if octant & 4 else image
+
+
+def from_octant_image(octant: int, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn images of shape (..., n, n) back from the frame of an octant."""
+    if octant & 4:
+        image = np.swapaxes(image[..., ::-1, ::-1], -1, -2)
+    if octant & 2:
+        image = image[..., ::-1, :]
+    return image[..., ::-1] if octant & 1 else image
+
+
+def relative_octant(query: NDArray[np.int64], sample: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Symmetry that leads from the frame of a sample's octant to that of the query's, 0..7."""
+    return _RELATIVE[query, sample]
+
+
+# to_octant_place as matrices; the inverse of one is its transpose
+_MATRICES: Final = to_octant_place(np.arange(OCTANTS)[:, None], np.eye(2)).mT
+_PRODUCTS: Final = _MATRICES[:, None] @ _MATRICES.mT[None]
+_RELATIVE: Final = (_PRODUCTS[:, :, None] == _MATRICES).all(axis=(-1, -2)).argmax(axis=-1)
+
 
 WINDOW: Final = 128  # pixels: holds several times the widest kernel, and little of the field (chosen)
 # edges, cycles/pixel: from three periods in a window to where green of a Bayer mosaic still tells

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.errors import NoUsablePatchesError
-from lensmodel.core.geometry import zone_of
-from lensmodel.core.types import FieldPosition, NoiseModel, Plane
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane, zone_of
 from lensmodel.patches.windows import CLIP_SHARE, Patch, Windows, polynomials
 
 SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.patches import checks, spread
 from lensmodel.patches.checks import Details
 from lensmodel.patches.good_regions import GoodRegionsSelector

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import NoUsablePatchesError
-from lensmodel.core.geometry import Frame
+from lensmodel.core.types import Frame
 from lensmodel.patches.windows import Patch, Reason, Rejection, Selection, Windows
 from lensmodel.photo.values import LinearPhoto
 

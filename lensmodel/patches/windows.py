@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition, NoiseModel, Plane, StepHook
+from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, StepHook
 from lensmodel.patches.rmap import (
     GROUPS,
     R_BINS,

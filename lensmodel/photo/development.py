@@ -30,8 +30,7 @@ from lensmodel.core.errors import (
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel, Planes
+from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel, Planes
 from lensmodel.photo.colour import (
     CODES,
     SRGB_TO_XYZ_D65,
@@ -53,7 +52,6 @@ from lensmodel.photo.containers import (
     opened_jpeg,
     png_picture,
 )
-from lensmodel.photo.dng import Opcode, demosaiced, packed_opcodes, read_opcodes
 from lensmodel.photo.metadata import Said
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import coding_noise, estimate_noise, grain_of
@@ -68,6 +66,7 @@ from lensmodel.photo.values import (
     Transfer,
     remarks_log,
 )
+from lensmodel.photo.writing import Opcode, demosaiced, packed_opcodes, read_opcodes
 
 MIN_SIDE = 16  # smaller pictures are icons, not photos
 

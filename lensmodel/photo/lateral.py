@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, optimize
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame, block_means
 from lensmodel.core.psf import correlation_peak, whole_peak
-from lensmodel.core.types import Channel, Plane, Planes
+from lensmodel.core.types import Channel, Frame, Plane, Planes, block_means
 
 Polynomial = tuple[float, float, float, float]
 IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)  # r -> r

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.core.geometry import block_means
-from lensmodel.core.types import NoiseModel, Plane, Planes
+from lensmodel.core.types import NoiseModel, Plane, Planes, block_means
 
 BLOCK: Final = 8  # side of the blocks in pixels: flat places of this size exist in almost any photo
 GRAIN: Final = 4  # side of blocks whose means tell of coarse grain: fine grain averages out there (chosen)

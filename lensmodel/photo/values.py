@@ -9,8 +9,7 @@ from datetime import datetime
 from typing import Final, Literal, TypeAlias
 
 from lensmodel.core.errors import MetadataMissingError, TurnedPixelsError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import BayerPattern, LensSettings, NoiseModel, Planes
+from lensmodel.core.types import BayerPattern, Frame, LensSettings, NoiseModel, Planes
 
 _RAW: Final = (
     "3fr ari arw bay cap cr2 cr3 crw cs1 dc2 dcr dcs dng drf eip erf fff gpr ia iiq k25 kc2 kdc mdc mef mfw "

@@ -19,9 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import places_of
-from lensmodel.core.types import ZONES, Channel, FieldPosition, LensSettings, StepHook, Zone, ignore_step
+from lensmodel.core.types import (
+    ZONES,
+    Channel,
+    FieldPosition,
+    LensSettings,
+    StepHook,
+    Zone,
+    ignore_step,
+    zone_of,
+)
 from lensmodel.measured import is_measured
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.photo.lateral import LateralColour

@@ -6,8 +6,7 @@ import math
 from typing import Final
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, field_grid
-from lensmodel.core.types import FieldPosition
+from lensmodel.core.types import CENTER_ZONE_R, CORNER_ZONE_R, FieldPosition, field_grid
 
 # Width over height of a 35 mm frame; a profile does not say how wide its photos were
 DEFAULT_ASPECT: Final = 1.5

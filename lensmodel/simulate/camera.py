@@ -18,10 +18,9 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, Channel, LensSettings, NoiseModel, Planes
-from lensmodel.photo.dng import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
+from lensmodel.core.types import CHANNELS, Channel, Frame, LensSettings, NoiseModel, Planes
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.photo.writing import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import Direction, FieldPosition, Planes
-from lensmodel.quality.mtf import Box, edge_area
+from lensmodel.core.types import Direction, FieldPosition, Frame, Planes
+from lensmodel.quality import Box, edge_area
 
 DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 """Names of the photographs that come with the library, see lensmodel/demo_data/README.md."""

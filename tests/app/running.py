@@ -29,8 +29,8 @@ from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.photo.writing import write_bayer_dng
 from lensmodel.simulate import demo_scene
 
 PATIENCE_S = 120.0

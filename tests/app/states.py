@@ -12,7 +12,7 @@ from app.http.dependencies import Services
 from app.store.lenses import report_key
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
-from lensmodel.core.codec import to_json
+from lensmodel.core.files import to_json
 from lensmodel.model import LensModel
 from lensmodel.report import lens_report
 

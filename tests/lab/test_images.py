@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from lab.images import best_shift, fidelity, psnr_of, shifted, to_srgb
 from lab.scenes import dead_leaves
-from lensmodel.core.geometry import CORNER_ZONE_R, Frame
+from lensmodel.core.types import CORNER_ZONE_R, Frame
 
 
 def test_psnr_is_that_of_the_mean_square() -> None:

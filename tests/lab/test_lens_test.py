@@ -13,8 +13,7 @@ from scipy import ndimage
 
 from lab.images import direction_of
 from lab.lens_test import MARGIN, Square, squares_chart, true_mtf50
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import LensSettings
+from lensmodel.core.types import Frame, LensSettings
 from lensmodel.measured.edges import SlantedEdges, chart_edges, squares_of
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.quality import find_edges, tangential_sagittal_mtf50

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.model_benchmark import pixel_to_local
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition
+from lensmodel.core.types import FieldPosition, Frame
 
 angles = st.floats(-10, 10)
 

@@ -13,8 +13,7 @@ from lab.kernels import distance, gaussian
 from lab.scenes import dead_leaves
 from lab.schuler import BasisField, PhotoWindow, RadialBasis, Schuler, load_basis, principal, save_basis
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition, NoiseModel
+from lensmodel.core.types import FieldPosition, Frame, NoiseModel
 from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2000, 3000)

@@ -12,9 +12,8 @@ from lab.kernels import distance, gaussian
 from lab.scenes import dead_leaves
 from lab.traced import GridField, GridLens, read_grid
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings
 from lensmodel.photo import develop
 from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
 

@@ -27,7 +27,7 @@ sys.modules |= dict.fromkeys({ABSENT!r})  # None: as if it were not installed
 import numpy as np
 import lensmodel
 from lab.kernels import gaussian
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
 
 rows, cols = np.ogrid[:160, :240]

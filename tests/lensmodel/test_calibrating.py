@@ -32,7 +32,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings, Plane
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 
 Admit = Callable[[photo.PhotoMetadata], None]
 

@@ -14,8 +14,8 @@ from scipy import ndimage
 import lensmodel
 from lensmodel.core.types import LensSettings
 from lensmodel.photo import develop
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import PhotoMetadata
+from lensmodel.photo.writing import write_bayer_dng
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.simulate import BlurOptions, SimulatedCamera, demo_scene, draw_lens, photograph, write_photo
 

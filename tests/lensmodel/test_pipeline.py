@@ -10,8 +10,8 @@ import lensmodel
 from lab.images import fidelity
 from lensmodel import api, correction, photo
 from lensmodel.blind import sampling
-from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
+from lensmodel.core.files import to_json
 from lensmodel.core.psf import PsfSample, delta
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
@@ -175,7 +175,7 @@ def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
 
 def test_json_refuses_what_it_could_not_read_back() -> None:
     with pytest.raises(InvalidInputError, match="object"):
-        codec.to_json({"x": object()})
+        to_json({"x": object()})
 
 
 def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.MonkeyPatch) -> None:

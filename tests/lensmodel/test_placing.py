@@ -19,9 +19,8 @@ from lab.kernels import gaussian
 from lensmodel import api, correction, photo, simulate
 from lensmodel.api import placed
 from lensmodel.core.errors import InvalidInputError, OutsideSupportError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, resized, rms_width
-from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
+from lensmodel.core.types import FieldPosition, Frame, LensSettings, NoiseModel, Planes
 from lensmodel.model import LensModel
 from lensmodel.model.camera_bodies import circle_mm, on_one_circle
 from lensmodel.photo.development import photo_from_array

@@ -18,10 +18,9 @@ from lab.kernels import gaussian
 from lensmodel.api import say
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
-from lensmodel.core.geometry import field_grid
 from lensmodel.core.psf import PsfSample, centroid
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import FieldPosition, LensSettings, field_grid
 from lensmodel.lens import Lens
 from lensmodel.model import LensModel, LensProfile
 

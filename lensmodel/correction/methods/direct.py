@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Plane, Planes
 from lensmodel.correction.blur import UniformBlur, transfers
 from lensmodel.correction.canvas import Canvas

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.correction.transforms import ONE, ZERO, Complex, Number, Real, to_plane, to_spectrum
 
 _DEGREE: Final = (

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import Plane
 from lensmodel.correction.blur import UniformBlur, fast_shape
 from lensmodel.correction.deconvolver import Sensor

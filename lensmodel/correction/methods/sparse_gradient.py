@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.jit import jit
+from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, Plane, Planes
 from lensmodel.correction.blur import UniformBlur, transfers
 from lensmodel.correction.canvas import BLOCK, Canvas, spread_blocks

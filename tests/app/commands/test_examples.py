@@ -38,7 +38,7 @@ from lab import targets
 from lab.kernels import gaussian
 from lab.lens_test import MARGIN, squares_chart
 from lensmodel.cli.main import OnDemand, app
-from lensmodel.core.geometry import Frame
+from lensmodel.core.types import Frame
 from lensmodel.measured.page import TargetPage
 from lensmodel.model import save_profile
 

@@ -36,8 +36,8 @@ from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.photo.writing import write_bayer_dng
 
 SLOW_S = 10.0
 POOL = 400

@@ -36,7 +36,7 @@ from app.store import Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import CorrectionRow, PhotoRow
 from lab.kernels import gaussian
-from lensmodel.core import codec
+from lensmodel.core.files import to_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 from lensmodel.correction.expected_gain import ZoneReport
@@ -743,7 +743,7 @@ def test_what_no_task_gives_is_no_answer(kind: Any, answer: Any) -> None:
 
 def test_what_tasks_give_are_answers() -> None:
     zones = {"center": ZoneReport(cells=2, expected_gain_db=1.0, psf_error=0.1)}
-    report = codec.to_json({"zones": zones, "nothing_to_correct": False})
+    report = to_json({"zones": zones, "nothing_to_correct": False})
     corrected = {"file": "result.png", "report": report}
 
     for kind, answer in (

@@ -31,12 +31,11 @@ from app.store import LensName, Store
 from app.store.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lab.kernels import gaussian
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
+from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings, ignore_step
 from lensmodel.correction.lattice import cells
 from lensmodel.photo import upright
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 
 PNG8 = {"method": "fast", "strength": 1.0, "output": {"format": "png8"}, "roi": None}
 

@@ -27,10 +27,9 @@ from app.store.owners import ANY_OWNER
 from app.store.photos import Photos
 from lab.kernels import gaussian
 from lensmodel.blind import sampling
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, NoiseModel, ignore_step
+from lensmodel.core.types import FieldPosition, Frame, NoiseModel, ignore_step
 from lensmodel.measured import MeasuredPsf
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo

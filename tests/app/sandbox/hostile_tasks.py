@@ -257,7 +257,7 @@ def forge(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> No
 
 
 def compile_one(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[str]:
-    from lensmodel.core.jit import jit  # noqa: PLC0415 - others need it not
+    from lensmodel.core.numerics import jit  # noqa: PLC0415 - others need it not
 
     twice = jit(_twice)
     twice(1)

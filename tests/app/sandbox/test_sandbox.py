@@ -447,7 +447,7 @@ def test_a_task_loads_compiled_code_and_saves_none(sandbox: Sandbox, run: Run) -
     options: Any = {"limits": limits, "arguments": {"cache": str(sandbox.cache)}}
 
     first = run("compile_one", **options).value
-    compiling = "import hostile_tasks; from lensmodel.core.jit import jit; jit(hostile_tasks._twice)(1)"
+    compiling = "import hostile_tasks; from lensmodel.core.numerics import jit; jit(hostile_tasks._twice)(1)"
     environment = clean() | {"NUMBA_CACHE_DIR": str(sandbox.cache)}
     subprocess.run([sys.executable, "-c", compiling], env=environment, check=True)
     again = run("compile_one", **options).value

@@ -14,7 +14,7 @@ from lab.kernels import gaussian
 from lab.training import blind_data
 from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import Kernel, Plane
-from lensmodel.quality.mtf import edge_area
+from lensmodel.quality import edge_area
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

@@ -11,8 +11,7 @@ from lab.population.photos import Processing, Scenes, bayer, demosaic
 from lab.population.sets import Lens, draw_set, fixed_set, load_sets, of_photos, save_sets
 from lab.population.traced import draw, grid_of
 from lensmodel.core.psf import KINDS
-from lensmodel.neural.features import FAR_M, relation_features
-from lensmodel.neural.network import SIDE
+from lensmodel.neural.network import FAR_M, SIDE, relation_features
 
 
 @pytest.fixture(scope="module")

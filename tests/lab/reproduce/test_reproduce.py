@@ -51,9 +51,8 @@ from lab.stored import ROOT, code_of, version_of
 from lab.traced import read_grid
 from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel
-from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Kernel
+from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Frame, Kernel, zone_of
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
 

@@ -13,10 +13,10 @@ from lab.scenes import dead_leaves
 from lensmodel import blind
 from lensmodel.blind.patch_recurrence import blend, normal_equations, recur, window_products
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.least_squares import nonnegative_least_squares
+from lensmodel.core.numerics import nonnegative_least_squares
 from lensmodel.core.psf import centroid, delta, rms_width
 from lensmodel.core.types import NoiseModel, Plane
-from lensmodel.quality.mtf import edge_area
+from lensmodel.quality import edge_area
 from lensmodel.simulate import demo_scene
 
 SIGMA = 0.01

@@ -10,8 +10,7 @@ import pytest
 from lensmodel import blind
 from lensmodel.blind.learned import LearnedEstimator
 from lensmodel.core.errors import NoUsablePatchesError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
+from lensmodel.core.types import CHANNELS, Frame, LensSettings, NoiseModel
 from lensmodel.patches.spread import spread_evenly
 from lensmodel.photo import Encoding, LinearPhoto, PhotoInfo
 from lensmodel.simulate import demo_scene

@@ -18,7 +18,7 @@ from lab.kernels import gaussian
 from lensmodel.cli.ending import UsageError
 from lensmodel.cli.main import app
 from lensmodel.cli.report import name_of
-from lensmodel.core.codec import from_json
+from lensmodel.core.files import from_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile

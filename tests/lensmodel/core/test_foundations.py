@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from lab import kernels
 from lensmodel.core import errors, psf
-from lensmodel.core.geometry import Frame, zone_of
-from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.names import camera_name, full_name
+from lensmodel.core.numerics import nonnegative_least_squares
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import FieldPosition, Frame, LensSettings, zone_of
 
 angles = st.floats(-10, 10)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.kernels import gaussian
-from lensmodel.core.codec import from_json, to_json
+from lensmodel.core.files import from_json, to_json
 from lensmodel.core.types import NoiseModel, Plane, Planes
 from lensmodel.correction.audit import (
     LIMITS,

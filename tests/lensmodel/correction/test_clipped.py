@@ -10,9 +10,8 @@ import pytest
 from scipy import ndimage
 
 from lab.kernels import gaussian
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, Kernel, NoiseModel
 from lensmodel.correction import correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.clipped import Lights, Window, compact, regions

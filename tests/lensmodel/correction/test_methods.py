@@ -10,9 +10,8 @@ from skimage import restoration
 
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import delta
-from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel
+from lensmodel.core.types import Channel, FieldPosition, Frame, Kernel, NoiseModel
 from lensmodel.correction import (
     RichardsonLucy,
     SaturationAwareRichardsonLucy,

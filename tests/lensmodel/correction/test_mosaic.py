@@ -20,7 +20,7 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, Noise
 from lensmodel.correction import Sensor, correct_planes
 from lensmodel.correction.mosaic import spread_grain
 from lensmodel.correction.transforms import smooth
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 
 SIDES = (160, 224)
 BLACK, WHITE, ELECTRONS = 512, 15872, 20_000.0

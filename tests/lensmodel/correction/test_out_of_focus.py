@@ -8,8 +8,7 @@ import pytest
 from scipy import ndimage
 
 from lab.kernels import gaussian
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import BayerPattern, Channel, FieldPosition, LensSettings, NoiseModel
+from lensmodel.core.types import BayerPattern, Channel, FieldPosition, Frame, LensSettings, NoiseModel
 from lensmodel.correction import PsfPosterior, correct_planes
 from lensmodel.correction.scene_power import noise_power, ring_power
 from lensmodel.photo import develop

@@ -13,8 +13,7 @@ from lab.images import to_srgb
 from lab.kernels import gaussian
 from lensmodel import correction, photo
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, Kernel, NoiseModel, Planes
 from lensmodel.correction import StoredColour
 from lensmodel.photo.colour import curves_of
 

@@ -12,8 +12,16 @@ from scipy import ndimage
 from lab.correction.filter_flow import EfficientFilterFlow
 from lab.kernels import gaussian
 from lensmodel.core.errors import CancelledError, InvalidInputError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, BayerPattern, Channel, FieldPosition, Kernel, NoiseModel, Planes
+from lensmodel.core.types import (
+    CHANNELS,
+    BayerPattern,
+    Channel,
+    FieldPosition,
+    Frame,
+    Kernel,
+    NoiseModel,
+    Planes,
+)
 from lensmodel.correction import Bounds, Corrected, correct_planes, whole_photo
 from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import plan

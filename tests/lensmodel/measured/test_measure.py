@@ -21,9 +21,8 @@ from lensmodel import measured as measure
 from lensmodel import simulate
 from lensmodel.calibration import joined
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, resized
-from lensmodel.core.types import Kernel, LensSettings, NoiseModel, StepHook, ignore_step
+from lensmodel.core.types import Frame, Kernel, LensSettings, NoiseModel, StepHook, ignore_step
 from lensmodel.measured.edges import SlantedEdges, squares_of
 from lensmodel.measured.measurer import Measurer, Prepared, psf_at
 from lensmodel.measured.page import PAPERS, TargetPage

@@ -13,16 +13,20 @@ from scipy import ndimage
 from lab.population.sets import adjusted, judge, load_sets
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork
-from lensmodel.neural.features import (
+from lensmodel.neural.network import WEIGHTS
+from lensmodel.neural.statistics import (
+    LENGTH,
     OCTANTS,
+    WINDOW,
     from_octant_image,
+    group,
     octant_of,
+    patch_statistics,
     relative_octant,
+    to_octant,
     to_octant_image,
     to_octant_place,
 )
-from lensmodel.neural.network import WEIGHTS
-from lensmodel.neural.statistics import LENGTH, WINDOW, group, patch_statistics, to_octant
 
 COLOURS = np.tile(np.array([[0, 1], [1, 2]], np.int8), (WINDOW // 2, WINDOW // 2))
 WIDE_OPEN = Conditions(f_number=2.8, pitch_um=4.5)

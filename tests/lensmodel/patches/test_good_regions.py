@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import NoiseModel, Plane, ignore_step
+from lensmodel.core.types import Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches.checks import Details, details_of
 from lensmodel.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
 from lensmodel.patches.windows import Windows, measure_blocks, windows_of

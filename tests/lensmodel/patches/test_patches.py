@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import FieldPosition, NoiseModel, Plane, ignore_step
+from lensmodel.core.types import FieldPosition, Frame, NoiseModel, Plane, ignore_step
 from lensmodel.patches import Patch, Reason, Selection, r_map, require_enough, select, selectors
 from lensmodel.patches import windows as blocks
 from lensmodel.patches.checks import look_at, part_of

@@ -13,8 +13,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
-from lensmodel.photo.dng import Opcode, demosaiced, packed_opcodes, read_opcodes, write_bayer_dng
-from lensmodel.photo.location import gps_directory
+from lensmodel.photo.metadata import gps_directory
+from lensmodel.photo.writing import Opcode, demosaiced, packed_opcodes, read_opcodes, write_bayer_dng
 
 REPORTS = Path(__file__).parents[2] / "data" / "reports"
 FORMATS = ("tiff16", "tiff32", "png16", "png8", "jpeg", "dng")

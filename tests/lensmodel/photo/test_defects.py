@@ -15,8 +15,8 @@ from lab.images import gains, to_srgb
 from lensmodel import calibrate, correct, photo, simulate
 from lensmodel.core.errors import RawDecodeError, UnsupportedFormatError
 from lensmodel.core.types import LensSettings, Zone
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.mosaic import Neighbours, defects
+from lensmodel.photo.writing import write_bayer_dng
 
 CAMERA = simulate.SimulatedCamera(height=400, width=600)
 RANGE = CAMERA.white - CAMERA.black

@@ -12,10 +12,10 @@ from PIL import Image, ImageCms
 from scipy import ndimage
 
 from lensmodel import photo
-from lensmodel.core import codec
 from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
+from lensmodel.core.files import from_json, to_json
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.writing import write_bayer_dng
 
 BLACK, WHITE = 512, 15000
 agree = partial(np.testing.assert_allclose, rtol=0.0, equal_nan=False)
@@ -342,7 +342,7 @@ def test_a_turned_jpeg_is_developed_as_the_sensor_saw_it(tmp_path: Path, orienta
 def test_all_but_the_planes_travels_as_json(tmp_path: Path) -> None:
     developed = shot(tmp_path, raw_numbers(textured(64, 96)))
     for value in (developed.info, developed.encoding, developed.frame):
-        assert codec.from_json(type(value), codec.to_json(value)) == value
+        assert from_json(type(value), to_json(value)) == value
 
 
 # --- real files --------------------------------------------------------------------------------

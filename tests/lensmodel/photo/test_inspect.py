@@ -26,8 +26,8 @@ from lensmodel.core.errors import (
     UnreadablePhotoError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.tiff import BYTE, Tag, Tags, Value, laid_out
+from lensmodel.photo.writing import write_bayer_dng
 
 
 def chunk(name: bytes, body: bytes) -> bytes:

@@ -6,8 +6,7 @@ import pytest
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import Planes
+from lensmodel.core.types import Frame, Planes
 from lensmodel.photo import lateral
 from lensmodel.photo.lateral import IDENTITY, LateralColour, estimate_lateral, resample
 

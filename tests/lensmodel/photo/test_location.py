@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
 from lensmodel.photo import tiff
-from lensmodel.photo.location import find_location
+from lensmodel.photo.metadata import find_location
 
 LATITUDE = (47.0, 13.0, 14.159)
 SECRET = struct.pack(">II", 14159, 1000), struct.pack("<II", 14159, 1000)

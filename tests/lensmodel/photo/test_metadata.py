@@ -20,8 +20,8 @@ from lensmodel import photo
 from lensmodel.core.errors import TruncatedImageError
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.development import opened_raw
-from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.metadata import Said, is_placeholder, read_xmp
+from lensmodel.photo.writing import write_bayer_dng
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
 _LOOKED_UP = {"61182", "Unknown (00 77 48 5C 80 24 24 0E)"}

@@ -25,8 +25,8 @@ from PIL import Image, ImageCms, ImageOps
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, matrix3, srgb_to_linear
-from lensmodel.photo.dng import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 from lensmodel.photo.metadata import xmp_packet
+from lensmodel.photo.writing import BAYER_PATTERNS, XYZ_TO_SRGB, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.images import by_zone, measure_edges
-from lensmodel.core.geometry import Frame
-from lensmodel.core.types import NoiseModel
+from lensmodel.core.types import Frame, NoiseModel
 from lensmodel.quality import find_edges
 from lensmodel.simulate import demo_scene, edge_chart
 

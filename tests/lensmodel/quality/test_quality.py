@@ -15,9 +15,8 @@ from scipy import ndimage, optimize, special
 from lab.images import by_zone, measure_edges
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import delta
-from lensmodel.core.types import LensSettings
+from lensmodel.core.types import Frame, LensSettings, zone_of
 from lensmodel.quality import (
     crossing,
     mtf50_from_kernel,

@@ -16,11 +16,10 @@ import pytest
 from PIL import Image
 
 from lab.kernels import gaussian
-from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import Frame
+from lensmodel.core.files import from_json, to_json
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, LensSettings
 from lensmodel.model import LensModel, ModelSettings, PsfAnswer
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf50_from_kernel

@@ -16,10 +16,9 @@ from PIL import Image
 
 from lab.scenes import dead_leaves
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
-from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import centroid
-from lensmodel.core.types import Kernel, LensSettings, Planes
-from lensmodel.quality.mtf import edge_area
+from lensmodel.core.types import Frame, Kernel, LensSettings, Planes, zone_of
+from lensmodel.quality import edge_area
 from lensmodel.simulate import (
     DEMO_SCENES,
     Aberrations,

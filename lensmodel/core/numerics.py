@@ -1,15 +1,26 @@
-"""Least squares for values that cannot be negative, as those of a kernel."""
+"""How inner loops are compiled; least squares for values that cannot be negative, as those of a kernel."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar, cast
 
+import numba
 import numpy as np
 import scipy  # its parts are loaded when they are needed
 from numpy.typing import NDArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def jit(function: F) -> F:
+    """Compile without the interpreter's lock, keep the machine code on disk."""
+    fastmath = {"nsz", "contract", "reassoc", "arcp"}
+    compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy")(function)
+    return cast("F", compiled)
+
 
 _Vector: TypeAlias = NDArray[np.float64]
 

@@ -40,8 +40,7 @@ from lensmodel.core.types import (
     StepHook,
     ignore_step,
 )
-from lensmodel.correction.blur import UniformBlur, fast_shape
-from lensmodel.correction.transforms import Real, to_plane, to_spectrum
+from lensmodel.correction.blur import Real, UniformBlur, fast_shape, to_plane, to_spectrum
 from lensmodel.photo import develop, write_image
 
 Window = tuple[int, int, int, int] | None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from lensmodel.correction.blur import crop_to_support
+from lensmodel.correction.cell import Roi
 from lensmodel.correction.deconvolver import Deconvolver, Sensor, restore_planes
-from lensmodel.correction.lattice import Roi
-from lensmodel.correction.limit import Bounds
-from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
-from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.limit import Bounds, StoredColour
 from lensmodel.correction.posterior import PsfPosterior
-from lensmodel.correction.stored_colour import StoredColour
+from lensmodel.correction.richardson_lucy import SaturationAwareRichardsonLucy
+from lensmodel.correction.sparse_gradient import SparseGradient
 from lensmodel.correction.whole_photo import KERNEL_SIZE, Corrected, correct_planes, deconvolvers
 
 __all__ = [
@@ -18,7 +17,6 @@ __all__ = [
     "Corrected",
     "Deconvolver",
     "PsfPosterior",
-    "RichardsonLucy",
     "Roi",
     "SaturationAwareRichardsonLucy",
     "Sensor",

@@ -10,10 +10,9 @@ import numpy as np
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import CHANNELS, ZONES, Plane, Planes, Zone
-from lensmodel.correction.blur import UniformBlur, fast_shape
-from lensmodel.correction.clipped import LEAST_CLIPPED
+from lensmodel.correction.blur import Complex, Real, UniformBlur, fast_shape, smooth, through
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.transforms import Complex, Real, smooth, through
+from lensmodel.correction.richardson_lucy import LEAST_CLIPPED
 
 Window: TypeAlias = tuple[slice, slice]
 

@@ -11,10 +11,9 @@ from scipy import fft
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import Planes
-from lensmodel.correction.canvas import Canvas
+from lensmodel.correction.blur import ONE, ZERO, Canvas, Number, Real, smooth
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.scene_power import wiener_spectrum
-from lensmodel.correction.transforms import ONE, ZERO, Number, Real, smooth
+from lensmodel.correction.expected_gain import wiener_spectrum
 
 Mask = NDArray[np.bool_]
 

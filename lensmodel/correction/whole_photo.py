@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
@@ -20,6 +20,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import (
     CHANNELS,
+    ZONES,
     BayerPattern,
     Channel,
     FieldPosition,
@@ -32,18 +33,24 @@ from lensmodel.core.types import (
     zone_of,
 )
 from lensmodel.correction.audit import AuditReport, pooled
-from lensmodel.correction.blur import UniformBlur, crop_to_support
-from lensmodel.correction.cell import CorrectionJob, RestoredCell, blur_of, restore_cell
+from lensmodel.correction.blur import Real, UniformBlur, crop_to_support
+from lensmodel.correction.cell import (
+    Cell,
+    CorrectionJob,
+    RestoredCell,
+    Roi,
+    blur_of,
+    cells,
+    restore_cell,
+    usual_pitch,
+)
 from lensmodel.correction.deconvolver import Deconvolver
-from lensmodel.correction.expected_gain import ZoneReport, zone_reports
-from lensmodel.correction.lattice import Cell, Roi, cells, usual_pitch
-from lensmodel.correction.limit import Bounds
-from lensmodel.correction.methods.direct import DirectFilter
-from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
-from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.direct_filter import DirectFilter
+from lensmodel.correction.expected_gain import CellForecast, decibels
+from lensmodel.correction.limit import Bounds, StoredColour
 from lensmodel.correction.posterior import PosteriorField, PsfPosterior
-from lensmodel.correction.stored_colour import StoredColour
-from lensmodel.correction.transforms import Real
+from lensmodel.correction.richardson_lucy import SaturationAwareRichardsonLucy
+from lensmodel.correction.sparse_gradient import SparseGradient
 from lensmodel.photo.lateral import LateralColour
 
 deconvolvers: Registry[Deconvolver] = Registry(
@@ -52,7 +59,6 @@ deconvolvers: Registry[Deconvolver] = Registry(
         "standard": SparseGradient,
         "paper": partial(SaturationAwareRichardsonLucy, warped=True),  # section 7
         "fast": DirectFilter,
-        "richardson-lucy": RichardsonLucy,
     },
     "lensmodel.deconvolvers",
 )
@@ -66,8 +72,25 @@ _KEPT: Final = 640
 """Kernels to keep: each serves its own cell and its neighbours; these are three rows of cells of 100
 megapixels."""
 
+_UNKNOWN: Final = 1.0
+"""Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""
+
 first_use = logging.getLogger(f"{__name__}.first_use")
 """Says when loops are compiled, during which nothing else happens that a user could see."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneReport:
+    """What the correction is expected to have done in one zone."""
+
+    cells: int  # cells of the zone that were corrected
+    # Expected gain in PSNR of linear light against the sharp scene, decibels; may be negative. None where the
+    # PSFs are too uncertain.
+    expected_gain_db: float | None
+    psf_error: float  # mean expected relative error of the PSFs
+    left: int = 0  # cells left as they were, because there was nothing to gain
+    held_back: float = 0.0  # mean share of the correction that the audit held back, 0 to 1
+    reasons: tuple[str, ...] = ()  # the checks that held something back, the strictest first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,6 +258,29 @@ def _unchanged(
     bottom, right = window.top + window.height, window.left + window.width
     planes = np.array(job.planes[:, window.top : bottom, window.left : right], dtype=np.float32)
     return Corrected(planes, zone_reports(forecasts, left, pooled(())))
+
+
+def zone_reports(
+    forecasts: Sequence[CellForecast], left: Mapping[Zone, int], audit: AuditReport
+) -> dict[Zone, ZoneReport]:
+    """Pool the cells of each zone; zones without a cell are left out."""
+    reports: dict[Zone, ZoneReport] = {}
+    for zone in ZONES:
+        in_zone = [f for f in forecasts if f.zone == zone]
+        if not in_zone:
+            continue
+        error = sum(f.psf_error for f in in_zone) / len(in_zone)
+        gain = decibels(sum(f.before for f in in_zone), sum(f.after for f in in_zone))
+        held = audit.zones.get(zone)
+        reports[zone] = ZoneReport(
+            len(in_zone),
+            gain if error < _UNKNOWN else None,
+            error,
+            left=left.get(zone, 0),
+            held_back=0.0 if held is None else held.held_back,
+            reasons=() if held is None else tuple(sorted(held.checks, key=lambda name: -held.checks[name])),
+        )
+    return reports
 
 
 def _posteriors_of(

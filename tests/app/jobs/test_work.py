@@ -39,7 +39,7 @@ from lab.kernels import gaussian
 from lensmodel.core.files import to_json
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
-from lensmodel.correction.expected_gain import ZoneReport
+from lensmodel.correction.whole_photo import ZoneReport
 
 Answer = Outcome | Callable[[dict[str, Any], Path], Outcome]
 KERNEL = gaussian(15, np.eye(2))

@@ -33,7 +33,7 @@ from app.store.tables import PhotoRow
 from lab.kernels import gaussian
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import CHANNELS, FieldPosition, Frame, LensSettings, ignore_step
-from lensmodel.correction.lattice import cells
+from lensmodel.correction.cell import cells
 from lensmodel.photo import upright
 from lensmodel.photo.writing import write_bayer_dng
 

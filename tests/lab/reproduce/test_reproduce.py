@@ -266,7 +266,7 @@ def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages()
         "lab/model_benchmark.py",
         "lab/cases.py",
         "lab/schuler.py",
-        "lensmodel/correction/methods/richardson_lucy.py",
+        "lensmodel/correction/richardson_lucy.py",
     } <= names
     assert not names & {f"lab/reproduce/{name}.py" for name in ("page", "tables")}
 

@@ -14,8 +14,8 @@ from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Frame, Kernel, NoiseModel
 from lensmodel.correction import correct_planes
 from lensmodel.correction.blur import UniformBlur
-from lensmodel.correction.clipped import Lights, Window, compact, regions
 from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.richardson_lucy import Lights, Window, compact, regions
 
 REACH = 4
 KERNEL = gaussian(2 * REACH + 1, np.eye(2) * 1.2)

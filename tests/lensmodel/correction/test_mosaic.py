@@ -18,8 +18,8 @@ from lensmodel import photo
 from lensmodel.core.psf import as_kernel, delta
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel
 from lensmodel.correction import Sensor, correct_planes
+from lensmodel.correction.blur import smooth
 from lensmodel.correction.mosaic import spread_grain
-from lensmodel.correction.transforms import smooth
 from lensmodel.photo.writing import write_bayer_dng
 
 SIDES = (160, 224)

@@ -10,7 +10,7 @@ from scipy import ndimage
 from lab.kernels import gaussian
 from lensmodel.core.types import BayerPattern, Channel, FieldPosition, Frame, LensSettings, NoiseModel
 from lensmodel.correction import PsfPosterior, correct_planes
-from lensmodel.correction.scene_power import noise_power, ring_power
+from lensmodel.correction.expected_gain import noise_power, ring_power
 from lensmodel.photo import develop
 from lensmodel.simulate import SimulatedCamera, draw_lens, photograph, write_photo
 

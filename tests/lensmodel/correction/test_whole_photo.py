@@ -23,9 +23,9 @@ from lensmodel.core.types import (
     Planes,
 )
 from lensmodel.correction import Bounds, Corrected, correct_planes, whole_photo
+from lensmodel.correction.cell import cells
 from lensmodel.correction.deconvolver import Sensor, Solution
 from lensmodel.correction.expected_gain import plan
-from lensmodel.correction.lattice import cells
 from lensmodel.correction.posterior import PsfPosterior
 
 FRAME = Frame(152, 208)  # two cells by two
@@ -296,11 +296,11 @@ def test_flat_areas_keep_their_grain_unless_it_is_to_be_taken_away(mosaic: bool)
 
 def test_forecast_of_a_blur_turns_with_it() -> None:
     plane = np.random.default_rng(0).random((3, 72, 72), dtype=np.float32)
-    cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.01))] * 3
+    sensors = [Sensor(NoiseModel.white(0.01))] * 3
 
     lying, standing = (
         plan(
-            cell,
+            "mid",
             plane,
             [PsfPosterior.of_error(gaussian(15, np.diag(width)), 0.2)] * 3,
             [(0.0, 0.0)] * 3,
@@ -316,11 +316,11 @@ def test_forecast_of_a_blur_turns_with_it() -> None:
 
 def test_less_of_a_kernel_is_used_the_less_sure_it_is() -> None:
     plane = np.random.default_rng(0).random((3, 72, 72), dtype=np.float32)
-    cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.003))] * 3
+    sensors = [Sensor(NoiseModel.white(0.003))] * 3
     kernel = gaussian(15, 1.4**2 * np.eye(2))
 
     plans = [
-        plan(cell, plane, [PsfPosterior.of_error(kernel, error)] * 3, [(0.0, 0.0)] * 3, sensors)
+        plan("mid", plane, [PsfPosterior.of_error(kernel, error)] * 3, [(0.0, 0.0)] * 3, sensors)
         for error in (0.0, 0.3, 0.6, 1.0)
     ]
 

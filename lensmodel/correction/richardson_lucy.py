@@ -1,20 +1,38 @@
-"""Richardson-Lucy: plain, accelerated, and aware of clipped pixels."""
+"""Richardson-Lucy: accelerated, aware of clipped pixels; and the light that such steps find.
+
+Light of clipped pixels, and light from beyond the frame.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
-from scipy import special
+from numpy.typing import NDArray
+from scipy import ndimage, special
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.numerics import jit
-from lensmodel.core.types import Plane
-from lensmodel.correction.blur import UniformBlur, fast_shape
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import Plane, Planes
+from lensmodel.correction.blur import (
+    BACK,
+    FORWARD,
+    ONE,
+    ZERO,
+    Canvas,
+    Complex,
+    Number,
+    Real,
+    UniformBlur,
+    fast_shape,
+    smooth,
+    through,
+)
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.transforms import BACK, FORWARD, ONE, ZERO, Complex, Number, Real, smooth, through
 
 Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 """How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
@@ -46,39 +64,10 @@ _SOFT: Final = special.softmax(-(np.arange(-10, 11) ** 2) / 18.0).astype(np.floa
 
 
 @dataclass(frozen=True, slots=True)
-class RichardsonLucy:
-    """Richardson-Lucy iteration, the maximum-likelihood ascent for Poisson noise.
-
-    Each step multiplies the estimate by the back-projected ratio of data to prediction::
-
-        x <- x / (F^T 1) * F^T ( (y + b) / (F x + b) )
-
-    W. H. Richardson, J. Opt. Soc. Am. 62, 55-59, 1972. The background b = read / shot variance makes read
-    noise nearly Poisson (D. L. Snyder et al., J. Opt. Soc. Am. A 12, 272-283, 1995); without it the dark
-    parts diverge.
-    """
-
-    iterations: int = 15  # the only regulariser: noise grows with it
-
-    def __post_init__(self) -> None:
-        _check(self.iterations)
-
-    def deconvolve(self, blurred: Plane, blur: UniformBlur, *, sensor: Sensor) -> Plane:
-        """Deconvolve one plane; see `Deconvolver`."""
-        base = _background(sensor)
-        data = np.maximum(blurred, 0.0) + base
-        latent, reach = first_guess(blurred, blur)
-        for _ in range(self.iterations):
-            # Written with the error instead of the ratio: at the rim, where F^T 1 is small and
-            # floored, a perfect prediction must leave the estimate alone.
-            error = data / np.maximum(blur.forward(latent) + base, _TINY) - 1.0
-            latent = latent * np.maximum(1.0 + blur.adjoint(error) / reach, 0.0)
-        return blur.frame(latent)
-
-
-@dataclass(frozen=True, slots=True)
 class SaturationAwareRichardsonLucy:
     """Richardson-Lucy for a sensor that clips, without rings around lights, accelerated.
+
+    The maximum-likelihood ascent for Poisson noise of W. H. Richardson, J. Opt. Soc. Am. 62, 55-59, 1972.
 
     After O. Whyte, J. Sivic, A. Zisserman, "Deblurring shaken and partially saturated images", IJCV 110,
     185-201, 2014, eq. 13 to 19. The sensor answers with a smooth minimum of light and clipping level t::
@@ -107,7 +96,8 @@ class SaturationAwareRichardsonLucy:
     warped: bool = False  # whether lateral colour is removed by resampling before, not as part of the kernels
 
     def __post_init__(self) -> None:
-        _check(self.iterations)
+        if not 1 <= self.iterations <= 500:
+            raise InvalidInputError(f"iterations must lie in 1..500, got {self.iterations}")
         if self.acceleration not in _ACCELERATIONS:
             raise InvalidInputError(
                 f"acceleration must be one of {', '.join(_ACCELERATIONS)}, got {self.acceleration!r}"
@@ -122,11 +112,6 @@ class SaturationAwareRichardsonLucy:
                 latent, blurred, reach, blur, sensor, self.iterations, self.acceleration, lights=lights
             )
         )
-
-
-def _check(iterations: int) -> None:
-    if not 1 <= iterations <= 500:
-        raise InvalidInputError(f"iterations must lie in 1..500, got {iterations}")
 
 
 def first_guess(blurred: Plane, blur: UniformBlur) -> tuple[Plane, Plane]:
@@ -183,7 +168,11 @@ def richardson_lucy_steps(
 
 
 def _background(sensor: Sensor) -> float:
-    """Read variance over shot variance: the light whose Poisson noise equals the read noise."""
+    """Read variance over shot variance: the light whose Poisson noise equals the read noise.
+
+    It makes read noise nearly Poisson (D. L. Snyder et al., J. Opt. Soc. Am. A 12, 272-283, 1995); without it
+    the dark parts diverge.
+    """
     if sensor.noise.shot <= 0.0:
         return 0.0
     return min(sensor.noise.read / sensor.noise.shot, 1.0)
@@ -362,3 +351,257 @@ def _steps(  # noqa: C901 - one pass over memory per loop
                 start[i, j] = ahead
                 work[i, j] = ahead
             work[i, cols:] = ZERO
+
+
+Mask = NDArray[np.bool_]
+Window = tuple[slice, slice]
+
+LEAST_CLIPPED: Final = 0.98
+"""Share of the clipping level from which light may have clipped: demosaicing leaves it a little below, and
+sensors do not clip at one level (chosen)."""
+_LEAST_SEEN: Final = 0.02
+"""Least share of a point's light that counts as measured (chosen: a step divides by it, so that with less a
+few pixels of noise would make a light of any strength; with more, broad lights would come up too slowly)."""
+_UNSEEN: Final = 1e-3
+"""Share of a point's light below which it is unknown (chosen: no more than the kernel's far wings, which are
+known no better)."""
+_SIGMAS: Final = np.float32(3.0)
+"""Standard deviations of noise by which glow may exceed the photo (chosen: noise alone exceeds it in one
+pixel of 700; with less, chance would dim the lights; with more, their glow would leave holes)."""
+_ABSURD: Final = np.float32(2.0)
+"""Times that bound beyond which the glow is no answer (chosen: steps that converge leave less)."""
+
+_DARKEST: Final = 0.9
+"""Least share of the darkest light nearby that remains, times what a kernel spreads (chosen: 1 would allow no
+dark detail in a glow at all, much less the dark ring that it is there to prevent)."""
+_DUBIOUS: Final = np.float32(0.25)
+"""Share of the glow that may be scene light instead (chosen: 0 lets an error of the glow make a black ring, 1
+would leave all glow in place)."""
+_GLARE, _NO_GLARE = np.float32(0.5), np.float32(0.02)
+"""Share of glow in the photo's light at and above which the bound holds in full (chosen: from there on more
+of a pixel is subtracted than is left), and share of that below which it is rounding errors of transforms."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lights:
+    """What shines beyond saturation in a tile."""
+
+    # the tile without the glow; clipped pixels hold what the light below saturation makes of them
+    rest: Planes
+    beyond: Planes  # sharp light above the clipping level
+    glow: Planes  # the same as the lens spreads it
+    spread: Real  # (channels,), share of a point's light that falls beyond its neighbours
+
+    @classmethod
+    def of(
+        cls, tile: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], steps: int
+    ) -> Lights | None:
+        """Find the light above the clipping level of each colour; None where nothing is clipped.
+
+        Only its glow on the pixels around it shows how bright a clipped light is. Richardson-Lucy steps
+        estimate that, with clipped pixels as lower bounds, R and R' as in `SaturationAwareRichardsonLucy`,
+        and divided by the share of a point's light that was measured::
+
+            x <- x ( 1 + F^T e / F^T 1[y < t] ),     e = ( y / R(F x) - 1 ) R'(F x)
+
+        Divided by F^T 1 instead, lights of which little was measured take several times the steps; those of
+        which nothing was measured do use F^T 1, or they would grow without end. This is done only for lights
+        that the lens may have spread (`compact`); broad clipped areas count as light at saturation. Positive
+        and unregularised, x is a poor picture, so only what lies above t is taken from it.
+        """
+        if not any(
+            plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
+        ):
+            return None
+        rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
+        for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+            clipped = np.asarray(plane >= np.float32(sensor.clip))
+            spread = positive(blur)
+            for window, own in regions(compact(clipped, blur.spread), spread.reach):
+                _estimate(window, own, plane, clipped, spread, sensor, steps, (rest[c], beyond[c], glow[c]))
+            rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
+        return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
+
+    def put_back(self, photo: Planes, restored: Planes) -> Planes:
+        """Add the light to the restored rest.
+
+        Where most of a pixel's light was glow, an error of the glow is large compared with the scene, and
+        the more the lens spreads, the more of it comes back as a dark ring. So there the result stays above
+        a share of the darkest light nearby.
+        """
+        if not self.glow.any():
+            return np.asarray(restored + self.beyond, dtype=np.float32)
+        near = ndimage.maximum_filter(self.glow, (1, 5, 5), mode="nearest")
+        scene = np.maximum(self.rest, np.float32(0.0)) + _DUBIOUS * self.glow
+        darkest = ndimage.minimum_filter(scene, (1, 5, 5), mode="nearest")
+        glare = np.minimum(near / (_GLARE * np.maximum(photo, np.float32(1e-6))), np.float32(1.0))
+        depth = (np.float32(_DARKEST) * self.spread)[:, None, None]
+        held = np.where(glare > _NO_GLARE, np.maximum(restored, depth * glare * darkest), restored)
+        return np.asarray(held + self.beyond, dtype=np.float32)
+
+
+def regions(lights: Mask, reach: int) -> list[tuple[Window, Mask]]:
+    """Windows of a tile in which lights are estimated together.
+
+    Each is the data to use, and the light that only this window estimates, `reach` wider on each side.
+    """
+    if not lights.any():
+        return []
+    near = ndimage.maximum_filter(np.pad(lights, reach), 2 * reach + 1)
+    labels, count = ndimage.label(near)
+    found = []
+    for number, box in enumerate(ndimage.find_objects(labels, count), start=1):
+        window = tuple(
+            slice(max(part.start - 2 * reach, 0), min(part.stop, extent))
+            for part, extent in zip(box, lights.shape, strict=True)
+        )
+        wide = tuple(slice(part.start, part.stop + 2 * reach) for part in window)
+        found.append(((window[0], window[1]), np.asarray(labels[wide] == number)))
+    return found
+
+
+def compact(clipped: Mask, reach: int) -> Mask:
+    """Clipped pixels of areas that a lamp may have made through a kernel of this reach.
+
+    An area with a clipped pixel further than the reach from all measured ones is broad: nothing shows how
+    bright it is inside.
+    """
+    if not clipped.any():
+        return clipped
+    # demosaicing leaves pixels between clipped ones hardly below saturation
+    closed = ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped
+    depth = ndimage.distance_transform_cdt(np.pad(closed, 1), "chessboard")[1:-1, 1:-1]
+    labels, count = ndimage.label(closed, structure=np.ones((3, 3), dtype=np.int8))
+    broad = np.zeros(count + 1, dtype=np.bool_)
+    broad[0] = True
+    broad[labels[depth > reach]] = True
+    return np.asarray(clipped & ~broad[labels])
+
+
+def positive(blur: UniformBlur) -> UniformBlur:
+    """The same blur, its shift by parts of a pixel in the kernel, so that no light becomes negative.
+
+    A shift that acts as a phase belongs to a kernel with negative lobes, behind which Richardson-Lucy steps
+    run away.
+    """
+    if blur.offset == (0.0, 0.0):
+        return blur
+    wide = blur.reach - blur.kernel.shape[0] // 2
+    moved = ndimage.shift(np.pad(blur.kernel, wide), blur.offset, order=1)
+    return UniformBlur(as_kernel(np.maximum(moved, 0.0)))
+
+
+def _spread(blur: UniformBlur) -> float:
+    """Share of a kernel outside its middle 3 x 3 pixels."""
+    middle = blur.kernel.shape[0] // 2
+    near = slice(max(middle - 1, 0), middle + 2)
+    return 1.0 - float(blur.kernel[near, near].sum())
+
+
+def _estimate(
+    window: Window,
+    own: Mask,
+    plane: Real,
+    clipped: Mask,
+    blur: UniformBlur,
+    sensor: Sensor,
+    steps: int,
+    into: tuple[Real, Real, Real],
+) -> None:
+    """Estimate the light of one region of one colour; update `into`: rest, light beyond saturation, glow."""
+    rest, beyond, glow = into
+    data, lost = np.ascontiguousarray(plane[window]), clipped[window]
+    latent, reach = first_guess(data, blur)
+    measured = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
+    full = float(reach.max())
+    measured = np.where(
+        measured < _UNSEEN * full, reach, np.maximum(measured, np.float32(_LEAST_SEEN * full))
+    )
+    latent = richardson_lucy_steps(latent, data, measured, blur, sensor, steps=steps)
+    below = np.minimum(latent, np.float32(sensor.clip))
+    excess = np.where(own, latent - below, np.float32(0.0))
+    bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
+    excess, spread = _believable(excess, np.where(lost, np.float32(np.inf), bound), blur)
+    glow[window] += spread
+    beyond[window] += blur.frame(excess)
+    answered = lost & np.asarray(blur.frame(own.astype(np.float32)), dtype=np.bool_)
+    rest[window][answered] = np.maximum(blur.forward(below), np.float32(0.0))[answered]
+
+
+def _believable(excess: Real, bound: Real, blur: UniformBlur) -> tuple[Real, Real]:
+    """Return the estimated light and its glow, dimmed where the glow far exceeds a bound; none if that fails.
+
+    Steps may run away: just below clipping the response hardly rises.
+    """
+    glow = blur.forward(excess)
+    absurd = ~(np.abs(glow) <= _ABSURD * bound)
+    if absurd.any():
+        share = np.where(absurd, bound / np.where(absurd, np.abs(glow), np.float32(1.0)), np.float32(1.0))
+        excess = excess * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
+        glow = blur.forward(excess)
+        if not (np.abs(glow) <= _ABSURD * bound).all():
+            return np.zeros_like(excess), np.zeros_like(glow)
+    return excess, glow
+
+
+_DEPTH, _MORE = 4, 8
+"""Depth of the strip of data that predicts what lies beyond a side: so many reaches of the blur, plus so many
+pixels (chosen: those within two reaches share light with the outside, as many again share it with them; more
+costs time and says nothing of the outside)."""
+
+
+def fill_canvas(
+    canvas: Canvas,
+    tile: Planes,
+    light: Real,
+    K: Complex,
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    steps: int,
+) -> Planes:
+    """Place a tile, none of it beyond saturation and divided by the `light` of each colour, on its canvas.
+
+    What lies beyond the sides of the frame does not fade. A mirror image of the frame is a poor guess of
+    that: its errors come back as ripples inside, stronger the less noise there is. `steps` of Richardson-Lucy
+    on a strip of the data estimate the light on both sides of the border, each point divided by the share of
+    its light that was measured; that light, blurred by K, is what a larger sensor would have recorded.
+    """
+    y = canvas.filled(tile, light)
+    if all(sensor.surrounded for sensor in sensors):
+        return y
+    outside = np.ones(canvas.shape, dtype=np.bool_)
+    outside[canvas.data] = False
+    for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+        if blur.reach == 0:
+            continue
+        latent = _extended(plane, blur, sensor, steps)
+        recorded = canvas.filled(latent[None], light[c : c + 1], blur.reach)[0]
+        through(recorded, np.empty_like(K[c]), K[c], True, 0, len(recorded), 0, len(recorded))
+        np.copyto(y[c], recorded, where=outside)
+    return y
+
+
+def _extended(
+    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int
+) -> NDArray[np.float32]:
+    """The data, extended by the reach; at the sides of the frame they are replaced by the latent light."""
+    wide = blur.reach
+    depth, both = _DEPTH * wide + _MORE, 2 * wide
+    wider = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
+    unclipped = replace(sensor, clip=float("inf"), measured=None)
+
+    def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
+        part = np.ascontiguousarray(part)
+        latent, reach = first_guess(part, blur)
+        return richardson_lucy_steps(latent, part, reach, blur, unclipped, steps=steps)
+
+    top, bottom, left, right = sensor.edges
+    if left:
+        wider[:, :both] = light_of(plane[:, :depth])[:, :both]
+    if right:
+        wider[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
+    if top:
+        wider[:both] = light_of(plane[:depth])[:both]
+    if bottom:
+        wider[-both:] = light_of(plane[-depth:])[-both:]
+    return wider

@@ -12,21 +12,22 @@ from numpy.typing import NDArray
 
 from lensmodel.core.numerics import jit
 from lensmodel.core.types import Plane, Planes
-from lensmodel.correction.blur import UniformBlur, transfers
-from lensmodel.correction.canvas import Canvas
-from lensmodel.correction.clipped import Lights
-from lensmodel.correction.deconvolver import Sensor, Solution
-from lensmodel.correction.posterior import GRID
-from lensmodel.correction.scene_power import frequency_squared, noise_power, ring_power, scene_law
-from lensmodel.correction.transforms import (
+from lensmodel.correction.blur import (
     ONE,
     ZERO,
+    Canvas,
     Complex,
     Real,
+    UniformBlur,
     smooth,
     to_plane,
     to_spectrum,
+    transfers,
 )
+from lensmodel.correction.deconvolver import Sensor, Solution
+from lensmodel.correction.expected_gain import frequency_squared, noise_power, ring_power, scene_law
+from lensmodel.correction.posterior import GRID
+from lensmodel.correction.richardson_lucy import Lights, fill_canvas
 
 _TEXTURE: Final = np.float32(0.87)  # t, see `DirectFilter` (chosen as `cell._SHARE` is)
 _LIGHT_STEPS, _OUTSIDE_STEPS = 15, 10
@@ -50,7 +51,7 @@ enough pixels for a variance, and little of the next object)."""
 class DirectFilter:
     r"""Wiener's filter of each colour (N. Wiener, 1949), with a part of the grain that it takes.
 
-    With S = c |f|^-a the power of the scene in the very cell (`scene_power.scene_law`) and n its noise::
+    With S = c |f|^-a the power of the scene in the very cell (`expected_gain.scene_law`) and n its noise::
 
         X = G Y,    G = W + t ( 1 - K W ),    W = conj(K) S / ( |K|² S + n )
 
@@ -76,10 +77,10 @@ class DirectFilter:
         """Restore the colours together; see `ColourDeconvolver`."""
         lights = Lights.of(blurred, blurs, sensors, _LIGHT_STEPS)
         photo, blurred = blurred, np.ascontiguousarray(blurred if lights is None else lights.rest)
-        canvas = Canvas.around(blurred, blurs, sensors)
+        canvas = Canvas.around(blurred, blurs, surrounded=all(sensor.surrounded for sensor in sensors))
         K, _ = transfers(blurs, canvas.shape, 1.0)
         unit = np.ones(len(blurred), dtype=np.float32)
-        x = canvas.filled(blurred, unit, K, blurs, sensors, _OUTSIDE_STEPS)
+        x = fill_canvas(canvas, blurred, unit, K, blurs, sensors, _OUTSIDE_STEPS)
         part = blurred[:, ::_EVERY, ::_EVERY]
         noise = np.array([s.noise.variance(p).mean() for s, p in zip(sensors, part, strict=True)])
         # of the usual part of the cell, not of its lamps

@@ -129,7 +129,7 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
 
 @pytest.mark.usefixtures("reading")
 def test_a_lens_is_asked_named_merged_and_sent_on(
-    client: TestClient, api: Client, steps: Steps, tmp_path: Path
+    client: TestClient, api: Client, steps: Steps, store: Store, tmp_path: Path
 ) -> None:
     photo = steps.counted(serial="1", patches=6)
     one, other = steps.lens_id(photo), steps.lens_id(steps.counted(serial="2"))
@@ -162,6 +162,11 @@ def test_a_lens_is_asked_named_merged_and_sent_on(
     assert api.lens(one).version == 2
     with pytest.raises(ServiceProblemError, match="other_lens"):
         api.change_lens(one, merge_into=other)
+    busy = steps.receive()
+    steps.inspect(busy, serial="3")
+    with pytest.raises(ServiceProblemError, match="conflict"):
+        api.change_lens(steps.lens_id(busy), merge_into=other, any_lens=True)
+    store.photos.delete(busy.public_id, "local")
     assert api.change_lens(one, merge_into=other, any_lens=True).id == other
     assert [each.id for each in api.lenses()] == [other]
 

@@ -58,7 +58,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    # of so few patches no wavefront is fitted, for which each version would wait; see test_lens_modes
+    # of so few patches no wavefront is fitted, for which each version would wait
     made = Service(tmp_path_factory.mktemp("journey") / "data", BRIEF, **OWN_ACCOUNT)
     try:
         made.start()

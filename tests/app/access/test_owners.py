@@ -426,21 +426,6 @@ def send(client: TestClient) -> Any:
     return client.post("/v1/photos?filename=a.jpg", content=JPEG)
 
 
-def test_a_request_that_is_sent_again_makes_nothing_twice(
-    client: TestClient, store: Store, steps: Steps, storage: Storage
-) -> None:
-    wish = {"photo_id": steps.counted().public_id, "method": "fast"}
-
-    photos = [send(client) for _ in range(2)]
-    made = [client.post("/v1/corrections", json=wish) for _ in range(2)]
-
-    assert [answer.status_code for answer in (*photos, *made)] == [202, 200, 202, 202]
-    assert made[0].json()["id"] == made[1].json()["id"]
-    assert counts(store, tables.PhotoRow, tables.CorrectionRow) == [2, 1]
-    kept = [path.parent.name for path in storage.folder.glob("photos/*/original")]
-    assert kept == [photos[0].json()["id"]] == [photos[1].json()["id"]]
-
-
 def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
     client: TestClient, steps: Steps, storage: Storage
 ) -> None:

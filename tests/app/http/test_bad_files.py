@@ -137,22 +137,6 @@ def test_bad_files_are_refused_and_a_good_photo_still_goes_through_in_the_same_w
     assert "started again" not in service.log.read_text()
 
 
-@pytest.mark.slow  # each of them is read without a service in tests/lensmodel/photo/test_bad_files.py
-@pytest.mark.tools
-def test_each_file_of_the_collection_is_refused_or_processed_and_none_is_stuck(
-    service: Service, shared_data: Path
-) -> None:
-    files = {path.name: path.read_bytes() for path in sorted((shared_data / "bad").iterdir())}
-    assert len(files) > 40
-
-    answers = send_all(service, files)
-
-    codes = {name: answer["code"] for name, answer in answers.items()}
-    assert codes.keys() == files.keys()
-    assert {name: code for name, code in codes.items() if code not in KNOWN_CODES | {"counted"}} == {}
-    assert "started again" not in service.log.read_text()
-
-
 @pytest.mark.slow
 def test_a_thumbnail_and_detail_in_one_place_do_not_count(tmp_path: Path) -> None:
     # the fewest patches of which as much evidence is asked as of the default

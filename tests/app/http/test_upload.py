@@ -14,6 +14,7 @@ from states import refusal, services_of
 
 from app.blobs.storage import MARK
 from app.http.upload import safe_name
+from app.routes.photos import MAX_UPLOADS
 from app.runtime.settings import Settings
 from app.store import Store
 
@@ -248,3 +249,4 @@ def test_an_upload_cut_off_by_the_client_leaves_no_blob(client: TestClient, sett
 
     assert blobs(settings) == []
     assert sent[0]["status"] == 400
+    assert services_of(client).uploads._value == MAX_UPLOADS  # its place is free again

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import shutil
 import zipfile
 from dataclasses import replace
 from typing import Any
@@ -12,15 +13,17 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from sqlalchemy import event, update
 from starlette.testclient import TestClient
-from states import Steps, refusal, store_report
+from states import Steps, refusal, services_of, store_report
 
 from app.http import model_cache
 from app.http.model_cache import ModelCache
 from app.routes.psf import accepted
 from app.schemas import PsfQuery
 from app.store import LensName, Store
-from lensmodel.core.psf import centroid
+from app.store.tables import SampleRow
+from lensmodel.core.psf import centroid, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings
 from lensmodel.model.answer import PAPER
@@ -261,6 +264,71 @@ def test_lateral_colour_is_the_middle_of_what_the_photos_show(client: TestClient
     assert shown["photos"] == 3
 
 
+# --- what makes an answer, and pixels of several bodies ----------------------------------------------
+
+
+def taken(steps: Steps, pitch_um: float = 6.0, width: int = 6000, sigma_px: float = 1.5) -> str:
+    """Let a photo of a body count; return the path of its lens."""
+    body = {"pixel_pitch_um": pitch_um, "width": width, "height": width * 2 // 3}
+    return f"/v1/lenses/{steps.lens_id(steps.counted(patches=6, width=sigma_px**2, size=25, body=body))}"
+
+
+def test_an_answer_says_what_made_it_and_what_is_beyond_all_photos(client: TestClient, steps: Steps) -> None:
+    lens = taken(steps)
+    near, far = (ask(client, lens, **of)["support"] for of in ({"r": 0.5}, {"r": 0.5, "aperture": 16}))
+
+    assert (near["answered_by"], near["weights"], near["beyond"]) == ("regression", "", [])
+    assert 0.0 < near["nearest"] < 2.5
+    assert far["beyond"] == ["aperture_stops"]
+
+
+def test_bodies_of_different_pitch_share_a_lens(client: TestClient, steps: Steps) -> None:
+    lens = taken(steps)
+    assert taken(steps) == lens
+    # the same 9 um of blur on a sensor of that size
+    assert taken(steps, pitch_um=4.0, width=9000, sigma_px=2.25) == lens
+
+    pitches: list[dict[str, Any]] = [{"pixel_pitch_um": 6}, {"pixel_pitch_um": 4}, {}]
+    coarse, fine, usual = (ask(client, lens, r=0.5, size=15, **at) for at in pitches)
+
+    assert rms_width(np.array(coarse["psf"]["data"])) == pytest.approx(1.5, rel=0.05)
+    assert rms_width(np.array(fine["psf"]["data"])) == pytest.approx(2.25, rel=0.05)
+    assert [a["units"]["pixel_pitch_um"] for a in (coarse, fine, usual)] == [6.0, 4.0, 6.0]
+    assert usual["psf"] == coarse["psf"]
+    assert fine["support"]["photos"] == 3
+    assert client.get(f"{lens}/psf", params={"r": 0.5, "pixel_pitch_um": -1}).status_code == 422
+
+
+def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, steps: Steps) -> None:
+    lens = taken(steps)
+    services = services_of(client)
+    ask(client, lens)
+    services.models.get(lens.rpartition("/")[2])
+    statements: list[str] = []
+
+    def note(*arguments: Any) -> None:
+        statements.append(str(arguments[2]))
+
+    event.listen(services.store.database.reader, "before_cursor_execute", note)
+    shutil.rmtree(services.storage.folder)  # it takes no blob, wherever these are
+    ask(client, lens, r=0.7)
+
+    assert len([text for text in statements if "SELECT" in text]) == 1
+
+
+def test_samples_of_an_earlier_version_ask_for_a_calibration(
+    client: TestClient, store: Store, steps: Steps
+) -> None:
+    lens = taken(steps)
+    with store.database.writing() as session:
+        session.execute(update(SampleRow).values(format_version=1))
+
+    answer = client.get(f"{lens}/psf", params={"r": 0.5})
+
+    assert answer.status_code == 409
+    assert "calibrate it again" in answer.json()["detail"]
+
+
 # --- merged, taken along, reported ------------------------------------------------------------------
 
 
@@ -315,26 +383,6 @@ def test_several_photos_are_named_at_once_or_none(client: TestClient, steps: Ste
     rows = [steps.fresh(photo) for photo in photos]
     assert len({row.given["lens_id"] for row in rows}) == 1
     assert {(row.given["aperture"], row.state) for row in rows} == {(2.0, "received")}
-
-
-def test_merged_lenses_are_one(client: TestClient, steps: Steps) -> None:
-    def merge(one: str, other: str, **insisting: bool) -> Any:
-        return client.patch(f"/v1/lenses/{one}", json={"merge_into": other, **insisting})
-
-    one, two = (steps.counted(serial=serial) for serial in ("1", "2"))
-    first, second = steps.lens_id(one), steps.lens_id(two)
-
-    asked = merge(first, second)
-    merged = merge(first, second, any_lens=True).json()
-
-    assert refusal(asked) == (409, "other_lens")
-    assert "its serial number is 1, that of the lens 2" in asked.json()["detail"]
-    assert (merged["id"], merged["photos"], merged["samples"]) == (second, 2, 12)
-    assert client.get(f"/v1/lenses/{first}").status_code == 404
-    assert steps.lens_id(one) == second
-    busy = steps.receive()
-    steps.inspect(busy, serial="3")
-    assert refusal(merge(steps.lens_id(busy), second, any_lens=True)) == (409, "conflict")
 
 
 @pytest.mark.usefixtures("reading")

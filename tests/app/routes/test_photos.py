@@ -164,6 +164,7 @@ def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps,
 
 def test_a_counted_photo_moves_to_another_lens_and_aperture(client: TestClient, steps: Steps) -> None:
     mine, other = steps.counted(serial="1"), steps.counted(serial="2")
+    left = f"lenses/{steps.lens_id(mine)}"
 
     moved = change(client, mine, lens_id=steps.lens_id(other)).json()
     lens = get(client, f"lenses/{steps.lens_id(other)}")
@@ -171,6 +172,7 @@ def test_a_counted_photo_moves_to_another_lens_and_aperture(client: TestClient, 
     renewed = get(client, f"lenses/{steps.lens_id(other)}")
 
     assert (moved["lens_id"], lens["photos"], opened["aperture"]) == (lens["id"], 2, 2.0)
+    assert (lens["samples"], get(client, left)["samples"]) == (12, 0)
     assert (renewed["version"], renewed["apertures"]) == (lens["version"] + 1, [1.4, 2.0])
 
 

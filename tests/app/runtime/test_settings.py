@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import pytest
 import yaml  # type: ignore[import-untyped]  # its types are a package of their own
 
 from app.runtime.settings import PREFIX, Settings, described
+from app.runtime.supervisor import listen
+from lensmodel.core.errors import InvalidInputError
 
 ROOT = Path(__file__).parents[3]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
@@ -59,6 +62,20 @@ def test_a_database_server_needs_storage_that_all_machines_see_and_has_the_jobs(
     settings = Settings(database_url=SERVER, storage_url="s3://lensmodel")
 
     assert settings.jobs == settings.database
+
+
+def test_no_answer_waits_for_a_receipt_of_its_head() -> None:
+    with listen("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        connection, _ = listener.accept()
+        with connection:
+            assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with listen("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+        with pytest.raises(InvalidInputError, match=f"127.0.0.1:{port}"):
+            listen("127.0.0.1", port)
 
 
 def test_every_setting_of_the_compose_file_is_known_and_they_fit_together(

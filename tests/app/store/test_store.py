@@ -16,8 +16,9 @@ import pytest
 from conftest import Steps
 from deadline import stretched
 from servers import postgres
-from sqlalchemy import Text, cast, event, func, insert, select, text
+from sqlalchemy import Text, cast, event, func, select, text
 from sqlalchemy.exc import DBAPIError
+from starlette.testclient import TestClient
 from uploads import receive
 
 from app.errors import BusyError, UnknownError
@@ -25,7 +26,7 @@ from app.runtime.settings import Settings
 from app.store import LensName, Store
 from app.store.database import Database, current, head, upgrade
 from app.store.owners import ANY_OWNER, ensure_owner
-from app.store.tables import Base, CorrectionRow, LensRow, OwnerRow, PatchRow, PhotoRow
+from app.store.tables import Base, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
 from lab.kernels import gaussian
 from lensmodel.core.errors import InvalidInputError
 
@@ -36,22 +37,20 @@ WINDOW = {"row": 5, "col": 5, "size": 64, "r": 0.5, "phi": 0.0, "cell": 0}
 # --- photos and their patches -----------------------------------------------------------------
 
 
-def test_finishing_a_photo_counts_it_once_however_often_it_is_tried(store: Store, steps: Steps) -> None:
-    photo = steps.counted()
-
-    assert store.photos.finish(photo.public_id, photo.epoch) is None
-
-    lens = photo.lens
-    assert (lens.version, lens.photo_count, lens.sample_count) == (1, 1, 6)
-    assert len(store.lenses.history(lens)) == 1
-
-
-def test_a_repeated_cell_stores_no_sample_twice(steps: Steps) -> None:
+def test_steps_of_a_photo_that_are_repeated_count_once(store: Store, steps: Steps) -> None:
     photo = steps.planned()
 
+    store.photos.plan_patches(photo.public_id, 1, [WINDOW], [])
+    assert len(store.photos.windows(photo.public_id)) == 3
+    assert store.photos.patches(photo.public_id)[0].row == 100
     assert [steps.estimate(photo, indices) for indices in ((0,), (0,), (0, 1))] == [3, 0, 3]
-    again = steps.fresh(photo)
+    finished = [store.photos.finish(photo.public_id, photo.epoch) is not None for _ in range(2)]
+
+    again, lens = steps.fresh(photo), steps.lens(photo)
+    assert finished == [True, False]
     assert (again.patches_total, again.patches_done, again.patches_rejected) == (2, 2, 1)
+    assert (lens.version, lens.photo_count, lens.sample_count) == (1, 1, 6)
+    assert len(store.lenses.history(lens)) == 1
 
 
 def test_patches_that_fail_stay_so_and_those_that_are_done_do_not_fail(store: Store, steps: Steps) -> None:
@@ -62,15 +61,6 @@ def test_patches_that_fail_stay_so_and_those_that_are_done_do_not_fail(store: St
 
     states = [row.state for row in store.photos.patches(photo.public_id)]
     assert states == ["done", "rejected", "done", "rejected"]
-
-
-def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
-    photo = steps.planned()
-
-    store.photos.plan_patches(photo.public_id, 1, [WINDOW], [])
-
-    assert len(store.photos.windows(photo.public_id)) == 3
-    assert store.photos.patches(photo.public_id)[0].row == 100
 
 
 def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> None:
@@ -84,8 +74,8 @@ def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> N
     count = store.photos.plan_patches(photo.public_id, 1, [WINDOW], rejected)
 
     listed, again = store.photos.windows(photo.public_id), steps.fresh(photo)
+    stored = len(rows(store, PatchRow))
     with store.database.reading() as session:
-        stored = session.scalar(select(func.count()).select_from(PatchRow))
         size = session.scalar(select(func.length(cast(PhotoRow.windows, Text))))
     assert (count, stored, again.patches_total, again.patches_rejected) == (1, 1, 1, 2000)
     assert [row.idx for row in listed] == list(range(2001))
@@ -115,29 +105,12 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     store.photos.plan_patches(photo.public_id, 1, [WINDOW], [])
     assert store.photos.patches(photo.public_id, 1) == []
     assert steps.estimate(photo) == 0
+    store.photos.record_lateral(photo.public_id, 1, {"red": [0, 0, 0, 1]})
     store.photos.set_state(photo.public_id, ("selecting",), "received")
     assert not store.photos.is_live(photo.public_id, 1)
     assert store.photos.is_live(photo.public_id, 2)
     assert not store.photos.fail(photo.public_id, 1, "time_limit", "late")
-    assert steps.fresh(photo).state == "received"
-
-
-def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:
-    photo, other = steps.receive(), steps.receive()
-    store.photos.delete(photo.public_id, OWNER)
-    store.photos.change([other.public_id], OWNER, {"aperture": 2.0})
-
-    for key in (photo.public_id, other.public_id):
-        store.photos.record_lateral(key, 1, {"red": [0, 0, 0, 1]})
-
-    with store.database.reading() as session:
-        assert list(session.scalars(select(PhotoRow.lateral))) == [None]
-
-
-def test_a_photo_that_waits_for_its_lens_does_not_fail_for_the_end_of_its_job(
-    store: Store, steps: Steps
-) -> None:
-    assert not store.photos.fail(steps.waiting().public_id, 1, "internal_error", "its job is done")
+    assert (steps.fresh(photo).state, steps.fresh(photo).lateral) == ("received", None)
 
 
 def test_a_photo_taken_up_again_keeps_the_time_since_its_stage_began(store: Store, steps: Steps) -> None:
@@ -183,15 +156,6 @@ def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: S
     steps.inspect(photo, aperture=1.4)
 
     assert (steps.fresh(photo).epoch, steps.fresh(photo).aperture) == (3, 2.0)
-
-
-def test_an_aperture_sent_with_the_same_bytes_ends_the_wait_for_it(steps: Steps) -> None:
-    photo = steps.waiting(serial="123", aperture=None)
-
-    assert steps.receive_again(photo, aperture=4.0).state == "received"
-    steps.inspect(photo, aperture=None)
-
-    assert steps.fresh(photo).aperture == 4.0
 
 
 def test_a_correction_of_a_counted_photo_renews_its_samples_and_starts_nothing(
@@ -257,18 +221,6 @@ def test_samples_come_back_as_they_were_written(steps: Steps) -> None:
     np.testing.assert_allclose(samples[0].kernel, gaussian(15, np.eye(2)), atol=1e-7)
 
 
-def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: Store, steps: Steps) -> None:
-    photo = steps.counted()
-
-    assert store.photos.change([photo.public_id], OWNER, {}, excluded=True)
-    assert steps.learned(photo)[1] == []
-    assert store.photos.change([photo.public_id], OWNER, {}, excluded=True)  # again: no version of its own
-    assert store.photos.change([photo.public_id], OWNER, {}, excluded=False)
-
-    state, samples = steps.learned(photo)
-    assert (state.version, state.rebuild_epoch, len(samples)) == (3, 2, 6)
-
-
 def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, steps: Steps) -> None:
     other, photo = steps.counted(), steps.counted()
     lens = steps.lens_id(photo)
@@ -284,16 +236,6 @@ def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, 
     history = [event.kind for event in store.lenses.history(steps.lens(other))]
     assert history == ["photo_added", "photo_added", "photo_removed"]
     assert steps.receive_again(photo).public_id != photo.public_id
-
-
-def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -> None:
-    mine, other = steps.counted(serial="123"), steps.counted(serial="124")
-    old = steps.lens_id(mine)
-
-    assert store.photos.change([mine.public_id], OWNER, {}, lens=steps.lens_id(other))
-
-    assert store.lenses.samples_of(old)[1] == []
-    assert len(steps.learned(other)[1]) == 12
 
 
 def test_a_photo_is_moved_to_no_lens_that_is_gone_or_of_another(store: Store, steps: Steps) -> None:
@@ -322,19 +264,110 @@ def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, ste
     assert steps.learned(photo)[0].version == 21
 
 
-# --- corrections, workers, garbage ------------------------------------------------------------
+# --- what is deleted is gone -------------------------------------------------------------------
+
+WHY = ("no_usable_patches", "all is sky")
 
 
-def test_the_same_correction_is_made_once_and_a_failed_one_again(store: Store, steps: Steps) -> None:
+def rows(store: Store, table: type[Any]) -> list[Any]:
+    with store.database.reading() as session:
+        return list(session.scalars(select(table)))
+
+
+def lenses(store: Store) -> list[str]:
+    return [lens.public_id for lens in rows(store, LensRow)]
+
+
+def test_a_deleted_lens_is_gone_and_its_photos_can_be_corrected_with_another(
+    client: TestClient, store: Store, steps: Steps
+) -> None:
+    counted, running, waiting = steps.counted(), steps.planned(), steps.waiting()
+    address = f"/v1/lenses/{steps.lens_id(counted)}"
+
+    assert client.delete(address).status_code == 204
+
+    assert client.get(address).status_code == client.get(f"{address}/psf?r=0").status_code == 404
+    assert client.delete(address).status_code == 404
+    states = [steps.fresh(photo).state for photo in (counted, running, waiting)]
+    assert states == ["stored", "cancelled", "needs_lens"]
+    for table in (SampleRow, PatchRow, EventRow, LensRow):
+        assert rows(store, table) == []
+
+
+def test_nothing_that_still_ran_brings_a_deleted_lens_back(store: Store, steps: Steps) -> None:
+    running = steps.planned()
+    store.lenses.delete(steps.lens_id(running), OWNER)
+
+    assert steps.estimate(running) == 0
+    assert store.photos.finish(running.public_id, 1) is None
+    assert lenses(store) == []
+
+
+def test_the_same_lens_begins_anew_with_its_next_photo(store: Store, steps: Steps) -> None:
+    first = steps.lens(steps.counted())
+    store.lenses.delete(first.public_id, OWNER)
+
+    second = steps.lens(steps.counted())
+
+    assert second.public_id != first.public_id
+    assert second.id > first.id  # its key is given to no other
+    assert second.version == 1
+
+
+def test_a_lens_goes_with_its_last_photo_and_the_photos_hash_too(store: Store, steps: Steps) -> None:
+    one, two = steps.counted(), steps.counted()
+
+    store.photos.delete(one.public_id, OWNER)
+    assert len(lenses(store)) == 1
+    store.photos.delete(two.public_id, OWNER)
+
+    assert lenses(store) == rows(store, PhotoRow) == []
+
+
+def test_failed_and_cancelled_photos_leave_no_lens_behind(store: Store, steps: Steps) -> None:
+    counted, failed, cancelled = steps.counted(serial="1"), steps.planned(), steps.planned()
+    other, sharing = steps.lens_id(counted), steps.planned(serial="1")
+    assert len(lenses(store)) == 2
+
+    store.photos.fail(failed.public_id, 1, *WHY)
+    store.photos.fail(sharing.public_id, 1, *WHY)
+    store.photos.cancel(cancelled.public_id, OWNER)
+
+    assert lenses(store) == [other]
+    assert len(steps.learned(counted)[1]) == 6
+    assert store.photos.retry(failed.public_id, OWNER)
+    steps.inspect(steps.fresh(failed))
+    assert len(lenses(store)) == 2
+
+
+def test_a_lens_that_its_owner_named_waits_for_his_next_try(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    store.photos.change([photo.public_id], OWNER, {}, lens=LensName(None, "Old lens", None, label="mine"))
+    lens_id = steps.fresh(photo).given["lens_id"]
+    again = steps.fresh(photo)
+    steps.inspect(again, serial=None)
+    store.photos.fail(photo.public_id, again.epoch, *WHY)
+
+    assert lenses(store) == [lens_id]
+    assert store.photos.retry(photo.public_id, OWNER)
+    assert steps.fresh(photo).given["lens_id"] == lens_id
+    store.photos.delete(photo.public_id, OWNER)
+    assert lenses(store) == []
+
+
+def test_corrections_of_a_deleted_lens_that_are_finished_stay(store: Store, steps: Steps) -> None:
     photo = steps.counted()
-    first, again = steps.correct(photo, method="fast"), steps.correct(photo, method="fast")
-    assert again.public_id == first.public_id
+    lens_id, corrections = steps.lens_id(photo), [steps.correct(photo, strength=s) for s in (1.0, 0.5)]
+    store.jobs.set_state(corrections[0].public_id, ("queued",), "succeeded")
 
-    assert store.jobs.fail(first.public_id, 1, "time_limit", "too slow")
-    third, made = store.jobs.correct(photo, photo.lens, 1, {"method": "fast"})
+    store.lenses.delete(lens_id, OWNER)
 
-    assert made
-    assert third.public_id != first.public_id
+    left = [store.jobs.get(row.public_id, ANY_OWNER) for row in corrections]
+    assert [row.state for row in left] == ["succeeded", "cancelled"]
+    assert {row.lens_public_id for row in left} == {lens_id}
+
+
+# --- corrections, workers, garbage ------------------------------------------------------------
 
 
 def test_a_correction_is_finished_by_the_last_who_took_it_up_and_not_once_it_is_cancelled(
@@ -514,32 +547,8 @@ def test_who_names_a_photo_of_another_owner_does_not_wait_for_that_one(server: S
         assert deleted.result(timeout=stretched(10.0)) is None
 
 
-def many(store: Store, count: int = 10_000) -> None:
-    """Give each of two owners lenses with a photo and a correction each."""
-    now = datetime.now(UTC)
-    lens = {"serial_source": "none", "created_at": now}
-    photo = {"filename": "p", "kind": "dng", "byte_size": 1, "blob_key": "k", "calibrate": True, "given": {}}
-    photo |= {"state": "stored", "received_at": now, "stage_at": now}
-    correction = {"lens_version": 1, "params": {}, "params_hash": "h", "state": "succeeded"}
-    correction |= {"created_at": now, "stage_at": now}
-    with store.database.writing() as session:
-        for owner in (1, 2):
-            session.add(OwnerRow(id=owner, name=f"owner {owner}", created_at=now))
-        session.flush()
-        for table, common, own in (
-            (LensRow, lens, lambda k: {"identity_key": str(k)}),
-            (PhotoRow, photo, lambda k: {"sha256": f"{k:064}", "lens_id": k}),
-            (CorrectionRow, correction, lambda k: {"photo_id": k, "lens_public_id": f"lens{k:08}"}),
-        ):
-            rows = [
-                {"id": k, "public_id": f"{table.__tablename__}{k:08}", "owner_id": 1 + k % 2, **own(k)}
-                for k in range(1, count + 1)
-            ]
-            session.execute(insert(table), [{**common, **row} for row in rows])
-
-
-def test_a_page_of_ten_thousand_lenses_is_found_by_an_index(store: Store) -> None:
-    many(store)
+def test_pages_are_found_by_an_index(store: Store, steps: Steps) -> None:
+    steps.correct(steps.counted(), method="fast")
     seen: list[tuple[str, Any]] = []
 
     def note(connection: object, cursor: object, statement: str, *rest: Any) -> None:
@@ -548,7 +557,7 @@ def test_a_page_of_ten_thousand_lenses_is_found_by_an_index(store: Store) -> Non
 
     event.listen(store.database.reader, "before_cursor_execute", note)
     for page in (store.lenses.page, store.photos.page, store.jobs.page):
-        assert len(page("owner 1", before=None, limit=50)) == 50
+        assert len(page(OWNER, before=None, limit=50)) == 1
     event.remove(store.database.reader, "before_cursor_execute", note)
 
     indexes = ("ix_lens_page", "ix_photo_page", "ix_correction_page")

@@ -1,17 +1,19 @@
-"""Pictures as shown, shifts of them, and PSNR."""
+"""Pictures as shown, shifts of them, PSNR, and the local frame of a place."""
 
 from __future__ import annotations
 
-from functools import cache
+import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import ndimage
 
 from lab.images import best_shift, fidelity, psnr_of, shifted, to_srgb
+from lab.model_benchmark import pixel_to_local
 from lab.scenes import dead_leaves
-from lensmodel.core.types import CORNER_ZONE_R, Frame
+from lensmodel.core.types import CORNER_ZONE_R, FieldPosition, Frame
 
 
 def test_psnr_is_that_of_the_mean_square() -> None:
@@ -24,19 +26,14 @@ def test_srgb_curve_has_its_known_values_and_clips() -> None:
     )
 
 
-@cache
-def smooth_scene() -> NDArray[np.float64]:
-    scene = dead_leaves(120, 160, np.random.default_rng(1))
-    return np.stack([ndimage.gaussian_filter(p.astype(np.float64), 1.5) for p in scene])
-
-
 @pytest.mark.parametrize("shift", [(0.3, -0.7), (1.6, 0.0), (-0.05, 2.2)])
 def test_best_shift_undoes_a_shift(shift: tuple[float, float]) -> None:
-    scene = smooth_scene()
-    moved = shifted(scene, *shift)
-    found = best_shift(moved, scene)
+    leaves = dead_leaves(120, 160, np.random.default_rng(1)).astype(np.float64)
+    scene = ndimage.gaussian_filter(leaves, (0.0, 1.5, 1.5))
+    found = best_shift(shifted(scene, *shift), scene)
 
     np.testing.assert_allclose(found, (-shift[0], -shift[1]), atol=0.01)
+    assert best_shift(np.full((40, 40), 0.3), np.full((40, 40), 0.3)) == (0.0, 0.0)
 
 
 def test_shift_moves_towards_growing_rows_and_columns() -> None:
@@ -45,10 +42,6 @@ def test_shift_moves_towards_growing_rows_and_columns() -> None:
 
     assert np.unravel_index(shifted(picture, 3.0, -2.0).argmax(), picture.shape) == (23, 23)
     np.testing.assert_array_equal(shifted(picture, 0.0, 0.0), picture)
-
-
-def test_best_shift_of_a_flat_picture_is_none() -> None:
-    assert best_shift(np.full((40, 40), 0.3), np.full((40, 40), 0.3)) == (0.0, 0.0)
 
 
 def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
@@ -66,3 +59,15 @@ def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
 
     assert registered > plain + 6.0
     assert blurred < registered - 3.0
+
+
+@given(st.floats(-10, 10))
+def test_u_points_outwards_and_v_is_u_turned_towards_growing_phi(phi: float) -> None:
+    frame = Frame(300, 400)
+    near = np.array(frame.pixel(FieldPosition(0.3, phi)))
+    far = np.array(frame.pixel(FieldPosition(0.3 + 1 / frame.half_diagonal, phi)))
+    middle = np.array(frame.pixel(FieldPosition(0.0, 0.0)))
+    beside = np.array(frame.pixel(FieldPosition(1 / frame.half_diagonal, phi + math.pi / 2)))
+
+    assert pixel_to_local(*(far - near), phi) == pytest.approx((1.0, 0.0), abs=1e-9)
+    assert pixel_to_local(*(beside - middle), phi) == pytest.approx((0.0, 1.0), abs=1e-9)

@@ -33,7 +33,6 @@ from lab.cases import (
     make_cases,
     observe,
     photo_half,
-    psf_half,
     scene_of,
 )
 from lab.stored import ROOT
@@ -73,17 +72,17 @@ class Fake:
         return PsfEstimate(kernels.gaussian(size, np.eye(2) * self.sigma**2), 0.5, 0.3)
 
 
-@dataclass(frozen=True)
-class Declining(Fake):
-    def estimate(self, patches: Sequence[Plane], noise: Sequence[NoiseModel], **_: object) -> PsfEstimate:
-        raise NotEnoughEvidenceError("nothing to see")
-
-
 def run(cache: Path | None = None, **methods: Fake) -> BlindReport:
     """Run the benchmark on three small cases."""
     wanted = BlindBenchmark(methods=tuple(methods), patch=128, cases=3, half="all")
     known = Registry("method", {name: (lambda m=m: m) for name, m in methods.items()})
     return run_blind_benchmark(wanted, cache=cache, methods=known)
+
+
+@dataclass(frozen=True)
+class Declining(Fake):
+    def estimate(self, patches: Sequence[Plane], noise: Sequence[NoiseModel], **_: object) -> PsfEstimate:
+        raise NotEnoughEvidenceError("nothing to see")
 
 
 @pytest.fixture(scope="module")
@@ -109,13 +108,6 @@ def test_judge_brings_a_blurred_scene_nearer_to_the_truth(scene: Plane) -> None:
     assert judge.squared_error(restored, scene) < 0.7 * judge.squared_error(noisy, scene)
 
 
-def test_judge_returns_a_flat_patch_unchanged() -> None:
-    flat = np.full((128, 128), 0.4, dtype=np.float32)
-    restored = judge.deconvolved(flat, kernels.gaussian(11, np.eye(2)), 0.01, (0.0, 0.0))
-
-    np.testing.assert_allclose(restored, 0.4, atol=1e-3)
-
-
 def test_kernel_shifted_by_the_judge_is_the_kernel_shifted_on_the_grid() -> None:
     kernel = np.zeros((9, 9))
     kernel[2, 5], kernel[4, 4] = 0.25, 0.75
@@ -126,16 +118,6 @@ def test_kernel_shifted_by_the_judge_is_the_kernel_shifted_on_the_grid() -> None
         judge.shifted_otf(moved, (32, 32), (0.0, 0.0)),
         atol=1e-12,
     )
-
-
-def test_judge_undoes_the_shift_of_a_kernel(scene: Plane) -> None:
-    kernel = kernels.gaussian(15, np.eye(2) * 2.0)
-    off = psf.as_kernel(ndimage.shift(np.pad(kernel, 3), (1.0, -2.0), order=1))
-    blurred = ndimage.convolve(scene.astype(np.float64), kernel).astype(np.float32)
-    straight = judge.deconvolved(blurred, kernel, 0.003, (0.0, 0.0))
-    aligned = judge.deconvolved(blurred, off, 0.003, kernels.distance(off, kernel).shift)
-
-    np.testing.assert_allclose(aligned, straight, atol=1e-3)
 
 
 def test_padding_joins_without_a_jump() -> None:
@@ -177,25 +159,17 @@ def test_error_ratio_of_the_true_kernel_is_one_even_when_it_is_off_centre(
         assert row.improved
 
 
-def test_untouched_patch_is_in_every_report_and_never_counts_as_improved(report: BlindReport) -> None:
-    rows = [r for r in report.results if r.method == UNTOUCHED]
-
-    assert len(rows) == 3
-    assert all(row.error_ratio == row.untouched_ratio and not row.improved for row in rows)
-
-
-def test_a_kernel_far_too_wide_does_harm(report: BlindReport) -> None:
+def test_what_does_harm_is_told_from_what_declines_and_leaves_the_patch_untouched(
+    report: BlindReport,
+) -> None:
     wide = next(row for row in summarised(report.results) if row["method"] == "wide")
+    left = [row for row in report.results if row.method in {UNTOUCHED, "shy"}]
 
     assert wide["improved"] == 0.0
     assert wide["width_ratio"] > 1.5
-
-
-def test_a_method_that_declines_leaves_the_patch_as_it_is(report: BlindReport) -> None:
-    shy = [row for row in report.results if row.method == "shy"]
-
-    assert [row.declined for row in shy] == [True] * 3
-    assert all(row.error_ratio == row.untouched_ratio for row in shy)
+    assert [row.declined for row in left] == [row.method == "shy" for row in left]
+    assert len(left) == 6
+    assert all(row.error_ratio == row.untouched_ratio and not row.improved for row in left)
 
 
 # ---- cases
@@ -213,12 +187,7 @@ def test_halves_share_no_photo_and_no_psf() -> None:
     assert not {n for _, n in pairs["dev"]} & {n for _, n in pairs["test"]}
     assert len(pairs["all"]) == 48
     assert pairs["dev"] | pairs["test"] <= pairs["all"]
-
-
-def test_demo_photos_are_in_the_half_of_the_photos_they_were_made_from() -> None:
-    assert photo_half("city") == photo_half("s01_city_sunset") == "test"
-    assert photo_half("lake") == photo_half("s03_lake_mountains") == "dev"
-    assert {psf_half(n) for n in range(12)} == {"dev", "test"}
+    assert [photo_half(name) for name in ("city", "s01_city_sunset", "lake")] == ["test", "test", "dev"]
 
 
 def test_a_limit_spreads_over_photos_and_psfs() -> None:

@@ -22,21 +22,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.fixture(scope="module")
-def lens(folder: Path) -> Lens:
-    crops = Scenes(folder / "scenes", held_out=False)
-    stored = library.make_lens("wavefront", 3, crops, held_out=False)
+def lens_of(folder: Path, family: library.Family = "wavefront") -> Lens:
+    stored = library.make_lens(family, 3, Scenes(folder / "scenes", held_out=False), held_out=False)
     assert stored is not None
     return Lens.of(stored)
 
 
-def test_scenes_held_out_are_none_of_the_others(folder: Path) -> None:
-    assert [len(Scenes(folder / "scenes", held_out=value)) for value in (False, True)] == [11, 1]
+@pytest.fixture(scope="module")
+def lens(folder: Path) -> Lens:
+    return lens_of(folder)
 
 
 def test_a_lens_is_the_same_whenever_it_is_made(folder: Path, lens: Lens) -> None:
-    crops = Scenes(folder / "scenes", held_out=False)
-    again = Lens.of(library.make_lens("wavefront", 3, crops, held_out=False) or {})
+    assert [len(Scenes(folder / "scenes", held_out=value)) for value in (False, True)] == [11, 1]
+    again = lens_of(folder)
     np.testing.assert_array_equal(again.statistics, lens.statistics)
     np.testing.assert_array_equal(again.truth, lens.truth)
 
@@ -125,9 +124,7 @@ def test_a_traced_lens_is_photographed_at_several_apertures_and_focus_distances(
 
 
 def test_samples_of_another_focus_distance_say_so(folder: Path) -> None:
-    stored = library.make_lens("traced", 3, Scenes(folder / "scenes", held_out=False), held_out=False)
-    assert stored is not None
-    lens = Lens.of(stored)
+    lens = lens_of(folder, "traced")
     assert len(np.unique(lens.settings[:, 3])) > 1
     query = lens.settings[np.argmin(lens.settings[:, 3])][None]
     relation = relation_features(lens.xy[:1], query, lens.xy[:2], lens.settings[[0, 0]])[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import re
@@ -53,14 +54,15 @@ from lensmodel.blind.sampling import PRESETS, Config
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel
 from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, Frame, Kernel, zone_of
+from lensmodel.correction.richardson_lucy import RichardsonLucy
 from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS, photograph, write_photo
 
 DRAW = job.figures.draw
 
 
-def case(**changes: Any) -> Case:
-    return replace(planned("quick").cases[0], height=480, width=640, **changes)
+def case(number: int = 0, **changes: Any) -> Case:
+    return replace(planned("quick").cases[number], height=480, width=640, **changes)
 
 
 def plan(*cases: Case, **changes: Any) -> Reproduction:
@@ -88,14 +90,10 @@ def traced(path: Path = HELIAR, **changes: Any) -> Case:
     return replace(one, height=480, width=640, **changes)
 
 
-def test_default_size_has_eight_kinds_of_lenses_on_reported_seeds() -> None:
-    cases = [one for one in planned("default").cases if one.grid is None]
-    assert len({one.lens.model.split()[1] for one in cases}) == len(LENS_KINDS) == 8
-    assert min(one.seed for one in cases) >= FIRST_SEED
-    assert {one.photos for one in cases} == {(1, 2, 5, 10)}
-
-
-def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
+def test_plan_has_eight_kinds_of_lenses_of_both_families_and_says_which_were_looked_at() -> None:
+    drawn = [one for one in planned("default").cases if one.grid is None]
+    assert len({one.lens.model.split()[1] for one in drawn}) == len(LENS_KINDS) == 8
+    assert min(one.seed for one in drawn) >= FIRST_SEED
     cases = planned("quick").cases
     assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2
     assert [one.unseen for one in cases] == [True, True, False, False]
@@ -164,15 +162,12 @@ class EvenField:
 
 def test_even_lens_is_its_own_general_profile_and_an_uneven_one_is_not() -> None:
     place = FieldPosition(0.8, 0.6)
-    even = EvenField()
-    found = symmetric(even).kernel_at(place, "g", 21)
-    np.testing.assert_allclose(found, even.kernel_at(place, "g", 21), atol=1e-12)
-    assert distance(even.kernel_at(place, "g", 21), even.kernel_at(place, "g", 21)[::-1]).rel_l2 > 0.1
+    even, found = (field.kernel_at(place, "g", 21) for field in (EvenField(), symmetric(EvenField())))
+    np.testing.assert_allclose(found, even, atol=1e-12)
+    assert distance(even, even[::-1]).rel_l2 > 0.1
     one = traced()
-    assert (
-        distance(general_field(one).kernel_at(place, "g", 25), one.truth().kernel_at(place, "g", 25)).rel_l2
-        > 0.02
-    )
+    general, own = (field.kernel_at(place, "g", 25) for field in (general_field(one), one.truth()))
+    assert distance(general, own).rel_l2 > 0.02
 
 
 def test_general_profile_of_a_drawn_lens_is_the_mean_of_development_lenses_of_its_kind() -> None:
@@ -248,11 +243,7 @@ def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
 
 def test_key_changes_with_settings_and_code() -> None:
     one = case()
-    keys = {
-        key_of(one, plan(), "1"),
-        key_of(one, plan(), "2"),
-        key_of(replace(one, seed=1002), plan(), "1"),
-    }
+    keys = {key_of(one, plan(), "1"), key_of(one, plan(), "2"), key_of(case(seed=1002), plan(), "1")}
     assert len(keys) == 3
     assert photos_of(one, plan()) == photos_of(one, plan(compare=True))
     assert photos_of(one, plan()) != photos_of(replace(one, width=320), plan())
@@ -261,26 +252,16 @@ def test_key_changes_with_settings_and_code() -> None:
 
 def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages() -> None:
     names = {path.relative_to(ROOT).as_posix() for path in code_of("lab.reproduce.job")}
-    assert {
-        "lab/reproduce/cases.py",
-        "lab/model_benchmark.py",
-        "lab/cases.py",
-        "lab/schuler.py",
-        "lensmodel/correction/richardson_lucy.py",
-    } <= names
+    ours = {f"lab/{name}.py" for name in ("reproduce/cases", "model_benchmark", "cases", "schuler")}
+    assert ours | {Path(inspect.getfile(RichardsonLucy)).relative_to(ROOT).as_posix()} <= names
     assert not names & {f"lab/reproduce/{name}.py" for name in ("page", "tables")}
 
 
 def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
-    for name, text in {
-        "a": "from pkg import b\n",
-        "b": "def f():\n    import pkg.c\n",
-        "c": "",
-        "d": "",
-    }.items():
-        path = tmp_path / "pkg" / f"{name}.py"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
+    (tmp_path / "pkg").mkdir()
+    texts = {"a": "from pkg import b\n", "b": "def f():\n    import pkg.c\n", "c": "", "d": ""}
+    for name, text in texts.items():
+        (tmp_path / "pkg" / f"{name}.py").write_text(text)
     first = version_of("pkg.a", root=tmp_path)
     (tmp_path / "pkg" / "d.py").write_text("changed = 1")
     assert version_of("pkg.a", root=tmp_path) == first
@@ -292,18 +273,9 @@ def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
 
 
 def state(mtf50: float, psnr: float) -> dict[str, Any]:
-    edge = {
-        "edges": 2,
-        "mtf50": mtf50,
-        "tangential_mtf50": mtf50,
-        "sagittal_mtf50": None,
-        "mtf_max": 1.02,
-        "overshoot": 2.0,
-    }
-    return {
-        "edges": {zone: dict(edge) for zone in ZONES},
-        "psnr": dict.fromkeys(ZONES, psnr),
-    }
+    edge = {"edges": 2, "mtf50": mtf50, "tangential_mtf50": mtf50, "sagittal_mtf50": None}
+    edge |= {"mtf_max": 1.02, "overshoot": 2.0}
+    return {"edges": {zone: dict(edge) for zone in ZONES}, "psnr": dict.fromkeys(ZONES, psnr)}
 
 
 def psf(error: float, right: float = 0.75) -> dict[str, Any]:
@@ -312,6 +284,7 @@ def psf(error: float, right: float = 0.75) -> dict[str, Any]:
 
 def result(*lenses: tuple[float, float]) -> dict[str, Any]:
     """Lenses given by MTF50 and PSNR after n = 1; 100 and 30 before, 200 and 34 with the true PSF."""
+    before, true, rival = state(100, 30.0), state(200, 34.0), state(130, 31.0)
     cases = [
         {
             "name": f"lens{i}",
@@ -320,27 +293,16 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             "unseen": True,
             "source": f"drawn, seed {1000 + i}",
             "settings": {"seed": 1000 + i, "height": 480, "width": 640},
-            "states": {
-                BEFORE: state(100, 30.0),
-                TRUE: state(200, 34.0),
-                "n = 1": state(mtf50, psnr),
-                RIVAL: state(130, 31.0),
-            },
+            "states": {BEFORE: before, TRUE: true, "n = 1": state(*lens), RIVAL: rival},
             "psf": {"n = 1": psf(0.2), RIVAL: psf(0.5)},
             "refused": {"n = 1": []},
             "paths": {},
             "pictures": {"before": "before.png", "scene": "scene.png", "true": "true.png", "n1": "after.png"},
         }
-        for i, (mtf50, psnr) in enumerate(lenses)
+        for i, lens in enumerate(lenses)
     ]
-    return {
-        "code": "abc",
-        "plan": {"size": "quick", "own_scenes": True},
-        "scenes": ["city", "lake"],
-        "developed_on": ["lake"],
-        "cases": cases,
-        "figures": {},
-    }
+    about = {"code": "abc", "plan": {"size": "quick", "own_scenes": True}, "figures": {}}
+    return {**about, "scenes": ["city", "lake"], "developed_on": ["lake"], "cases": cases}
 
 
 def test_share_is_of_the_gain_of_the_true_psf_unless_that_is_small() -> None:
@@ -456,18 +418,10 @@ def test_page_shows_every_way_lens_and_refusal_and_needs_nothing_from_outside(tm
 
     markdown, html = (path.read_text(encoding="utf-8") for path in write_page(made, tmp_path))
     assert list(summary(made)["psnr"]) == [BEFORE, RIVAL, GENERAL, way, "n = 1", MEASURED, TRUE]
-    for row in (
-        "| third order | Lens &lt;0&gt; | drawn, seed 1000 | unseen |",
-        "| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |",
-        "| default, n = 1 | 160 |",
-        f"| {RIVAL} | 130 |",
-        f"| {way} | 140 |",
-        f"| {way} | 0.600 |",
-        f"| {way} | 31.50 |",
-        "photo-00: flat",
-        "| default | 4 |",
-        "MISSED",
-    ):
+    shown = ["| third order | Lens &lt;0&gt; | drawn, seed 1000 | unseen |", "photo-00: flat", "MISSED"]
+    shown += ["| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |"]
+    shown += ["| default, n = 1 | 160 |", f"| {RIVAL} | 130 |", "| default | 4 |"]
+    for row in (*shown, *(f"| {way} | {value} |" for value in ("140", "0.600", "31.50"))):
         assert row in markdown
     assert "Lens &lt;0&gt;" in html
     assert not re.search(r"https?:|//[a-z]|<script|<link|@import", html)
@@ -494,7 +448,7 @@ def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
     few = [(FieldPosition(r, 0.5), c) for r in (0.1, 0.5, 0.9) for c in CHANNELS]
     monkeypatch.setattr(measure, "places", lambda: few)
     field = case().truth()
-    exact = [(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in measure.places()]
+    exact = [(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in few]
     found = measure.psf_errors(exact, field)
     assert max(v for zones in found["rel_l2"].values() for v in zones.values()) < 1e-3
     assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
@@ -523,8 +477,7 @@ def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) 
     scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
     change = HARD_SCENES[name]
     made = change(scene, np.random.default_rng(2))
-    assert made.shape == scene.shape
-    assert made.dtype == np.float32
+    assert (made.shape, made.dtype) == (scene.shape, np.float32)
     assert made.min() >= 0.0
     assert np.abs(made - scene).mean() > 0.01
     assert np.array_equal(made, change(scene, np.random.default_rng(2)))
@@ -622,8 +575,8 @@ def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) ->
     assert len(quick_photos) == 1
 
 
-def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path, quick_photos: list[str]) -> None:
-    del quick_photos
+@pytest.mark.usefixtures("quick_photos")
+def test_papers_own_way_is_learned_beside_the_default(tmp_path: Path) -> None:
     chosen = plan(case(photos=(1, 2)), compare=True)
     made = reproduced(tmp_path, chosen)
     assert {f"{PAPER_WAY}, n = {n}" for n in (1, 2)} < set(made["cases"][0]["states"])
@@ -639,9 +592,8 @@ def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
             raise KeyboardInterrupt
         return [f"{photos[0].stem}: too dark"]
 
-    second = replace(planned("quick").cases[1], height=480, width=640, photos=(1, 2))
-    chosen = plan(case(photos=(1, 2)), second)
-    with pytest.MonkeyPatch.context() as patch:
+    chosen = plan(case(photos=(1, 2)), case(1, photos=(1, 2)))
+    with monkeypatch.context() as patch:
         patch.setattr(Nothing, "learn", killed)
         with pytest.raises(KeyboardInterrupt):
             reproduced(tmp_path / "killed", chosen)
@@ -653,11 +605,10 @@ def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
     assert made == reproduced(tmp_path / "whole", chosen)
 
 
+@pytest.mark.usefixtures("quick_photos")
 def test_each_choice_of_lenses_keeps_figures_of_its_own(
-    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    del quick_photos
-
     def drawn(cases: Sequence[Case], path: Path) -> dict[str, Any]:
         path.write_text(cases[0].name)
         return {"picture": path.name}
@@ -666,7 +617,7 @@ def test_each_choice_of_lenses_keeps_figures_of_its_own(
     monkeypatch.setattr(job.figures, "_fig2", drawn)
     monkeypatch.setattr(job.figures, "_fig4", lambda chosen, _, path, __: drawn(chosen.cases, path))
     one = plan(case(photos=(1,)), compare=True)
-    other = plan(replace(planned("quick").cases[1], height=480, width=640, photos=(1,)), compare=True)
+    other = plan(case(1, photos=(1,)), compare=True)
     for chosen in (one, other, one):
         for figure in reproduced(tmp_path, chosen)["figures"].values():
             shown = tmp_path / "pictures" / figure["picture"]
@@ -676,8 +627,8 @@ def test_each_choice_of_lenses_keeps_figures_of_its_own(
         assert (tmp_path / "pictures" / figure["picture"]).exists()
 
 
-def test_damaged_result_is_reported(tmp_path: Path, quick_photos: list[str]) -> None:
-    del quick_photos
+@pytest.mark.usefixtures("quick_photos")
+def test_damaged_result_is_reported(tmp_path: Path) -> None:
     chosen = plan(case(photos=(1,)))
     reproduced(tmp_path, chosen)
     next(tmp_path.rglob("learned-1.json")).write_text("{")
